@@ -637,7 +637,7 @@ def test_another_street_lies_where_the_vehicle_drives() -> None:
     x, y = np.meshgrid(np.arange(-6, 40, 0.5), np.arange(-8, 8, 0.5), indexing="ij")
     xyz = np.stack([x, y, 0 * x], -1).reshape(-1, 3)
     assert np.nanmax(np.abs(ground)) < 1e-9
-    other = edited.with_background(model, model, away).without_nodes(["car-1"])
+    other = assets.with_background(model, model, away).without_nodes(["car-1"])
     ego = Motion.recorded([0.0, 2.0], np.stack([geometry.yaw_matrix(0.0)] * 2))
     street = Background(other, replace(ego, poses=away @ ego.poses), geometry.transform_points(away, xyz))
     world = EditWorld(EditWorld.of_model(model, None).actors, ego, HeightMap.from_points(xyz))

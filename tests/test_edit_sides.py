@@ -16,9 +16,9 @@ from mudg.core.edit import Motion
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
 from mudg.editing.apply import complete_asset
+from mudg.editing.model import with_closed_sides
 from mudg.editing.plan import Actor, EditSources, EditWorld, plan_edits, shown_anew
 from mudg.editing.script import parse_edits
-from mudg.editing.street import with_closed_sides
 from mudg.gaussians.model import CERTAINTY, SceneModel
 from mudg.gaussians.nodes import RigidNode, StaticNode
 from mudg.gaussians.start import SH_C0

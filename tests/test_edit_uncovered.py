@@ -16,9 +16,9 @@ from mudg.core.edit import Motion
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
 from mudg.editing.apply import hidden_by
+from mudg.editing.model import SHOWN, Hidden, continued, noted, shaded_cells, shown_by, without_traces
 from mudg.editing.plan import Actor, EditSources, EditWorld, plan_edits
 from mudg.editing.script import parse_edits
-from mudg.editing.street import SHOWN, Hidden, continued, noted, shaded_cells, shown_by, without_traces
 from mudg.gaussians.model import CERTAINTY, SceneModel
 from mudg.gaussians.nodes import RigidNode, SkyNode, StaticNode
 from mudg.gaussians.start import SH_C0

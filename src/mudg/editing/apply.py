@@ -34,36 +34,18 @@ from mudg.base.types import EgoPath, FusedCloud, Observation, PointCloud, Scene,
 from mudg.base.weather_settings import Conditions
 from mudg.core import trajectory
 from mudg.core.edit import HeightMap, Motion
+from mudg.core.harmonics import left_product_matrix
+from mudg.core.table import Table
 from mudg.core.weather import ShownView, drive_facts, edited_view
 from mudg.core.weather.light import curve_of
 from mudg.diffusion.inputs import InWeather
 from mudg.editing import model as edited
-from mudg.editing.model import (
-    GROUND_CLASSES,
-    Asset,
-    asset_of,
-    ground_points,
-    light_gain,
-    linear_of,
-    lowest_points,
-    matched_light,
-    motion_of,
-)
-from mudg.editing.plan import (
-    Actor,
-    Background,
-    EditPlan,
-    EditSources,
-    EditWorld,
-    check,
-    plan_edits,
-    shown_anew,
-    sides_seen,
-)
+from mudg.editing import plan as plans
+from mudg.editing.model import GROUND_CLASSES, Asset, linear_of
+from mudg.editing.plan import Actor, Background, EditPlan, EditSources, EditWorld
 from mudg.editing.runs import RunParts, find_run
 from mudg.editing.script import AssetSource, EditScript, conditions_of
-from mudg.editing.street import MOST_VIEWS, Hidden, noted, with_closed_sides, without_rows, without_traces
-from mudg.gaussians.model import SceneModel
+from mudg.gaussians.model import CERTAINTY, SceneModel
 from mudg.gaussians.nodes import RigidNode, SkyNode
 from mudg.gaussians.rendering import raster_of, render_view
 from mudg.gaussians.start import SH_C0
@@ -81,10 +63,6 @@ MOST_NAMED: Final = 4
 """More objects than these are counted in a message."""
 
 
-StreetOf = Callable[[SceneModel, EditPlan], SceneModel]
-"""Makes of a fitted scene the one that objects have left: ``street_left``, or something that remembers its results."""
-
-
 def street_left(model: SceneModel, plan: EditPlan, *, close: bool = True) -> SceneModel:
     """A fitted scene without the objects that a plan removes, with objects of their own for standing ones that it
     moves, and, unless told not to `close` anything, without the traces of those behind which the street is closed and
@@ -96,12 +74,12 @@ def street_left(model: SceneModel, plan: EditPlan, *, close: bool = True) -> Sce
     if closed and close:
         hidden, views = {name: hidden_by(plan.before.actors[name], plan.views) for name in closed}, spread(plan.views)
         log.info(f"edit: the street behind {_some(closed)} is closed from {len(views)} recorded views (close_street)")
-        model = noted(model, views, raster_of(model)).without_nodes([name for name in removed if name in closed])
-        model = without_traces(model, hidden, views, raster_of(model))
+        model = edited.noted(model, views, raster_of(model)).without_nodes([name for name in removed if name in closed])
+        model = edited.without_traces(model, hidden, views, raster_of(model))
     sides = tuple(name for name in sides if close and name in model.node_names())
     if sides:
         seen_from = views_of([plan.before.actors[name] for name in sides], plan.views)
-        model = with_closed_sides(model, sides, seen_from, raster_of(model))
+        model = edited.with_closed_sides(model, sides, seen_from, raster_of(model))
     return model
 
 
@@ -121,33 +99,87 @@ def _some(names: Sequence[str]) -> str:
 
 
 def edited_model(
-    model: SceneModel, plan: EditPlan, sky: Path | None = None, street_of: StreetOf = street_left
+    model: SceneModel, plan: EditPlan, sky: Path | None = None, street: SceneModel | None = None
 ) -> SceneModel:
-    """A fitted scene with a plan carried out. ``sky``: panorama of the plan's ``sky``. ``street_of``: makes the street
-    that objects left, or remembers it."""
-    model = street_of(model, plan)
+    """A fitted scene with a plan carried out. ``sky``: panorama of the plan's ``sky``. ``street``: what ``street_left``
+    made of the scene before."""
+    model = street_left(model, plan) if street is None else street
     if plan.background is not None:
         other, pose = plan.background
-        model = edited.with_background(model, other.model, pose)
+        model = with_background(model, other.model, pose)
         if plan.objects_gain is not None:
-            model = edited.with_relit_objects(model, plan.objects_gain)
-    kept = {node.name: node for node in model.nodes if isinstance(node, RigidNode)}
-    changed = {name: plan.changed(name, edited.motion_of(kept[name])) for name in plan.changes if name in kept}
-    model = edited.with_motions(model, changed)
+            model = with_relit_objects(model, plan.objects_gain)
+    nodes = list(model.nodes)
+    for index, node in enumerate(nodes):
+        if isinstance(node, RigidNode) and node.name in plan.changes:
+            nodes[index] = edited.node_along(node, plan.changed(node.name, edited.motion_of(node)))
+    model = replace(model, nodes=tuple(nodes), facts=dict(model.facts))
     for name, insertion in plan.inserted.items():
         actor = plan.after.actors[name]
         model = edited.with_asset(model, insertion.asset, name, actor.motion, actor.label)
         if insertion.shadow > 0:
             model = edited.with_shadow(model, name, insertion.shadow, insertion.sun)
     if sky is not None and plan.sky is not None:
-        model = replace(model, sky=panorama(sky, plan.sky.yaw_deg, model))
+        model = replace(model, sky=_panorama(sky, plan.sky.yaw_deg, model))
     if plan.erased:
-        street = np.flatnonzero((model.table.labels["node"] == 0).cpu().numpy())
-        gone = np.zeros(len(model.table), bool)
-        gone[street] = _erased(plan, model.table["means"].detach().cpu().numpy()[street])
-        model = without_rows(model, gone)
+        gone = edited.still_rows(model)
+        gone[gone] = _erased(plan, model.table["means"].detach().cpu().numpy()[gone])
+        model = edited.without_rows(model, gone)
     model.sort_rows()
     return model
+
+
+def with_relit_objects(model: SceneModel, gain: NDArray[np.float64]) -> SceneModel:
+    """A copy whose objects give off their linear light times a gain f64[3]; what their colours add with direction grows
+    with them."""
+    mine, old = (model.table.labels["node"] > 0)[:, None, None], model.table["sh_dc"].detach()
+    columns = {"sh_dc": (new := torch.where(mine, edited.relit(old, gain), old))}
+    if "sh_rest" in model.table.columns:
+        before, after = ((0.5 + SH_C0 * value).clamp(min=1 / 255) for value in (old, new))
+        rest = model.table["sh_rest"].detach()
+        columns["sh_rest"] = torch.where(mine, rest * (after / before), rest)
+    return edited.changed(model, columns)
+
+
+def with_background(model: SceneModel, other: SceneModel, world_from_other: NDArray[np.float64]) -> SceneModel:
+    """A copy whose background and sky are those of another scene; its objects stay.
+
+    Classes are taken over by name, colours of degree 1 and more dropped: they hold the other scene's directions.
+
+    Args:
+        world_from_other: rigid 4x4, a turn about z and a translation.
+
+    Raises:
+        UsageError: a background that changes with time.
+    """
+    for scene in (model, other):
+        if scene.nodes[0].kind != "static":
+            what = "a background that changes with time cannot be exchanged"
+            raise UsageError(what, got=f"kind {scene.nodes[0].kind}")
+    rows = (other.table.labels["node"] == 0).nonzero()[:, 0]
+    given = {name: value.detach()[rows].cpu() for name, value in other.table.columns.items()}
+    columns, labels = (edited.zeros_like(own, len(rows)) for own in (model.table.columns, model.table.labels))
+    columns |= {name: given[name] for name in ("log_scales", "logits", "sh_dc")}
+    columns["means"] = torch.from_numpy(geometry.transform_points(world_from_other, given["means"].numpy()))
+    turn = torch.from_numpy(geometry.quaternion_from_matrix(world_from_other)).float()
+    columns["quats"] = given["quats"] @ left_product_matrix(turn).T
+    if "semantics" in columns:
+        columns["semantics"] = torch.full((len(rows), len(model.classes)), edited.ABSENT_LOGIT)
+        for channel, train_id in enumerate(model.classes):
+            if train_id in other.classes:
+                columns["semantics"][:, channel] = given["semantics"][:, other.classes.index(train_id)]
+    if CERTAINTY in labels and other.certainty is not None:
+        labels[CERTAINTY] = other.certainty[rows].cpu().to(labels[CERTAINTY].dtype)
+    mine, there = (model.table.labels["node"] > 0).nonzero()[:, 0], model.device
+    joined = lambda street, own: {
+        key: torch.cat([street[key].to(there), value.detach()[mine]]) for key, value in own.items()
+    }
+    sky = None
+    if other.sky is not None:
+        shift = round(geometry.yaw_of(world_from_other) / np.pi * other.sky.rows)
+        turned = torch.roll(other.sky.table["panorama"].detach(), shift, dims=3)
+        sky = SkyNode(Table({"panorama": turned})).to(there)
+    return edited.changed(model, joined(columns, model.table.columns), joined(labels, model.table.labels), sky=sky)
 
 
 def _erased(plan: EditPlan, xyz: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -163,7 +195,7 @@ def _erased(plan: EditPlan, xyz: NDArray[np.floating]) -> NDArray[np.bool_]:
     return gone
 
 
-def spread(views: Sequence[View], most: int = MOST_VIEWS) -> list[View]:
+def spread(views: Sequence[View], most: int = edited.MOST_VIEWS) -> list[View]:
     """At most so many of some views, evenly."""
     which = np.unique(np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int))
     return [views[int(index)] for index in which] if views else []
@@ -181,11 +213,11 @@ def views_of(actors: Sequence[Actor], views: Sequence[View]) -> list[View]:
     return spread(found, SIDE_VIEWS)
 
 
-def hidden_by(actor: Actor, views: Sequence[View]) -> Hidden:
+def hidden_by(actor: Actor, views: Sequence[View]) -> edited.Hidden:
     """An object and the views at whose times it is there, at most `MOST_VIEWS`."""
     there = [view for view in views if actor.motion.pose_at(view.time_s) is not None]
     there.sort(key=lambda view: view.time_s)
-    return Hidden(actor.size_m, actor.motion, actor.moves, tuple(spread(there)))
+    return edited.Hidden(actor.size_m, actor.motion, actor.moves, tuple(spread(there)))
 
 
 def _cut_out(model: SceneModel, names: Sequence[str], plan: EditPlan) -> SceneModel:
@@ -212,7 +244,7 @@ def _cut_out(model: SceneModel, names: Sequence[str], plan: EditPlan) -> SceneMo
     return model
 
 
-def panorama(path: Path, yaw_deg: float, model: SceneModel) -> SkyNode:
+def _panorama(path: Path, yaw_deg: float, model: SceneModel) -> SkyNode:
     """A sky from an image of all directions: longitude across, growing to the right as one looks at it; zenith in the
     top row."""
     rows = 256 if model.sky is None else model.sky.rows
@@ -246,20 +278,21 @@ def edited_cloud(cloud: FusedCloud, plan: EditPlan) -> FusedCloud:
         xyz = geometry.transform_points(world_from_other, other.points.xyz.astype(np.float64))
         static = replace(other.points, xyz=xyz.astype(np.float32))
         kept = {name: points for name, points in objects.items() if name not in standing}
-        objects = {name: _relit_points(points, plan.objects_gain) for name, points in kept.items()}
+        if plan.objects_gain is not None:
+            lit = lambda rgb: edited.display_of(linear_of(rgb / 255) * plan.objects_gain)
+            as_bytes = lambda rgb: np.rint(lit(rgb).clip(0, 1) * 255).astype(np.uint8)
+            kept = {name: replace(points, rgb=as_bytes(points.rgb)) for name, points in kept.items()}
+        objects = kept
     objects |= {name: asset_points(insertion.asset) for name, insertion in plan.inserted.items()}
     if plan.erased:
-        left = ~_erased(plan, static.xyz)
-        ids = None if static.semantics is None else static.semantics[left]
-        static = PointCloud(static.xyz[left], static.rgb[left], static.frame, ids)
+        static = some_points(static, ~_erased(plan, static.xyz))
     return FusedCloud(static, objects, cloud.colors)
 
 
-def _relit_points(points: PointCloud, gain: NDArray[np.float64] | None) -> PointCloud:
-    if gain is None:
-        return points
-    shown = edited.display_of(edited.linear_of(points.rgb / 255) * gain)
-    return replace(points, rgb=np.rint(shown.clip(0, 1) * 255).astype(np.uint8))
+def some_points(points: PointCloud, rows: NDArray[np.bool_]) -> PointCloud:
+    """Those of a cloud's points that a mask bool[N] chooses."""
+    ids = None if points.semantics is None else points.semantics[rows]
+    return PointCloud(points.xyz[rows], points.rgb[rows], points.frame, ids)
 
 
 def _cut_points(static: PointCloud, track: Track) -> tuple[PointCloud, PointCloud]:
@@ -267,16 +300,11 @@ def _cut_points(static: PointCloud, track: Track) -> tuple[PointCloud, PointClou
     pose = track.world_from_object[len(track.times_s) // 2]
     local = geometry.transform_points(geometry.invert(pose), static.xyz.astype(np.float64))
     half = track.size_m / 2 + edited.CUT_MARGIN_M
-    inside = (np.abs(local[:, :2]) <= half[:2]).all(1) & (np.abs(local[:, 2]) <= half[2])
     low = local[:, 2] < -track.size_m[2] / 2 + edited.CUT_FLOOR_M
-    ground = low if static.semantics is None else np.isin(static.semantics, edited.GROUND_CLASSES)
-    inside &= ~ground
-
-    def part(rows: NDArray[np.bool_], xyz: NDArray[np.float32], frame: Any) -> PointCloud:
-        ids = None if static.semantics is None else static.semantics[rows]
-        return PointCloud(xyz[rows], static.rgb[rows], frame, ids)
-
-    return part(~inside, static.xyz, "world"), part(inside, local.astype(np.float32), "object")
+    ground = low if static.semantics is None else np.isin(static.semantics, GROUND_CLASSES)
+    inside = (np.abs(local) <= half).all(1) & ~ground
+    own = some_points(replace(static, xyz=local.astype(np.float32), frame="object"), inside)
+    return some_points(static, ~inside), own
 
 
 def asset_points(asset: Asset) -> PointCloud:
@@ -288,13 +316,13 @@ def asset_points(asset: Asset) -> PointCloud:
     return PointCloud(asset.columns["means"].numpy()[solid], shown, "object", ids[solid])
 
 
-def ground_of(cloud: FusedCloud | None, model: SceneModel) -> HeightMap | None:
+def ground_of(cloud: FusedCloud | None, model: SceneModel | None) -> HeightMap | None:
     """Height map of the ground: of the fused points of ground classes, else of the fitted Gaussians; None where there
     are neither."""
     xyz = np.zeros((0, 3), np.float32)
     if cloud is not None and cloud.static.semantics is not None:
-        xyz = cloud.static.xyz[np.isin(cloud.static.semantics, edited.GROUND_CLASSES)]
-    xyz = edited.ground_points(model) if not len(xyz) else xyz
+        xyz = cloud.static.xyz[np.isin(cloud.static.semantics, GROUND_CLASSES)]
+    xyz = edited.ground_points(model) if model is not None and not len(xyz) else xyz
     return HeightMap.from_points(xyz) if len(xyz) else None
 
 
@@ -330,11 +358,6 @@ def _carried(view: View, before: EgoPath, after: Motion) -> View:
     return View(view.camera, new @ geometry.invert(old) @ view.world_from_cam, view.time_s)
 
 
-def ego_fact(ego: Motion) -> list[list[float]]:
-    """A path as JSON values."""
-    return np.column_stack([ego.times_s, ego.poses.reshape(-1, 16)]).tolist()
-
-
 def scene_seen_by(scene: Scene, facts: Mapping[str, Any]) -> Scene:
     """The scene on the vehicle's path that an edited fit asks for; itself if it asks for none."""
     if EGO_FACT not in facts:
@@ -358,7 +381,7 @@ FACT = "edits"
 @dataclass(frozen=True, slots=True, eq=False)
 class EditedDrive:
     """What a script made of a drive. ``plan``: what was done. ``scene``, ``cloud``: edited; None where they were not
-    given. ``notes``: what the reader should know (``checks.check``)."""
+    given. ``notes``: what the reader should know (``plan.check``)."""
 
     script: EditScript
     plan: EditPlan
@@ -366,15 +389,15 @@ class EditedDrive:
     cloud: FusedCloud | None
     notes: list[dict[str, Any]]
 
-    def model(self, model: SceneModel, keep_ego: bool = False, street_of: StreetOf = street_left) -> SceneModel:
+    def model(self, model: SceneModel, keep_ego: bool = False, street: SceneModel | None = None) -> SceneModel:
         """A fitted scene of this drive, edited. ``keep_ego``: note the vehicle's new path in the scene's facts, for
-        those who know the recorded path alone. ``street_of``: makes the street that objects left
-        (``apply.street_left``), or remembers it."""
+        those who know the recorded path alone. ``street``: what ``street_left`` made of it before."""
         sky = None if self.plan.sky is None else self.script.path_of(self.plan.sky.image)
-        made = edited_model(model, self.plan, sky, street_of)
+        made = edited_model(model, self.plan, sky, street)
         facts = {**made.facts, FACT: {"script": self.script.canonical(), "notes": self.notes}}
         if keep_ego and self.plan.moves_ego and self.plan.after.ego is not None:
-            facts[EGO_FACT] = ego_fact(self.plan.after.ego)
+            ego = self.plan.after.ego
+            facts[EGO_FACT] = np.column_stack([ego.times_s, ego.poses.reshape(-1, 16)]).tolist()
         return replace(made, facts=facts)
 
 
@@ -391,8 +414,8 @@ def carry_out(
     ground = ground_of(cloud, model)
     world = EditWorld.of_model(model, ground) if scene is None else EditWorld.of_scene(scene, ground)
     background = lambda name: background_of(find_run(script.path_of(name)), name)
-    closes = scene is not None and is_recording(scene)
-    plan = plan_edits(script, world, EditSources(opener(script), background, close_street=closes))
+    closes = scene is not None and scene.source.recipe is None  # a city has exact pictures of what an object hid
+    plan = plans.plan_edits(script, world, EditSources(opener(script), background, close_street=closes))
     plan.views = () if scene is None else tuple(frame.view for frame in scene.frames)
     take_light(plan, model)
     if scene is None and plan.closed:
@@ -401,17 +424,11 @@ def carry_out(
         plan.notes.append({"kind": "street not closed", "ids": names, "text": text})
     made = None if scene is None else edited_scene(scene, plan)
     views = tuple([frame.view for frame in s.frames] if s else [] for s in (scene, made))
-    plan.sides &= shown_anew(plan, *views)
-    notes = check(plan, *views)
+    plan.sides &= plans.shown_anew(plan, *views)
+    notes = plans.check(plan, *views)
     for note in notes:
         (log.info if note["kind"] == "lateral acceleration" else log.warn)(f"edit: {note['text']}")
     return EditedDrive(script, plan, made, None if cloud is None else edited_cloud(cloud, plan), notes)
-
-
-def is_recording(scene: Scene) -> bool:
-    """Whether a scene comes from sensors and not from the city generator, which has exact pictures of what an object
-    hid."""
-    return scene.source.recipe is None
 
 
 def background_of(parts: RunParts, name: str) -> Background:
@@ -422,10 +439,10 @@ def background_of(parts: RunParts, name: str) -> Background:
         if model.facts.get("method") != IMPORTED:
             what, expected = "of a fit alone it is not known where its street lies", "a folder made by `mudg run`"
             raise InputError(what, where="run", got=name, expected=f"{expected} or by `mudg asset import --kind scene`")
-        known = ground_points(model)
-        return Background(model, Motion.recorded([0.0], np.eye(4)[None]), known if len(known) else lowest_points(model))
+        known, still = edited.ground_points(model), Motion.recorded([0.0], np.eye(4)[None])
+        return Background(model, still, known if len(known) else edited.lowest_points(model))
     scene, model = read_scene(parts.scene), load_model(parts.model)
-    ground, cloud = ground_points(model), None if parts.fused is None else read_fused(parts.fused).static
+    ground, cloud = edited.ground_points(model), None if parts.fused is None else read_fused(parts.fused).static
     if cloud is not None and cloud.semantics is not None:
         ground = cloud.xyz[np.isin(cloud.semantics, GROUND_CLASSES)]
     if not len(ground):
@@ -471,7 +488,7 @@ def asset_from(parts: RunParts, name: str) -> Asset:
     """An object of a run, with the sides from which its scene shows it; those that it never shows are closed."""
     model = load_model(parts.model)
     if parts.scene is None:
-        return asset_of(model, name)
+        return edited.asset_of(model, name)
     recorded = read_scene(parts.scene)
     return complete_asset(model, name, [frame.view for frame in recorded.frames])
 
@@ -479,11 +496,11 @@ def asset_from(parts: RunParts, name: str) -> Asset:
 @one_torch_thread()
 def complete_asset(model: SceneModel, name: str, views: Sequence[View]) -> Asset:
     """An object of a fitted scene, with the sides from which views show it; the others are closed
-    (``editing/street.py``)."""
+    (``editing/model.py``)."""
     node = model.dynamic_object(name)
-    actor = Actor(node.label, (node.size_m[0], node.size_m[1], node.size_m[2]), motion_of(node))
-    closed = with_closed_sides(model, [name], views_of([actor], views), raster_of(model))
-    return asset_of(closed, name, sides_seen(actor, views).tolist(), light_rgb=surface_light(model, views))
+    actor = Actor(node.label, (node.size_m[0], node.size_m[1], node.size_m[2]), edited.motion_of(node))
+    closed = edited.with_closed_sides(model, [name], views_of([actor], views), raster_of(model))
+    return edited.asset_of(closed, name, plans.sides_seen(actor, views).tolist(), light_rgb=surface_light(model, views))
 
 
 def write_asset(path: Path, asset: Asset) -> None:
@@ -568,9 +585,10 @@ def take_light(plan: EditPlan, model: SceneModel) -> None:
     for name in wanting:
         asset = plan.inserted[name].asset
         unknown += [name] if there is None or asset.light_rgb is None else []
-        plan.inserted[name] = replace(plan.inserted[name], asset=matched_light(asset, there)[0], match_light=False)
+        lit, _ = edited.matched_light(asset, there)
+        plan.inserted[name] = replace(plan.inserted[name], asset=lit, match_light=False)
     if plan.match_objects:
-        plan.objects_gain = light_gain(here, there)
+        plan.objects_gain = edited.light_gain(here, there)
         unknown += [] if here is not None and there is not None else ["what was recorded"]
     if unknown:
         why = "for the light of one of the two streets is not known"

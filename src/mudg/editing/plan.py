@@ -1,6 +1,6 @@
 """From a script to what is to happen: every verb in order, on the paths of all road users and of the vehicle.
 
-Boxes of a scene and objects of a fitted scene lie almost in the same places, but not quite: a fit corrects boxes. So a
+Boxes of a scene and objects of a fitted scene lie almost in the same places, but not quite: a fit corrects paths. So a
 plan keeps what is done to a path as functions, to be applied to either.
 """
 
@@ -16,14 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import geometry
-from mudg.base.errors import InputError, MudgError, UsageError, nearest
+from mudg.base.errors import InputError, UsageError, nearest
 from mudg.base.types import PointCloud, Scene, View
 from mudg.base.weather_settings import WeatherSettings
-from mudg.core import edit as boxes
 from mudg.core import edit as paths
 from mudg.core.edit import Displacement, HeightMap, Motion
 from mudg.editing.model import Asset, motion_of
-from mudg.editing.script import EGO, AssetSource, EditScript, EraseEdit, ScriptEdit
+from mudg.editing.script import EGO, AssetSource, EditScript, EraseEdit
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import RigidNode
 
@@ -91,14 +90,15 @@ class EditWorld:
     def of_scene(cls, scene: Scene, ground: HeightMap | None) -> EditWorld:
         """All boxes of a scene and its vehicle."""
         motion = lambda track: Motion.recorded(track.times_s, track.world_from_object)
-        actors = {track.id: Actor(track.label, _three(track.size_m), motion(track)) for track in scene.tracks}
+        actors = {t.id: Actor(t.label, tuple(map(float, t.size_m)), motion(t)) for t in scene.tracks}
         return cls(actors, Motion.recorded(scene.ego.times_s, scene.ego.world_from_ego), ground)
 
     @classmethod
     def of_model(cls, model: SceneModel, ground: HeightMap | None) -> EditWorld:
         """The objects of a fitted scene."""
         nodes = [node for node in model.nodes if isinstance(node, RigidNode)]
-        return cls({node.name: Actor(node.label, _three(node.size_m), motion_of(node)) for node in nodes}, None, ground)
+        actors = {node.name: Actor(node.label, tuple(map(float, node.size_m)), motion_of(node)) for node in nodes}
+        return cls(actors, None, ground)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,9 +126,9 @@ class EditPlan:
         conditions: records of weather, light and season.
         notes: what the reader should know, with numbers.
         views: recorded ones, which say what nobody saw of the street; none where there is no scene.
-        closed: actors without whose traces the street is to be shown, if they were recorded (``editing/street.py``).
+        closed: actors without whose traces the street is to be shown, if they were recorded (``editing/model.py``).
         erased: records of ``erase``: parts of the street that are taken away.
-        sides: actors whose sides that no view showed are to be closed (``editing/street.py``).
+        sides: actors whose sides that no view showed are to be closed (``editing/model.py``).
     """
 
     before: EditWorld
@@ -179,8 +179,9 @@ def plan_edits(script: EditScript, world: EditWorld, sources: EditSources) -> Ed
             if edit.verb in _DISPLACING:
                 _close(plan, edit.settings.id, edit.settings, sources)
                 (plan.sides.add if edit.settings.close_sides else plan.sides.discard)(edit.settings.id)
-        except (InputError, UsageError) as problem:
-            raise _located(problem, edit) from problem
+        except (InputError, UsageError) as told:
+            where = f"{edit.where}: {edit.verb}" + (f".{told.where}" if told.where else "")
+            raise InputError(told.what, **{**told.fields, "where": where}) from told
     plan.closed = {name for name in plan.closed if _left_its_place(plan, name)}
     others = set[str]()
     if EGO in plan.sides:  # from another path of the vehicle, all are seen anew
@@ -195,11 +196,6 @@ def _left_its_place(plan: EditPlan, name: str) -> bool:
         return before is not None
     old, new = before.motion.poses, after.motion.poses
     return old.shape != new.shape or not np.allclose(old, new, atol=SAME_PLACE_M)
-
-
-def _located(problem: MudgError, edit: ScriptEdit) -> InputError:
-    where = f"{edit.where}: {edit.verb}" + (f".{problem.where}" if problem.where else "")
-    return InputError(problem.what, where=where, expected=problem.expected, got=problem.got, remedy=problem.remedy)
 
 
 # -- verbs -----------------------------------------------------------------------------------------
@@ -230,24 +226,22 @@ def _take_away(plan: EditPlan, name: str) -> None:
 
 def _chosen(world: EditWorld, fields: Any) -> list[str]:
     """Ids of the objects of a kind."""
+    if fields.within_m is not None and world.ego is None:
+        what = "the vehicle's path is not known, so nothing is near it"
+        raise InputError(what, where="within_m", remedy="give --scene")
     names = []
     for name, actor in world.actors.items():
-        near = fields.within_m is None or _nearest_m(world, actor) <= fields.within_m
-        if fields.class_ in (None, actor.label) and fields.moving in (None, actor.moves) and near:
+        if fields.within_m is not None:
+            apart = actor.motion.poses[:, None, :2, 3] - world.ego.poses[None, :, :2, 3]
+            if np.linalg.norm(apart, axis=-1).min() > fields.within_m:
+                continue
+        if fields.class_ in (None, actor.label) and fields.moving in (None, actor.moves):
             names.append(name)
     if not names:
         labels = ", ".join(sorted({actor.label for actor in world.actors.values()}))
         got = str(fields.model_dump(exclude_none=True, by_alias=True))
         raise InputError("no object is of this kind", expected=f"class among {labels or 'none'}", got=got)
     return names
-
-
-def _nearest_m(world: EditWorld, actor: Actor) -> float:
-    if world.ego is None:
-        what = "the vehicle's path is not known, so nothing is near it"
-        raise InputError(what, where="within_m", remedy="give --scene")
-    apart = actor.motion.poses[:, None, :2, 3] - world.ego.poses[None, :, :2, 3]
-    return float(np.linalg.norm(apart, axis=-1).min())
 
 
 def _move(plan: EditPlan, fields: Any, _: EditSources) -> None:
@@ -321,7 +315,9 @@ def _replace(plan: EditPlan, fields: Any, sources: EditSources) -> None:
 
 def _insert(plan: EditPlan, fields: Any, sources: EditSources) -> None:
     asset, world = sources.asset(fields.asset), plan.after
-    name = fields.id or _free_name(world, fields.class_ or asset.label)
+    label = fields.class_ or asset.label
+    numbered = (f"{label}-new{i}" for i in range(1, len(world.actors) + 2))
+    name = fields.id or next(name for name in numbered if name not in world.actors)
     if name in world.actors:
         what, remedy = "there is an object of this id already", "give the new one another id"
         raise InputError(what, where="id", got=name, remedy=remedy)
@@ -333,15 +329,13 @@ def _insert(plan: EditPlan, fields: Any, sources: EditSources) -> None:
         motion = paths.along_points(points, height, ground, _floor(world))
     else:
         motion = _near(world, fields.near, height, ground)
-    sun = None if fields.sun is None else _toward(fields.sun)
+    sun = None
+    if fields.sun is not None:
+        azimuth, elevation = math.radians(fields.sun.azimuth_deg), math.radians(fields.sun.elevation_deg)
+        flat = math.cos(elevation)
+        sun = np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)])
     plan.inserted[name] = Insertion(asset, fields.shadow, fields.match_light, sun)
-    plan.after = replace(
-        world, actors={**world.actors, name: Actor(fields.class_ or asset.label, asset.size_m, motion)}
-    )
-
-
-def _free_name(world: EditWorld, label: str) -> str:
-    return next(name for i in range(1, len(world.actors) + 2) if (name := f"{label}-new{i}") not in world.actors)
+    plan.after = replace(world, actors={**world.actors, name: Actor(label, asset.size_m, motion)})
 
 
 def _at_all_times(point: np.ndarray, world: EditWorld) -> np.ndarray:
@@ -370,10 +364,10 @@ def _near(world: EditWorld, fields: Any, height: float, ground: HeightMap | None
         if pose is None:
             got, expected = f"{fields.at_s} s", f"{leader.times_s[0]:.2f}..{leader.times_s[-1]:.2f} s"
             raise InputError("nobody is there at this time", where="near.at_s", got=got, expected=expected)
-        points = np.array([[0.0, *pose[:2, 3], geometry.yaw_of(pose)]])
-        return paths.along_points(_at_all_times(points[0], world), height, ground, _floor(world))
-    yaws = np.unwrap([geometry.yaw_of(pose) for pose in placed.poses])
-    points = np.column_stack([placed.times_s, placed.poses[:, :2, 3], yaws])
+        points = _at_all_times(np.array([0.0, *pose[:2, 3], geometry.yaw_of(pose)]), world)
+    else:
+        yaws = np.unwrap([geometry.yaw_of(pose) for pose in placed.poses])
+        points = np.column_stack([placed.times_s, placed.poses[:, :2, 3], yaws])
     return paths.along_points(points, height, ground, _floor(world))
 
 
@@ -426,10 +420,6 @@ def _seams(world: EditWorld, ground: HeightMap) -> list[dict[str, Any]]:
     return [{"kind": "off the ground", "ids": list(off), "shares": off, "text": text}] if off else []
 
 
-def _sky(plan: EditPlan, fields: Any, _: EditSources) -> None:
-    plan.sky = fields
-
-
 _VERBS: Final[dict[str, Callable[[EditPlan, Any, EditSources], None]]] = {
     "remove": _remove,
     "move": _move,
@@ -440,7 +430,7 @@ _VERBS: Final[dict[str, Callable[[EditPlan, Any, EditSources], None]]] = {
     "replace": _replace,
     "insert": _insert,
     "background": _background,
-    "sky": _sky,
+    "sky": lambda plan, fields, _: setattr(plan, "sky", fields),
     "erase": lambda plan, fields, _: plan.erased.append(fields),
 }
 
@@ -473,18 +463,6 @@ def _change(plan: EditPlan, name: str, change: Change) -> None:
     if name not in plan.inserted:
         plan.changes.setdefault(name, []).append(change)
     plan.after = replace(plan.after, actors={**plan.after.actors, name: replace(plan.after.actors[name], motion=made)})
-
-
-def _toward(sun: Any) -> np.ndarray:
-    """Unit vector f64[3] towards the sun."""
-    azimuth, elevation = math.radians(sun.azimuth_deg), math.radians(sun.elevation_deg)
-    flat = math.cos(elevation)
-    return np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)])
-
-
-def _three(size_m: Any) -> tuple[float, float, float]:
-    length, width, height = (float(value) for value in size_m)
-    return length, width, height
 
 
 # -- checks ----------------------------------------------------------------------------------------
@@ -551,7 +529,7 @@ def _deepest(a: Actor, b: Actor) -> tuple[float, float]:
     way = sum(float(actor.motion.travelled_m()[-1]) for actor in (a, b))
     if min(gap) > way + (np.linalg.norm(a.size_m) + np.linalg.norm(b.size_m)) / 2:
         return -np.inf, 0.0  # too far apart to meet
-    overlap = boxes.overlap_m(a.motion.at(times).poses, a.size_m, b.motion.at(times).poses, b.size_m)
+    overlap = paths.overlap_m(a.motion.at(times).poses, a.size_m, b.motion.at(times).poses, b.size_m)
     worst = int(overlap.argmax())
     return float(overlap[worst]), float(times[worst])
 
@@ -572,7 +550,7 @@ def unseen_sides(plan: EditPlan, views_before: Sequence[View], views_after: Sequ
             text = f"{name}: from which sides its own recording saw it is not known; export it with its scene"
             found.append({"kind": "unknown sides", "ids": [name], "text": text})
             continue
-        apart = boxes.angle_to_nearest(asked, seen)
+        apart = paths.angle_to_nearest(asked, seen)
         share = float((apart > SELDOM_RAD).mean())
         if share < LEAST_SHARE:
             continue
@@ -593,7 +571,7 @@ def shown_anew(plan: EditPlan, views_before: Sequence[View], views_after: Sequen
             continue
         asked = sides_seen(plan.after.actors[name], views_after)
         seen = sides_seen(plan.before.actors[name], views_before)
-        if len(asked) and len(seen) and boxes.angle_to_nearest(asked, seen).max() > ANOTHER_SIDE_RAD:
+        if len(asked) and len(seen) and paths.angle_to_nearest(asked, seen).max() > ANOTHER_SIDE_RAD:
             found.add(name)
     return found
 
@@ -610,4 +588,4 @@ def sides_seen(actor: Actor, views: Sequence[View]) -> Array:
         if 0 < depth[0] < FARTHEST_M and 0 <= uv[0, 0] <= view.camera.width and 0 <= uv[0, 1] <= view.camera.height:
             poses.append(pose)
             centres.append(view.center_world)
-    return boxes.azimuths(np.stack(poses), np.stack(centres)) if poses else np.zeros(0)
+    return paths.azimuths(np.stack(poses), np.stack(centres)) if poses else np.zeros(0)

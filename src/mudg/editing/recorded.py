@@ -28,11 +28,10 @@ from mudg.core.pictures import to_bytes
 from mudg.core.weather.lidar import SOFT, sweep_in_weather
 from mudg.diffusion.condition import Vacated, VacatedAt, ray_directions
 from mudg.editing.apply import SEED, carry_out, edited_cloud, edited_scene, opener
-from mudg.editing.model import GROUND_CLASSES
+from mudg.editing.model import FLOOR_M, GROUND_CLASSES, STRAY_M
 from mudg.editing.plan import Actor, Background, EditPlan, EditSources, EditWorld, plan_edits
 from mudg.editing.script import EditScript, conditions_of
 from mudg.editing.settings import EditConfig
-from mudg.editing.street import FLOOR_M, STRAY_M
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import raster_of, render_view
 from mudg.scene.labels import read_label

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import io
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -111,7 +110,7 @@ class EditDesk:
         drive = self._carried(text)
         with self._making:
             if text not in self._made:
-                made = [drive.model(model, street_of=self._street) for model in self.models]
+                made = [drive.model(model, street=self._street(model, drive.plan)) for model in self.models]
                 self._made = {**_last(self._made, KEPT - 1), text: made}
             return self._made[text]
 
@@ -156,7 +155,7 @@ class EditDesk:
             self.edited(text)
             return drive
         for model in self.models:
-            drive.model(model, street_of=functools.partial(street_left, close=False))
+            drive.model(model, street=street_left(model, drive.plan, close=False))
         return drive
 
     def _paths(self, drive: EditedDrive) -> dict[str, Any]:
