@@ -492,7 +492,7 @@ def ingest(
         workers: Threads that convert frames (0 = one per processor). The result does not depend on it.
         contact_sheet: Write contact_sheet.jpg: frames with LiDAR points and boxes, and the scene from above. Check it after every import.
         test_every: Hold out every n-th frame of all cameras for scoring (0 = none).
-        format: Format of the log: kitti, kitti360, waymo, nuscenes, argoverse2, pandaset, nuplan, dgp, ncore or custom (auto = recognise it).
+        format: Format of the log: kitti, kitti360, waymo, nuscenes, argoverse2, pandaset, nuplan, ncore or custom (auto = recognise it).
         frames: Frames to import, FIRST:END without END itself, e.g. 0:40 (empty = all). kitti, kitti360, pandaset: the numbers of their files; other formats: counted from 0.
         cameras: Cameras to import, by their names in the scene or in the dataset (empty = the format's default cameras).
         sequence: Log, sequence, scene or frame to import, if the folder holds several.
