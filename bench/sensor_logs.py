@@ -1,8 +1,7 @@
-"""Times the importers of nuScenes, Argoverse 2 and DGP on made-up logs of real sizes; each in a process of its own.
+"""Times the importers of nuScenes and Argoverse 2 on made-up logs of real sizes; each in a process of its own.
 
     python bench/sensor_logs.py nuscenes --seconds 4 --rows 500000 --workers 1
     python bench/sensor_logs.py argoverse2 --seconds 4
-    python bench/sensor_logs.py dgp --seconds 4
 
 Cameras, rates, image sizes and points per sweep are those of the data sets; all images are copies of one textured JPEG.
 ``--rows`` pads the large nuScenes tables with records of other scenes (the full release has 2,600,000).
@@ -177,36 +176,6 @@ def make_argoverse2(root: Path, seconds: float) -> int:
     return len(stamps)
 
 
-def make_dgp(root: Path, seconds: float) -> int:
-    """Six cameras of 1936x1216 and 49,000 points at 10 Hz."""
-
-    def pose(matrix: np.ndarray) -> dict:
-        q, t = quaternion_from_matrix(matrix).tolist(), matrix[:3, 3].tolist()
-        return {"rotation": dict(zip(("qw", "qx", "qy", "qz"), q)), "translation": dict(zip("xyz", t))}
-
-    (root / "image.jpg").write_bytes(jpeg(1936, 1216))
-    np.savez_compressed(root / "scan.npz", data=np.c_[street(49_000), np.full(49_000, 0.3)].astype("f8"))
-    mounts = {f"CAMERA_0{n}": mount(1.05 * n) for n in range(1, 7)} | {"LIDAR": np.eye(4)}
-    data, samples = [], []
-    for number in range(int(seconds * 10)):
-        stamp = f"2019-06-27T16:{number // 600:02d}:{number // 10 % 60:02d}.{number % 10}00000Z"
-        for name, sensor in mounts.items():
-            file = (
-                f"{'point_cloud' if name == 'LIDAR' else 'rgb'}/{name}/{number}.{'npz' if name == 'LIDAR' else 'jpg'}"
-            )
-            link(root / ("scan.npz" if name == "LIDAR" else "image.jpg"), root / file)
-            record = {"filename": file, "pose": pose(map_from_ego(number / 10) @ sensor), "width": 1936, "height": 1216}
-            kind = "point_cloud" if name == "LIDAR" else "image"
-            data.append({"datum": {kind: record}, "id": {"name": name, "timestamp": stamp}, "key": file})
-        samples.append({"datum_keys": [item["key"] for item in data[-7:]], "calibration_key": "c"})
-    (root / "calibration").mkdir()
-    lens = {"fx": 1056.0, "fy": 1056.0, "cx": 964.0, "cy": 588.0, "skew": 0.0}
-    calibration = {"names": list(mounts), "extrinsics": [pose(m) for m in mounts.values()], "intrinsics": [lens] * 7}
-    (root / "calibration" / "c.json").write_text(json.dumps(calibration))
-    (root / "scene_0.json").write_text(json.dumps({"data": data, "samples": samples, "ontologies": {}}))
-    return len(samples)
-
-
 def peak_mb() -> float:
     """Largest resident size of this process so far (Linux); a child does not inherit it, as it does ``ru_maxrss``."""
     lines = Path("/proc/self/status").read_text().splitlines()
@@ -236,7 +205,7 @@ def measure(name: str, source: Path, out: Path, workers: int) -> None:
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("format", choices=("nuscenes", "argoverse2", "dgp"))
+    parser.add_argument("format", choices=("nuscenes", "argoverse2"))
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--rows", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
@@ -248,12 +217,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "log"
         root.mkdir()
-        make = {"nuscenes": lambda: make_nuscenes(root, options.seconds, options.rows)}
-        make |= {
-            "argoverse2": lambda: make_argoverse2(root, options.seconds),
-            "dgp": lambda: make_dgp(root, options.seconds),
-        }
-        moments = make[options.format]()
+        nuscenes = options.format == "nuscenes"
+        seconds = options.seconds
+        moments = make_nuscenes(root, seconds, options.rows) if nuscenes else make_argoverse2(root, seconds)
         if options.rows:
             size = (root / "v1.0-mini" / "sample_data.json").stat().st_size / 1e6
             say(f"sample_data.json holds {options.rows} other records, {size:.0f} MB")

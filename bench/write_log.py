@@ -5,7 +5,7 @@
     python bench/ingest_cost.py FORMAT FOLDER
 
 FORMAT is one of kitti360, pandaset, nuplan, custom, recording (what docs/examples/convert_my_log.py reads) and, with
-``--small`` only, waymo, nuscenes, argoverse2, dgp (argoverse2 needs pyarrow). The logs are written by the writers of
+``--small`` only, waymo, nuscenes, argoverse2 (argoverse2 needs pyarrow). The logs are written by the writers of
 ``tests/``; cameras that the city's car lacks show another camera's images.
 """
 
@@ -24,7 +24,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import roundtrip
 from write_custom import write_log, write_recording
-from write_dgp import write_dgp
 from write_kitti360 import write_kitti360
 from write_nuplan import write_nuplan
 from write_nuscenes import write_nuscenes
@@ -75,7 +74,6 @@ SMALL_WRITERS: dict[str, Callable[[Scene, Path], object]] = {
     "waymo": write_waymo,
     "nuscenes": write_nuscenes,
     "argoverse2": write_av2,
-    "dgp": write_dgp,
     "recording": write_raw,
 }
 

@@ -25,7 +25,6 @@ import pytest
 import roundtrip
 import write_av2
 import write_custom
-import write_dgp
 import write_kitti360
 import write_nuplan
 import write_nuscenes
@@ -44,7 +43,7 @@ from mudg.scene.read import read_scene
 Change = Callable[[bytes], bytes]
 TWO = {"cameras": ("front", "front_left")}
 NUSCENES = {**TWO, "sequence": "scene-0007"}
-FORMATS = ("kitti", "kitti360", "waymo v1", "waymo v2", "nuscenes", "argoverse2", "pandaset", "nuplan", "dgp", "custom")
+FORMATS = ("kitti", "kitti360", "waymo v1", "waymo v2", "nuscenes", "argoverse2", "pandaset", "nuplan", "custom")
 NEEDS_PYARROW = ("waymo v2", "argoverse2")
 
 
@@ -133,9 +132,6 @@ def written(kind: str, folder: Path) -> Files | write_waymo.Log:
             image = f"{write_nuplan.token('CAM_F0', 1).hex()}.jpg"
             cloud = f"{write_nuplan.token('cloud', 1).hex()}.pcd"
             return Files(database, blobs / "CAM_F0" / image, blobs / "MergedPointCloud" / cloud)
-        case "dgp":
-            write_dgp.write_dgp(truth, root)
-            return Files(root, root / "rgb/FRONT/1.png", root / "point_cloud/LIDAR/1.npz")
         case "custom":
             write_custom.write_log(truth, root)
             return Files(root, root / "images/front/000001.png", root / "lidar/lidar/000001.npz")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import gzip
 import io
+import re
 import shutil
 import sqlite3
 import zipfile
@@ -20,7 +21,6 @@ import bad_logs
 import numpy as np
 import pytest
 import write_av2
-import write_dgp
 import write_nuscenes
 import write_waymo
 from bad_logs import Change
@@ -72,9 +72,7 @@ def flipped(at: float) -> Change:
 
 
 CLOUDS: dict[tuple[str, str], tuple[Change, str]] = {
-    ("dgp", "declares 10^12 points"): (npz(tall, "data.npy"), "declared size"),
     ("custom", "declares 10^12 points"): (npz(tall, "xyz.npy"), "declared size"),
-    ("dgp", "wrong checksum"): (flipped(0.5), "cut off"),
     ("custom", "wrong checksum"): (flipped(0.5), "not a readable NPZ"),
     ("pandaset", "wrong checksum"): (lambda c: c[:-8] + bytes([c[-8] ^ 1]) + c[-7:], "damaged"),
     ("argoverse2", "no table"): (lambda c: b"FEA1" + c[4:], "table cannot be read"),
@@ -90,15 +88,17 @@ def test_a_bad_cloud_is_refused_by_name(kind: str, case: str, folder: Path, tmp_
 
 
 def test_a_missing_cloud_is_refused_where_the_log_names_it(folder: Path, tmp_path: Path) -> None:
-    log = bad_logs.written("dgp", folder)
+    log = bad_logs.written("nuscenes", folder)
     assert isinstance(log, bad_logs.Files)
     content = log.cloud.read_bytes()
     log.cloud.unlink()
     try:
-        error = bad_logs.assert_refused("dgp", log.source, tmp_path, ImportOptions(), "missing", "1.npz")
+        error = bad_logs.assert_refused(
+            "nuscenes", log.source, tmp_path, bad_logs.options_of(log), "missing", re.escape(log.cloud.name)
+        )
     finally:
         log.cloud.write_bytes(content)
-    assert "lidar lacks 1" in error.got
+    assert "lidar_top lacks 1" in error.got
 
 
 def brighter(columns: int) -> Change:
@@ -232,15 +232,7 @@ def backslashes(rows: list[dict[str, Any]]) -> None:
         row["filename"] = row["filename"].replace("/", "\\")
 
 
-def dgp(file: str, change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
-    return lambda root: write_dgp.edit(root / file, lambda record: [change(record), None][1])
-
-
 LONG = "n" * 201
-
-
-def dgp_clouds(record: dict[str, Any]) -> None:
-    backslashes([d["datum"]["point_cloud"] for d in record["data"] if "point_cloud" in d["datum"]])
 
 
 def long_column(name: str) -> Callable[[Path], None]:
@@ -272,7 +264,6 @@ def long_labels(root: Path) -> None:
 TOO_LONG = "name is too long"
 SWAP = "UPDATE lidar_box SET width = length, length = width"
 BACKSLASH = "UPDATE image SET filename_jpg = replace(filename_jpg, '/', '\\')"
-LAST_CENTURY = {"timestamp": "1970-01-18T20:00:00.123456Z"}
 LONG_NUMBER = text("data_3d_bboxes/train/*.xml", "<instanceId>1<", f"<instanceId>{'1' * 300}<")
 RECORDS: dict[tuple[str, str], tuple[Callable[[Path], None], str, str]] = {
     # format and what is wrong: (how the log is damaged, words of the error, the place it names)
@@ -282,13 +273,6 @@ RECORDS: dict[tuple[str, str], tuple[Callable[[Path], None], str, str]] = {
     ("nuscenes", "Windows path"): (nuscenes("sample_data", backslashes), "backslash", "sample_data.json: record"),
     ("nuplan", "Windows path"): (nuplan(BACKSLASH), "backslash", "image at"),
     ("nuplan", "width and length swapped"): (nuplan(SWAP), "swapped", "lidar_box"),
-    ("dgp", "Windows path"): (dgp("scene_abc.json", dgp_clouds), "backslash", "datum LIDAR"),
-    ("dgp", "times of another century"): (
-        dgp("scene_abc.json", lambda r: [d["id"].update(LAST_CENTURY) for d in r["data"]]),
-        "another unit",
-        "scene_abc.json",
-    ),
-    ("dgp", "missing image"): (lambda r: (r / "rgb/FRONT/1.png").unlink(), "missing", "1.png"),
     ("kitti", "class of 201 letters"): (text("derived/label_02.txt", "Car", LONG), TOO_LONG, "label_02.txt"),
     ("kitti360", "number of an object of 300 digits"): (LONG_NUMBER, TOO_LONG, "id of an object"),
     ("nuscenes", "class of 201 letters"): (
@@ -299,7 +283,6 @@ RECORDS: dict[tuple[str, str], tuple[Callable[[Path], None], str, str]] = {
     ("argoverse2", "class of 201 letters"): (long_column("category"), TOO_LONG, "annotations.feather"),
     ("argoverse2", "id of 201 letters"): (long_column("track_uuid"), TOO_LONG, "annotations.feather"),
     ("pandaset", "class of 201 letters"): (long_labels, TOO_LONG, "cuboids"),
-    ("dgp", "class of 201 letters"): (text("ontology/*.json", '"Car"', f'"{LONG}"'), TOO_LONG, "bounding_box_3d"),
     ("custom", "class of 201 letters"): (text("log.json", '"class": "car"', f'"class": "{LONG}"'), TOO_LONG, "tracks"),
     ("nuscenes", "missing image"): (
         lambda r: bad_logs.second(r / "samples/CAM_FRONT").unlink(),
@@ -334,11 +317,11 @@ def test_an_unknown_class_of_kitti_keeps_its_name_and_is_noted(folder: Path, tmp
 
 
 def test_rows_in_any_order_give_the_same_scene(folder: Path, tmp_path: Path) -> None:
-    """Tables and lists whose order means nothing: poses and boxes of Argoverse 2, samples of DGP."""
+    """Tables and lists whose order means nothing: poses and boxes of Argoverse 2, images and sweeps of nuScenes."""
     pytest.importorskip("pyarrow")
     for kind, spoil in (
         ("argoverse2", reversed_tables),
-        ("dgp", dgp("scene_abc.json", lambda r: r["samples"].reverse())),
+        ("nuscenes", nuscenes("sample_data", lambda rows: rows.reverse())),
     ):
         log = bad_logs.written(kind, folder)
         assert isinstance(log, bad_logs.Files)

@@ -210,8 +210,8 @@ def test_nodes_edits_and_motion(fit: Path, tmp_path: Path) -> None:
     Export(format="glb", source=fit, out=tmp_path / "a.glb", settings=ExportConfig(sky="sphere")).run()
     document, _ = slow.open_glb((tmp_path / "a.glb").read_bytes())
     assert [node["name"] for node in document["nodes"]] == ["background", "car-1", "sky"]
-    Export(format="bundle", source=fit, out=tmp_path / "a.zip", settings=ExportConfig()).run()
-    assert "sky.png" in zipfile.ZipFile(tmp_path / "a.zip").namelist()
+    Export(format="usdz", source=fit, out=tmp_path / "a.usdz", settings=ExportConfig()).run()
+    assert "sky.png" in zipfile.ZipFile(tmp_path / "a.usdz").namelist()
 
 
 @pytest.mark.parametrize(
@@ -221,7 +221,7 @@ def test_nodes_edits_and_motion(fit: Path, tmp_path: Path) -> None:
         ({}, "ply", "a.spz", "does not fit its format"),
         ({"animated": True}, "ply", "a.ply", "cannot hold motion"),
         ({"animated": True, "time_s": 1.0}, "glb", "a.glb", "one moment or the motion"),
-        ({"time_s": 1.0}, "bundle", "a.zip", "holds all moments"),
+        ({"time_s": 1.0}, "alpasim", "a.usdz", "holds all moments"),
         ({"spz_version": 4}, "ply", "a.ply", "does not have this setting"),
         ({"nodes": ("car-7",)}, "ply", "a.ply", "no node 'car-7'"),
         ({"nodes": ("car-1",), "time_s": 99.0}, "sog", "a.sog", "nothing to export"),

@@ -105,8 +105,6 @@ CASES: dict[str, tuple[str, Callable[[Path], None]]] = {
     "kitti360 NaN": ("kitti360", float_rows(4, np.nan)),
     "nuscenes zeros": ("nuscenes", float_rows(5, 0.0)),
     "nuscenes NaN": ("nuscenes", float_rows(5, np.nan)),
-    "dgp zeros": ("dgp", npz("data", 0.0)),
-    "dgp NaN": ("dgp", npz("data", np.nan)),
     "custom zeros": ("custom", npz("xyz", 0.0)),
     "custom infinity": ("custom", npz("xyz", np.inf)),
     "nuplan zeros": ("nuplan", pcd((0, 0, 0))),

@@ -128,12 +128,6 @@ def test_golden_bytes_of_three_gaussians() -> None:
         for n in archive.namelist()
         if n.endswith("webp")
     }
-    files = zipfile.ZipFile(io.BytesIO(formats.bundle_bytes(toy_splats.scene(0, 1))))
-    made["bundle"] = {
-        name: rounded(files.read(name)) if name.endswith("json") else files.read(name).hex()
-        for name in files.namelist()
-        if name != "sky.png"
-    }
     made["sog"] = {"meta.json": rounded(archive.read("meta.json")), **pictures}
     if os.environ.get("MUDG_UPDATE_FROZEN"):
         GOLDEN.write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
@@ -246,31 +240,6 @@ def _has_zstandard() -> bool:
     return importlib.util.find_spec("zstandard") is not None
 
 
-def test_the_bundle_holds_everything() -> None:
-    scene = toy_splats.scene(1)
-    archive = zipfile.ZipFile(io.BytesIO(formats.bundle_bytes(scene)))
-    assert all(info.compress_type == zipfile.ZIP_STORED for info in archive.infolist())
-    about, tracks = (json.loads(archive.read(name)) for name in ("bundle.json", "tracks.json"))
-    assert [node["name"] for node in about["nodes"]] == ["background", "car-1", "1 person"]
-    assert tracks["schema"] == "splatsim.sequence_tracks/v2" and [t["track_id"] for t in tracks["tracks"]] == [
-        "car-1",
-        "1 person",
-    ]
-    frame = tracks["tracks"][0]["frames"][1]
-    assert frame["timestamp_us"] == 250_000 and frame["translation"] == [1.0, 1.0, 0.8]
-    assert np.allclose(frame["rotation"], [0, 0, np.sin(0.3), np.cos(0.3)])
-    from safetensors.numpy import load
-
-    for node, kept in zip(scene.nodes, about["nodes"], strict=True):
-        assert_close(
-            as_cloud(slow.read_ply(archive.read(kept["file"]))), node.cloud, steps("ply", node.cloud), activated=True
-        )
-    moved = load(archive.read(about["nodes"][2]["deform"]))["displacement"]
-    assert scene.nodes[2].displacement is not None and np.array_equal(moved, scene.nodes[2].displacement)
-    sky = np.asarray(Image.open(io.BytesIO(archive.read("sky.png"))))
-    assert scene.sky is not None and np.array_equal(sky, scene.sky)
-
-
 def test_zips_are_aligned_and_the_same_each_time() -> None:
     files = {"a.usda": b"x" * 100, "a name.png": b"y" * 7, "b" * 61: b"z" * 64}
     content = binary.stored_zip(files, align=64)
@@ -295,7 +264,7 @@ def test_what_is_lost_is_said() -> None:
     def lost(name: str, time_s: float | None) -> str:
         return "; ".join(formats.losses(name, formats.WriteRequest(scene, time_s)))
 
-    assert lost("bundle", None) == "" and lost("usdz", None) == ""
+    assert lost("usdz", None) == ""
     assert lost("usda", None).startswith("the sky")
     assert lost("glb", None).startswith("deformation (1 person in the shape of the middle")
     assert "motion (2 objects as at 0.5 s)" in lost("ply", 0.5)
@@ -314,9 +283,8 @@ def test_a_fit_that_draws_antialiased_says_so_where_it_can() -> None:
     assert not any("draws" in sentence for sentence in formats.losses("spz", request))
 
 
-def test_names_of_prims_and_files_are_valid_and_differ() -> None:
+def test_names_of_prims_are_valid_and_differ() -> None:
     assert usd.prim_names(["a-1", "a_1", "7", ""]) == ["a_1", "a_1_2", "_7", "node"]
-    assert formats.file_names(["a/b", "A_b", ".."]) == ["a_b", "A_b_2", "node"]
 
 
 def test_times_of_animations_rise_and_are_not_negative() -> None:

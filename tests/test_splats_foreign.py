@@ -150,16 +150,6 @@ def test_a_ply_with_the_axes_of_this_program_says_so(name: str, choice: str) -> 
     assert nearest.max() < 0.05
 
 
-def test_parts_of_a_bundle_state_their_axes() -> None:
-    archive = zipfile.ZipFile(
-        io.BytesIO(formats.FORMATS["bundle"].write(formats.WriteRequest(toy_splats.scene(), None)))
-    )
-    parts = [name for name in archive.namelist() if name.endswith(".ply")]
-    assert len(parts) == 3
-    for name, node in zip(parts, toy_splats.scene().nodes, strict=True):
-        assert np.allclose(read(archive.read(name)).means, node.cloud.means, atol=1e-6)
-
-
 def test_an_object_of_antialiased_gaussians_says_that_it_is_drawn_otherwise(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -20,7 +20,6 @@ import kitti_folders
 import numpy as np
 import pytest
 import write_av2
-import write_dgp
 import write_nuscenes
 import write_pandaset
 import write_waymo
@@ -108,14 +107,6 @@ def to_database(root: Path, names: Sequence[str]) -> None:
     connection.close()
 
 
-def to_boxes_of_dgp(root: Path, names: Sequence[str]) -> None:
-    for path in root.rglob("bounding_box_3d/*/*.json"):
-        content = json.loads(path.read_text())
-        for one in content["annotations"]:
-            one["box"] |= {name.removeprefix("annotations.box."): 0 for name in names}
-        write_dgp.write_json(path, content)
-
-
 def to_clouds(root: Path, names: Sequence[str]) -> None:
     for path in root.rglob("lidar/**/*.npz"):
         arrays: dict[str, Any] = dict(np.load(path))
@@ -134,7 +125,6 @@ CASES: dict[str, tuple[Adder, Sequence[str], str, str]] = {
     "argoverse2": (to_sweeps, ("laser_number",), "foo", "sensors/lidar/*.feather"),
     "pandaset": (to_poses, (), "foo", "poses.json"),
     "nuplan": (to_database, ("acceleration_x", "angular_rate_z"), "foo", "the table ego_pose"),
-    "dgp": (to_boxes_of_dgp, ("occlusion", "truncation"), "annotations.box.foo", "bounding_box_3d/*.json"),
     "custom": (to_clouds, ("ring", "near_ir"), "foo", "*.npz"),
 }
 """Format -> how fields come into a file of it; official ones; one that is none; what the file is called."""
@@ -247,7 +237,6 @@ def test_tracklets_of_a_raw_drive(tmp_path: Path, capsys: pytest.CaptureFixture[
 REAL = {
     "kitti": ("kitti_2011_09_26", {"frames": (0, 2)}),
     "pandaset": ("pandaset_002", {"frames": (33, 35), "cameras": ("front",)}),
-    "dgp": ("dgp_scene_02/scene_02", {}),
 }
 
 

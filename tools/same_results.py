@@ -74,12 +74,11 @@ import json, pathlib, sys
 from dataclasses import asdict
 import numpy as np, torch, yaml
 import kitti_folders, roundtrip, toy_clips, toy_published
-import write_av2, write_custom, write_dgp, write_kitti360, write_nuplan, write_nuscenes, write_pandaset, waymo_logs
+import write_av2, write_custom, write_kitti360, write_nuplan, write_nuscenes, write_pandaset, waymo_logs
 root = pathlib.Path(sys.argv[1]); logs = root / "logs"; logs.mkdir(parents=True)
 truth = roundtrip.small_log(root.parent / "truth")
 write_av2.write_av2(truth, logs / "argoverse2")
 write_custom.write_log(truth, logs / "custom")
-write_dgp.write_dgp(truth, logs / "dgp")
 write_kitti360.write_kitti360(truth, logs / "kitti360")
 write_nuplan.write_nuplan(truth, logs / "nuplan")
 write_nuscenes.write_nuscenes(truth, logs / "nuscenes")
@@ -105,7 +104,7 @@ for name, text in {
     "wrong_key": "- remove: {idss: [car-001]}", "wrong_id": "- remove: {ids: [car-999]}",
 }.items():
     (edits / f"{name}.yaml").write_text(text + "\\n")
-(root / "list.txt").write_text("logs/custom name=a\\nlogs/dgp name=b\\n")
+(root / "list.txt").write_text("logs/custom name=a\\nlogs/kitti360 name=b\\n")
 """
 
 

@@ -255,7 +255,6 @@ CAMERAS: Final[Mapping[str, Callable[[Scene, PointCloud | None], dict[str, bytes
     "colmap-text": lambda scene, points: colmap_files(scene, points, text=True),
 }
 """Formats of cameras: files beside the pictures."""
-_ALL_MOMENTS: Final = ("bundle", "alpasim")
 MOST_POINTS: Final = 500_000
 _CAMERA_FILES: Final = ("transforms.json", "points.ply", *below("sparse/0", ("*.bin", "*.txt")), "images/")
 FOLDERS: Final = {**dict.fromkeys(CAMERAS, (1, _CAMERA_FILES)), **LOG_FOLDERS}
@@ -340,7 +339,7 @@ def _refuse_settings(config: ExportConfig, name: str) -> None:
         able = ", ".join(key for key, one in FORMATS.items() if "motion" in one.carries)
         what = "this format cannot hold motion"
         raise UsageError(what, where="--animated", got=name, expected=able, remedy="or give --time-s")
-    if name in _ALL_MOMENTS and config.time_s is not None:
+    if name == "alpasim" and config.time_s is not None:
         what = "a file of this format holds all moments"
         raise UsageError(what, where="--time-s", got=name, remedy="leave it out, or export ply")
     usual = ExportConfig()

@@ -23,7 +23,7 @@ class IngestConfig:
     test_every: int = setting(default=4, ge=0)
     """Hold out every n-th frame of all cameras for scoring (0 = none)."""
     format: str = "auto"
-    """Format of the log: kitti, kitti360, waymo, nuscenes, argoverse2, pandaset, nuplan, dgp, ncore or custom (auto =
+    """Format of the log: kitti, kitti360, waymo, nuscenes, argoverse2, pandaset, nuplan, ncore or custom (auto =
     recognise it)."""
     frames: str = ""
     """Frames to import, FIRST:END without END itself, e.g. 0:40 (empty = all). kitti, kitti360, pandaset: the numbers

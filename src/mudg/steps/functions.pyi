@@ -300,7 +300,7 @@ def export(
     """Write a fitted scene for other programs: PLY, SPZ, glTF, USD, SOG; cameras for nerfstudio and COLMAP.
 
     Args:
-        format: Gaussians: ply, bundle, alpasim, spz, glb, usda, usdz, compressed-ply, sog, splat. Cameras: nerfstudio, colmap, colmap-text. The log over time: mcap, ros2, rerun, ncore.
+        format: Gaussians: ply, alpasim, spz, glb, usda, usdz, compressed-ply, sog, splat. Cameras: nerfstudio, colmap, colmap-text. The log over time: mcap, ros2, rerun, ncore.
         source: Gaussian scene written by fit, or folder of a finished mudg run; for cameras also a scene directory.
         out: File to write, with the suffix of the format; for cameras, ros2 and ncore, folder to write.
         scene: Scene directory that a Gaussian scene was fitted to. A run has its own.
@@ -492,7 +492,7 @@ def ingest(
         workers: Threads that convert frames (0 = one per processor). The result does not depend on it.
         contact_sheet: Write contact_sheet.jpg: frames with LiDAR points and boxes, and the scene from above. Check it after every import.
         test_every: Hold out every n-th frame of all cameras for scoring (0 = none).
-        format: Format of the log: kitti, kitti360, waymo, nuscenes, argoverse2, pandaset, nuplan, dgp, ncore or custom (auto = recognise it).
+        format: Format of the log: kitti, kitti360, waymo, nuscenes, argoverse2, pandaset, nuplan, ncore or custom (auto = recognise it).
         frames: Frames to import, FIRST:END without END itself, e.g. 0:40 (empty = all). kitti, kitti360, pandaset: the numbers of their files; other formats: counted from 0.
         cameras: Cameras to import, by their names in the scene or in the dataset (empty = the format's default cameras).
         sequence: Log, sequence, scene or frame to import, if the folder holds several.

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from mudg.labels.settings import AnnotateConfig
     from mudg.scene.settings import FuseConfig
 
-FORMATS = ("kitti360", "waymo", "nuscenes", "argoverse2", "pandaset", "nuplan", "dgp", "ncore", "custom", "kitti")
+FORMATS = ("kitti360", "waymo", "nuscenes", "argoverse2", "pandaset", "nuplan", "ncore", "custom", "kitti")
 
 
 OF_A_LOG = ("format", "frames", "cameras", "sequence", "poses", "boxes", "resolution", "skip_missing", "untwist")

@@ -9,6 +9,7 @@ their own times. Boxes stand in ``world``.
 
 from __future__ import annotations
 
+import re
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -39,7 +40,6 @@ from mudg.formats.ncore import (
     euler_of,
     package,
 )
-from mudg.formats.splats.formats import file_names
 from mudg.scene.labels import read_label
 
 FILES: Final = (f"*{MARK}.zarr.itar", f"*{MARK}.json")
@@ -60,7 +60,7 @@ def write_ncore(folder: Path, records: LogRecords) -> list[Path]:
             one microsecond.
     """
     made = _WrittenLog(records)
-    name = file_names([records.scene.id])[0]
+    name = re.sub(r"[^A-Za-z0-9_.-]", "_", records.scene.id).strip(".") or "log"
     with tempfile.TemporaryDirectory(prefix=".ncore.", suffix=".part", dir=folder) as work:
         found = [Path(work) / path.name for path in made.write(Path(work), name)]
         files = [folder / path.name for path in found]

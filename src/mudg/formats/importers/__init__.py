@@ -31,7 +31,6 @@ _MODULES = {
     "argoverse2": "argoverse2",
     "pandaset": "pandaset",
     "nuplan": "nuplan",
-    "dgp": "dgp",
     "ncore": "ncore",
     "custom": "custom",
     "kitti": "kitti",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -355,12 +355,12 @@ def doubtful_values(cloud: SplatCloud, where: str) -> list[str]:
     return found
 
 
-def each_once(names: Iterable[str], key: Callable[[str], str] = str) -> list[str]:
-    """Names that differ, also under ``key``: the second of one name is NAME_2."""
+def each_once(names: Iterable[str]) -> list[str]:
+    """Names that differ: the second of one name is NAME_2."""
     chosen: list[str] = []
     for name in names:
         candidate, count = name, 1
-        while key(candidate) in map(key, chosen):
+        while candidate in chosen:
             count += 1
             candidate = f"{name}_{count}"
         chosen.append(candidate)

@@ -211,8 +211,7 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     names = [name for name in archive.names if name.rpartition("/")[2] == "meta.json"]
     if not names:
         got = listed(archive.names) or "an empty zip"
-        remedy = "of a bundle, give the PLY files within" if "bundle.json" in archive.names else ""
-        raise InputError("the zip is no SOG file", where=where, expected="meta.json", got=got, remedy=remedy)
+        raise InputError("the zip is no SOG file", where=where, expected="meta.json", got=got)
     folder = names[0].removesuffix("meta.json")
     stated = store.parse_json(archive.read(names[0], _MOST_META), f"{where}: {names[0]}")
     if isinstance(stated, dict) and stated.get("version") != 2:
