@@ -467,7 +467,7 @@ def filled(tmp_path_factory):
     model = tmp_path_factory.mktemp("model") / "model"
     mdm_files.save(MDM(dataclasses.replace(SMALL, renders=True)), model, "a model of tests", {})
     size = {"logs": 2, "processes": 1, "videos": False, "resolution": "96x64", "frames": "0:5"}
-    methods = ("street_gaussians", "mudg_r", "freevs", "mudg_s")
+    methods = ("street_gaussians", "mudg_r", "mudg_s")
     config = BenchConfig(**size, iterations=20, model=str(model), methods=methods)
     return bench.run("paper", config, tmp_path_factory.mktemp("paper") / "out", sources=("city:development",)), config
 
@@ -482,7 +482,6 @@ def test_a_table_on_cities_end_to_end(filled):
         assert cell["n"] == [10, 10] and cell["standard_error"] > 0
         assert document["cells"][row]["3"]["fid"] == {"reason": "no weights: --score.fid-weights"}
     assert document["cells"]["truth"]["3"]["flicker"]["mean"] == pytest.approx(1.0)
-    assert document["cells"]["freevs"]["3"]["psnr"] == {"reason": "no model: --freevs-model"}
     seed = document["logs"][0]["log"]
     assert (out / seed / "film" / "front_shift+3.0.jpg").is_file()
     names = ("fit/mudg_s", "virtual", "score/mudg_s")
@@ -503,20 +502,18 @@ def test_a_table_on_cities_end_to_end(filled):
 def test_settings_and_further_paths_end_to_end(filled, table, tmp_path):
     _, config = filled
     own = [row.name for row in TABLES[table].rows]
-    methods = BenchConfig().methods if own else ("mudg_r", "freevs")
-    config = dataclasses.replace(config, table=table, logs=1, methods=methods, freevs_model="" if own else config.model)
+    methods = BenchConfig().methods if own else ("mudg_r",)
+    config = dataclasses.replace(config, table=table, logs=1, methods=methods)
     if table != "mudg3":  # nothing is fitted
         config = dataclasses.replace(config, iterations=BenchConfig().iterations, fit=BenchConfig().fit)
     out = bench.run("paper", config, tmp_path / "out", sources=("city:development",))
     document = store.read_json(out / "bench.json")
-    for name in own or ["mudg_r", "freevs"]:
+    for name in own or ["mudg_r"]:
         for place in TABLES[table].places:
             assert "mean" in document["cells"][name][place.name]["psnr"], (name, place.name)
     if table == "mudg2":
         psnr = {name: of[RECORDED]["psnr"]["mean"] for name, of in document["cells"].items() if name != "truth"}
         assert len({round(value, 6) for value in psnr.values()}) == len(psnr)  # every condition gives other views
-    if not own:
-        assert document["cells"]["freevs"]["lane"]["abs_rel"] == {"reason": "not produced"}
 
 
 @pytest.mark.slow

@@ -136,8 +136,6 @@ REFUSED = [
     ("shift", ["--preset", "paper"], "--model", "convert a checkpoint"),
     ("shift", ["--synthesize.compiled"], "--compiled", "leave it out"),
     ("shift", ["--methods", "pvg", "--fit.poses.learn"], "poses.learn", "leave the setting out"),
-    ("paper", ["--table", "mudg3", "--freevs-model", "x"], "--freevs-model", "leave it out"),
-    ("paper", ["--methods", "mudg_r", "--freevs-model", "x"], "--freevs-model", "leave it out"),
 ]
 
 

@@ -8,10 +8,9 @@ import torch
 
 from mudg import native
 from mudg.base.errors import InputError
-from mudg.base.types import Camera, Clip, Condition, FusedCloud, Photo, PointCloud, SweepPoints, Track, View
+from mudg.base.types import Camera, Clip, Condition, FusedCloud, Photo, PointCloud, Track, View
 from mudg.core import project as visible
-from mudg.core.fusion import SweepShots
-from mudg.diffusion import city_clips, clips, inputs
+from mudg.diffusion import city_clips, clips
 from mudg.diffusion import condition as conditions
 from mudg.diffusion.city_clips import HELD_OUT, CityClipRules, shifts_of
 from mudg.diffusion.condition import ConditionRules, WarpSource, build_conditions
@@ -300,53 +299,3 @@ def test_held_out_cities_have_the_stated_shifts():
         assert min(shifts) < 0 < max(shifts)
         assert shifts[-1] == 0.0
         assert all(0.5 <= abs(s) <= 4.2 for s in shifts[:-1])
-
-
-# ---- the condition of FreeVS ---------------------------------------------------------------------
-
-
-def one_wall_per_sweep(times, track=None):
-    """Sweeps of a 5 m wide piece of a wall at x = 12, each further to the left by 1 m, coloured by an image of one
-    colour."""
-    sweeps = []
-    for number, time_s in enumerate(times):
-        y, z = (grid.ravel() for grid in np.meshgrid(np.arange(-2.5, 2.5, 0.05) + number, np.arange(-2, 2, 0.05)))
-        xyz = np.stack([np.full(y.size, 12.0), y, z], 1).astype(np.float32)
-        points = SweepPoints(xyz, np.zeros(len(xyz), np.float32), np.zeros(len(xyz), np.float32))
-        image = np.full((32, 48, 3), 40 * number + 20, np.uint8)
-        sweeps.append(SweepShots(time_s, np.eye(4), points, [Photo(view_at(time_s=time_s), image)]))
-    return inputs.NearSweeps(tuple(times), sweeps.__getitem__, (), 0.1)
-
-
-def test_points_of_two_frames_before_and_after_are_shown():
-    near = one_wall_per_sweep([0.1 * n for n in range(6)])
-    assert near.numbers_at(0.3) == (1, 2, 3, 4, 5)
-    assert near.numbers_at(0.0) == (0, 1, 2) and near.numbers_at(9.0) == (3, 4, 5)
-    condition = inputs.near_condition(near, [view_at(time_s=0.0), view_at(time_s=0.5)], RULES)
-    shades = [
-        set((condition.color[t][:, condition.valid[t, 0]] * 255).round().int().flatten().tolist()) for t in (0, 1)
-    ]
-    assert shades[0] <= {20, 60, 100} and shades[1] <= {140, 180, 220} and all(shades)
-    assert not bool(condition.color[:, :, ~condition.valid[0, 0] & ~condition.valid[1, 0]].any())
-    assert bool((condition.depth == RULES.far_m).all()) and not bool(condition.warped.any())
-    assert bool((condition.semantics == 255).all()) and not bool(condition.reference.any())
-    late = inputs.near_condition(near, [view_at(time_s=0.0)], RULES, 0.5)
-    assert torch.equal(late.color[0], condition.color[1]) and late.views[0].time_s == 0.0
-
-
-def test_half_of_the_clips_on_the_path_have_points_of_other_frames():
-    near = one_wall_per_sweep([0.0, 0.1])
-    drawn = [inputs.simulated_lateness_s(near, np.random.default_rng(seed)) for seed in range(400)]
-    assert {round(value, 6) for value in drawn} == {0.0, 0.4, -0.4}
-    assert 0.4 < np.mean(np.array(drawn) == 0.0) < 0.6
-
-
-@pytest.mark.slow
-def test_city_clips_with_the_condition_of_freevs():
-    rules = city_clips.CityClipRules(48, 32, window=1, clips=1, near_points=True)
-    clips_of = city_clips.make_clips(rules, 7)
-    full = city_clips.make_clips(replace(rules, near_points=False), 7)
-    for near, whole in zip(clips_of, full, strict=True):
-        assert torch.equal(near.rgb, whole.rgb)
-        assert not bool(near.condition.warped.any()) and near.condition.renders is None
-        assert 0 < float(near.condition.valid.float().mean()) < 0.9

@@ -176,11 +176,3 @@ def test_a_step_has_clips_of_one_size(tmp_path) -> None:
                 assert sizes[chosen % 5] == sizes[first % 5]
     assert learn.clips_of_cities(LearnConfig(), tmp_path).sizes == [(192, 128)]
     assert len(learn.clips_of_cities(config, tmp_path, points_alone=True).sizes) == 1
-
-
-def test_the_condition_of_freevs_is_made_of_cities_without_renders():
-    config = learn.check(LearnConfig(data=LearnData(condition="freevs")))
-    assert learn.city_rules(config).near_points and not config.data.renders
-    assert not learn.city_rules(LearnConfig()).near_points
-    with pytest.raises(UsageError, match="generated cities only"):
-        learn.check(LearnConfig(data=LearnData(condition="freevs", scenes=("a",))))

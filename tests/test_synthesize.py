@@ -244,16 +244,6 @@ def test_further_paths_are_made_and_parts_of_the_condition_switched_off(world, u
     assert all(not torch.equal(seen[a], seen[b]) for a in names for b in names if a < b)
 
 
-def test_the_condition_of_freevs_gives_colour_alone(world, usual, tmp_path):
-    out = made(world, tmp_path / "freevs", condition="freevs") / "front_shift+1.0"
-    seen = frames_of(out)
-    assert len(seen) == FRAMES
-    assert all(o.depth is None and o.semantics is None and o.source == "freevs" for o in seen)
-    assert all(not torch.equal(a.rgb, b.rgb) for a, b in zip(seen, frames_of(usual / "front_shift+1.0")))
-    enlarged = frames_of(made(world, tmp_path / "large", condition="freevs", full_size=True) / "front_shift+1.0")
-    assert enlarged[0].rgb.shape == (3, 64, 96)
-
-
 def test_a_setting_that_the_sampler_does_not_take_ends_the_command(tmp_path, capsys):
     """Before any work: neither scene nor cloud is read, and nothing is written."""
     for folder, name in (("scene", "scene.json"), ("fused", "fuse.json")):

@@ -39,7 +39,6 @@ from mudg.benchmarks.places import (
 from mudg.benchmarks.rows import (
     FILL,
     PAPERS,
-    REPAIRED,
     TABLES,
     PaperColumn,
     PaperTable,
@@ -98,7 +97,7 @@ class PaperLog(Views):
             features[row] = {place: files_at(of, names, out) for place, names in places.items()}
         for row in self.rows:
             if row.left_out:
-                why = "the model uses no renders" if row.name == REPAIRED else "no model: --freevs-model"
+                why = "the model uses no renders"
                 values[row.name] = dict.fromkeys(places, {key: {"value": why} for key in keys})
         # it is not known off the path: the scorer's floors, and frames of the reference against others of it
         if truth is None:
@@ -132,12 +131,10 @@ def run(
     logs = logs_of(config, sources, table)
     read = {f"log {log.name}": log.source for log in logs if not isinstance(log, ListedCity)}
     weights = _weights_of(config.score)
-    models = {"model": mdm_files.folder_of(config.model), "freevs-model": config.freevs_model}
-    refuse_overlap(out, {**models, **read, **weights})
+    refuse_overlap(out, {"model": mdm_files.folder_of(config.model), **read, **weights})
     digests = {name: store.digest(Path(path)) for name, path in weights.items()}  # before any work: one may be missing
-    digests |= {"freevs_model": mdm_files.digest(config.freevs_model)} if config.freevs_model else {}
     refuse_foreign(out, PAGES, lambda doc: doc["bench"] == "paper" and doc["table"]["name"] == table.name)
-    generates = [row.changes for row in rows if METHODS[row.method].made_by == "synthesize" and not row.left_out]
+    generates = [row.changes for row in rows if METHODS[row.method].made_by == "synthesize"]
     refuse_unfit(config, preset, rows, [replace(generator_of(config), **changes) for changes in generates])
     measured = score_settings(config, table)
     jobs, first = {}, (table, (Row(FILL, ANCHORS[FILL]), *rows), config)

@@ -19,7 +19,6 @@ from mudg.base.records import StrictRecord, checked_by, parse_record
 from mudg.baselines.settings import MethodConfig
 from mudg.benchmarks.settings import BenchConfig, bench_preset
 from mudg.diffusion import model_files, views
-from mudg.diffusion.published import is_published
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.gaussians.recipes import recipe_of
 from mudg.gaussians.settings import METHODS, PUBLISHED, UNFIT, WEIGHTS
@@ -222,11 +221,6 @@ ABLATION: Final[dict[str, tuple[str, Mapping[str, float]]]] = {
 virtual views can bring at this number of steps: row -> (what is learned from, settings ``virtual`` of the fit)."""
 PLACES: Final = ("cameras", "shifts_m", "paths", "condition", "processes")
 """Settings of generated views that are the benchmark's matter, not the user's."""
-SAMPLING: Final = (
-    *("steps", "sampler", "eta", "overlap", "align_depth", "full_size", "guidance", "guidance_rescale"),
-    *("memory_budget_gb", "offload", "compiled"),
-)
-"""Settings of generated views that published-type and small models do not share."""
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
 
 
@@ -373,14 +367,11 @@ def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "def
     """The rows of a paper's table: its own where it has such, else the methods asked for (all of them, where none is
     named). UsageError: an unknown method, one that does not know a setting beyond the preset, or methods for a table
     that has rows of its own."""
-    usual_methods, freevs = BenchConfig().methods, config.freevs_model
+    usual_methods = BenchConfig().methods
     if table.rows:
         if config.methods != usual_methods:
             got, what = ", ".join(config.methods), "this table has rows of its own"
             raise UsageError(what, where="--methods", expected="not given", got=got)
-        if freevs:
-            got, what = f"--table {table.name}", "this table has no row freevs"
-            raise UsageError(what, where="--freevs-model", got=got, remedy="leave it out")
         rows = [Row(row.name, row.title, row.method, changes=row.changes) for row in table.rows]
     else:
         known = [name for method in METHODS for name in ((method, LONGER) if method == BASE else (method,))]
@@ -388,14 +379,7 @@ def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "def
         if config.methods == usual_methods:
             methods = [name for name in known if config.guided_share > 1 or name != LONGER]
         _refuse_unknown(methods, known, some=False)
-        if freevs and "freevs" not in methods:
-            got, remedy = f"--methods {' '.join(config.methods)}", "leave it out, or add freevs to --methods"
-            raise UsageError("no row freevs was asked for", where="--freevs-model", got=got, remedy=remedy)
-        changes: dict[str, dict[str, Any]] = {"freevs": {"condition": "freevs", "model": freevs}}
-        if freevs and is_published(config.model):  # the row's own model is a small one, which samples in its own way
-            changes["freevs"] |= {name: getattr(SynthesizeConfig(), name) for name in SAMPLING}
-        if not model_files.uses_renders(config.model):
-            changes[REPAIRED] = {"model": ""}
+        changes = {} if model_files.uses_renders(config.model) else {REPAIRED: {"model": ""}}
         titles = {LONGER: LONGER_TITLE, **{name: method.title for name, method in METHODS.items()}}
         rows = [
             Row(name, f"{titles[name]} ({name})", BASE if name == LONGER else name, changes=changes.get(name, {}))

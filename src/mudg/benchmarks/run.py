@@ -51,7 +51,7 @@ USED: Final[Mapping[str, tuple[str, ...]]] = {
         ((SHIFT, REAL), "ablation variant"),
         ((REAL,), "protocols shown"),
         ((REAL, PAPER), "resolution frames"),
-        ((PAPER,), "table freevs_model score"),
+        ((PAPER,), "table score"),
     )
     for setting in names.split()
 }

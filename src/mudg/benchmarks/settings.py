@@ -57,7 +57,7 @@ class BenchOwn:
     """shift, real, loop: methods to compare: those of the default (loop: street_gaussians and mudg_s); pvg, s3gaussian,
     bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on until it has as many steps as mudg_s,
     without generated views. shift: also mudg_f, renders of mudg_s that the diffusion model repairs. paper: any of these
-    of shift but mudg_f, and freevs; with the default, all of them."""
+    of shift but mudg_f; with the default, all of them."""
     iterations: int = setting(default=1000, ge=1)
     """shift, real, loop, paper: optimisation steps of every fit without virtual views."""
     guided_share: float = setting(default=1.5, gt=0)
@@ -75,9 +75,6 @@ class BenchOwn:
     """shift, paper: also write videos of all methods side by side."""
     table: Literal[_Mudg, "recondreamer", "drivedreamer4d", "streetcrafter", "freesim", _Others] = "mudg1"
     """paper: the table to fill (docs/paper_tables.md)."""
-    freevs_model: str = ""
-    """paper: diffusion model for the row freevs, learned with `--data.condition freevs` (empty = the row has no
-    numbers)."""
     protocols: tuple[str, ...] = ("gap", "camera", "lidar", "classes")
     """real: protocols, out of the four of the default. Instead of gap also gap-1, gap-3 and gap-5 alone."""
     shown: tuple[str, ...] = ()

@@ -54,7 +54,6 @@ from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
 from mudg.core.trajectory import ego_left_world
 from mudg.diffusion.clips import FAR_M, pack_clips, shard_path, write_shard
 from mudg.diffusion.condition import ConditionRules, RenderAt, WarpSource, build_conditions
-from mudg.diffusion.inputs import NearSweeps, near_condition, simulated_lateness_s
 from mudg.gaussians import fit
 from mudg.gaussians.rendering import render_planes
 from mudg.gaussians.schedule import short_fit
@@ -325,8 +324,6 @@ class CityClipRules:
     published: bool = False
     """The published system's condition: points alone, 0 where nothing was seen; the reference is the image recorded at
     the time of the first view, from where it was recorded."""
-    near_points: bool = False
-    """FreeVS' condition (`near_condition`): points of a few frames alone."""
     realism: Realism = "plain"
     """varied: training cities and their sensors are drawn from `draw_city`; clips then have the size of
     `size_of`. mixed: so are half of them; the others are plain, of these sizes."""
@@ -488,8 +485,6 @@ def make_clips(
     clips = []
     sources: dict[int, WarpSource] = {}
     known = _known(rules, city, log, rng)
-    times = tuple(sweep.time_s for sweep in log.sweeps)
-    near = NearSweeps(times, lambda number: log.sweeps[number], tracks, 1 / log.world.config.rate_hz)
     for number, shift_m in enumerate(shifts_of(rules, city)):
         start = start_of(rules, city, number)
         views = [shifted_view(log.world, view, shift_m) for view in front_views[start : start + rules.window]]
@@ -498,11 +493,7 @@ def make_clips(
             given, cache = _split_moments(log.recorded, int(rng.integers(2, 5)), rng)[0], {}
         given = log.recorded if rules.published else given  # for the reference only
         claimed = [log.claimed(view) for view in views]
-        if rules.near_points:
-            late_s = simulated_lateness_s(near, rng) if shift_m == 0.0 and city < HELD_OUT else 0.0
-            condition = fine = near_condition(near, claimed, conditions, late_s)
-        else:
-            condition, fine = build_conditions(log.cloud, tracks, claimed, given, conditions, cache, render_at)
+        condition, fine = build_conditions(log.cloud, tracks, claimed, given, conditions, cache, render_at)
         truths = [log.truth(view.resized(*size)) for view in views]
         clip = replace(clip_from_truth(condition, truths), shift_m=shift_m)
         if rules.fitted:

@@ -8,7 +8,7 @@ model makes of the rest, not what a model trained without that part would make.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Final, Literal, cast
 
 import numpy as np
@@ -16,91 +16,13 @@ import torch
 from torch import Tensor
 
 from mudg.base import palette
-from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import UsageError
 from mudg.base.types import Condition, FusedCloud, Photo, RenderPlanes, Track, View
 from mudg.base.weather_settings import Conditions
 from mudg.core import weather
-from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
 from mudg.core.project import ProjectedPoints
 from mudg.core.weather import DriveFacts, ShownView
 from mudg.diffusion.condition import ConditionRules, RenderAt, VacatedAt, WarpSource, build_conditions
-
-# near points --------------------------------------------------------------------------------------
-#
-# The condition of FreeVS: coloured LiDAR points of the sweeps within two frames of a view's time, one pixel per point,
-# the nearest wins, black elsewhere; those of moving objects where their boxes are at the view's time. No depth, no
-# recorded image, no classes, no renders. Unlike FreeVS we do not reserve a margin around objects, and do not crop rows
-# that LiDAR never covers. Its training simulates another view on the recorded path: half of the clips there are made of
-# points that are four frames off.
-
-
-NEAR_FRAMES: Final = 2
-"""Points of so many frames before and after a view are shown."""
-OTHER_FRAMES: Final = 4
-"""How many frames off the points of a simulated view are."""
-OTHER_SHARE: Final = 0.5
-_RULES: Final = FusionRules(min_object_points=1)
-
-
-@dataclass(frozen=True, slots=True)
-class NearSweeps:
-    """The sweeps of a log, fused a few at a time.
-
-    Args:
-        times_s: of the sweeps. read: a sweep by its number. tracks: all boxes. period_s: time from frame to frame.
-        colors: how the cameras of the log show common colours.
-    """
-
-    times_s: tuple[float, ...]
-    read: Callable[[int], SweepShots]
-    tracks: Sequence[Track]
-    period_s: float
-    colors: CameraColors = SAME_COLORS
-    clouds: dict[tuple[int, ...], FusedCloud] = field(default_factory=dict)
-    """Clouds that were made already, by the numbers of their sweeps."""
-
-    def numbers_at(self, time_s: float) -> tuple[int, ...]:
-        """The sweeps within two frames of the one nearest to a time."""
-        nearest = min(self.times_s, key=lambda t: abs(t - time_s), default=0.0)
-        reach = (NEAR_FRAMES + 0.5) * self.period_s
-        return tuple(n for n, t in enumerate(self.times_s) if abs(t - nearest) <= reach)
-
-    def cloud_at(self, time_s: float) -> FusedCloud:
-        """Their points: static ones in the world, others in their boxes."""
-        numbers = self.numbers_at(time_s)
-        if numbers not in self.clouds:
-            self.clouds[numbers] = fuse_sweeps(map(self.read, numbers), self.tracks, _RULES, self.colors)[0]
-        return self.clouds[numbers]
-
-
-def near_condition(sweeps: NearSweeps, views: Sequence[View], rules: ConditionRules, late_s: float = 0.0) -> Condition:
-    """The model's condition for ``views``, resized to the rules' size.
-
-    Args:
-        rules: size and distance limits; nothing else counts. late_s: how much later than its view the points of a view
-            were measured.
-    """
-    small = tuple(view.resized(rules.width, rules.height) for view in views)
-    bare = replace(rules, published=True, point_px=1.0)
-    seen = [bare.project(sweeps.cloud_at(view.time_s + late_s), sweeps.tracks, view) for view in small]
-    valid = torch.stack([s.valid for s in seen])[:, None]
-    shown = [
-        sweeps.colors.image_of(v.camera.name, s.rgb).clamp(0, 1) if sweeps.colors.to_common else s.rgb
-        for v, s in zip(small, seen)
-    ]
-    color = torch.stack(shown) * valid
-    unknown = torch.full_like(valid, palette.UNLABELLED, dtype=torch.uint8)
-    depth = torch.full(valid.shape, float(rules.far_m))
-    return Condition(
-        small, color, depth, valid, torch.zeros_like(color[0]), torch.zeros_like(valid), color, unknown, unknown
-    )
-
-
-def simulated_lateness_s(sweeps: NearSweeps, rng: np.random.Generator) -> float:
-    """How late the points of a training clip on the recorded path are: half of them four frames, to either side."""
-    return 0.0 if rng.random() >= OTHER_SHARE else float(rng.choice([-1.0, 1.0])) * OTHER_FRAMES * sweeps.period_s
-
 
 # weathered ----------------------------------------------------------------------------------------
 #
@@ -154,7 +76,7 @@ class WeatheredPoints:
 # with only some of its parts ----------------------------------------------------------------------
 
 
-ConditionParts = Literal["full", "reference", "points", "concat", "freevs", "repair"]
+ConditionParts = Literal["full", "reference", "points", "concat", "repair"]
 """full: the whole condition. reference: the nearest recorded image alone, put up far away. points: colour and depth of
 the points alone, without recorded images and renders. concat: points and that image, without anything warped by depth,
 and without renders. repair: renders of a fit and that image, without anything measured. Of published-type models
@@ -166,16 +88,15 @@ COVERED = 0.5
 
 @dataclass(frozen=True, slots=True)
 class ConditionSources:
-    """What conditions of a scene are made of: its clouds and tracks, recorded images, rules, renders of a fit, and the
-    log's sweeps, where they are needed; of an edited drive also where something stood that is not there any more, and,
-    for published-type models, its weather."""
+    """What conditions of a scene are made of: its clouds and tracks, recorded images, rules, and renders of a fit, if
+    there is one; of an edited drive also where something stood that is not there any more, and, for published-type
+    models, its weather."""
 
     cloud: FusedCloud
     tracks: Sequence[Track]
     recorded: Sequence[Photo]
     rules: ConditionRules
     render_at: RenderAt | None = None
-    near: NearSweeps | None = None
     vacated_at: VacatedAt | None = None
     weather: InWeather | None = None
 
@@ -190,11 +111,6 @@ def conditions_of(
     """
     rules = sources.rules
     cloud, tracks, recorded = sources.cloud, sources.tracks, sources.recorded
-    if parts == "freevs":
-        if sources.near is None:
-            raise UsageError("this condition needs the sweeps of the log", got=parts)
-        condition = near_condition(sources.near, views, rules)
-        return condition, condition
     if parts == "full":
         how, render_at = sources.weather, sources.render_at
         recolor = (

@@ -51,32 +51,12 @@ from mudg.diffusion.settings import LearnConfig
 from mudg.diffusion.shard_sources import ListedClips, ListedShards, ShardCache, StreamedShards, is_list, read_list
 from mudg.scene.read import read_scene
 
-
-def check(config: LearnConfig) -> LearnConfig:
-    """The configuration; without renders where the condition has none.
-
-    Raises:
-        UsageError: settings that do not go together, or a condition that cannot be made.
-    """
-    if config.data.condition != "full":
-        if config.data.scenes:
-            raise UsageError(
-                "this condition is made of generated cities only",
-                where="--data.condition",
-                got="--data.scenes",
-                remedy="leave one of them out",
-            )
-        config = replace(config, data=replace(config.data, renders=False))
-    is_streamed(config)  # refuses what does not go together
-    return config
-
-
 WEIGHT_DECAY = 0.01
 """Of AdamW, as published."""
 
 
-def train(config: LearnConfig, out: Path, output: VerbOutput, open_work: Callable[[], RunDir]) -> None:
-    """Train a model, from nothing or from an earlier one, and export it to `OUT/model`.
+def train(config: LearnConfig, out: Path, output: VerbOutput, open_work: Callable[[], RunDir]) -> Path:
+    """Train a model, from nothing or from an earlier one, and export it to `OUT/model`, which is returned.
 
     Under `torchrun` every process calls this with the same arguments; `out` lies on a file system that all see.
 
@@ -98,15 +78,15 @@ def train(config: LearnConfig, out: Path, output: VerbOutput, open_work: Callabl
             return "" if opened[0].complete else str(opened[0].path)
 
         path = ranks.leader_does(open_run)
-        if not path:
-            return
-        work = opened[0] if ranks.leads else RunDir(out, Path(path), output, "", {})
-        try:
-            _train(model, fresh, config, work, ranks)
-        except KeyboardInterrupt:
-            if ranks.leads:
-                work.pause()
-            raise
+        if path:
+            work = opened[0] if ranks.leads else RunDir(out, Path(path), output, "", {})
+            try:
+                _train(model, fresh, config, work, ranks)
+            except KeyboardInterrupt:
+                if ranks.leads:
+                    work.pause()
+                raise
+    return out / "model"
 
 
 def inputs_of(config: LearnConfig) -> dict[str, str]:
@@ -188,28 +168,22 @@ def clips_at_address(config: LearnConfig) -> bool:
     return bool(config.data.clips) and Location.of(config.data.clips).local is None
 
 
-def is_streamed(config: LearnConfig) -> bool:
-    """Whether clips are not all in one folder of this machine before training starts.
-
-    Raises:
-        UsageError: settings that do not go together.
-    """
-    listed, remote = is_list(config.data.scenes), clips_at_address(config)
-    if remote and config.data.scenes:
+def check_clips(config: LearnConfig) -> None:
+    """UsageError for settings of clips that do not go together."""
+    if config.data.scenes and clips_at_address(config):
         raise UsageError(
             "logs and clips at an address are given",
             where="--data.scenes, --data.clips",
             got=config.data.clips,
             remedy="leave one out; a list of scenes may name folders of clips at addresses",
         )
-    if listed and config.data.clips:
+    if config.data.clips and is_list(config.data.scenes):
         raise UsageError(
             "a list of scenes says where the clips are",
             where="--data.clips",
             got=config.data.clips,
             remedy="leave it out; --compute.cache chooses where clips that were made or fetched are kept",
         )
-    return listed or remote
 
 
 def open_clips(
@@ -219,6 +193,7 @@ def open_clips(
 
     A model that uses no renders needs no fitted cities.
     """
+    check_clips(config)
     data, points_alone = config.data, model.points_alone
     folder, nothing = Path(data.clips) if data.clips else out / "clips", contextlib.nullcontext()
     if is_list(data.scenes):
@@ -229,7 +204,7 @@ def open_clips(
         return clips_of_logs(config, rules, folder, *counts), nothing
     fitted = data.renders and isinstance(model, MDM) and model.config.renders
     source = clips_of_cities(config, folder, points_alone)
-    if is_streamed(config):
+    if clips_at_address(config):
         shards = StreamedShards(Location.of(data.clips), _cache(config, out), data.clips_per_city)
         return replace(source, shards=shards), nothing
     return source, making_clips(source, city_rules(config, points_alone, fitted)) if ranks.leads else nothing
@@ -264,7 +239,6 @@ def city_rules(config: LearnConfig, points_alone: bool = False, fitted: bool = F
         realism=data.realism,
         textures=data.textures,
         fitted=fitted,
-        near_points=data.condition == "freevs",
         log_frames=data.log_frames,
         side_cameras=data.side_cameras,
         fit_steps=data.fit_steps,

@@ -34,11 +34,10 @@ class SynthesizeConfig:
     eta: float | None = setting(default=None, ge=0, le=1)
     """Sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not
     given: 1)."""
-    condition: Literal["full", "reference", "points", "concat", "freevs", "repair"] = "full"
+    condition: Literal["full", "reference", "points", "concat", "repair"] = "full"
     """Which parts of the model's condition are given, to measure what each brings. reference: the nearest recorded
     image alone. points: LiDAR points alone. concat: both, without images warped by depth (published-type models: the
-    image in frame 0, not in the image tokens). The shipped models were trained on whole conditions. freevs: the
-    condition of FreeVS, for models learned with `--data.condition freevs`; gives colour alone. repair: renders of
+    image in frame 0, not in the image tokens). The shipped models were trained on whole conditions. repair: renders of
     `--fitted` and the nearest recorded image, without points; gives colour alone."""
     given_classes: bool = True
     """Use the classes of labelled points and recorded images in the model's condition, if the scene has labels."""
@@ -195,10 +194,6 @@ class LearnData:
     """Generated cities: fit a scene to each city's images for a few hundred steps and give its renders in the
     condition, with patches at the camera's resolution. Takes about half a minute per city. Not done for models that use
     no renders. Without it, or on recorded logs, no model learns to use renders or gets a finisher."""
-    condition: Literal["full", "freevs"] = "full"
-    """Generated cities: what the model is given. freevs: as FreeVS, coloured LiDAR points of two frames before and
-    after each view, without depth, recorded images, classes and renders; use the model with `mudg synthesize
-    --condition freevs`."""
     textures: str = ""
     """Varied cities: folder with photographs of surfaces (textures/*.jpg, *.png) and panoramas of skies (sky/*.hdr) to
     use (empty = none)."""

@@ -30,32 +30,27 @@ from mudg.base.records import understood
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Condition, FusedCloud, Photo, Scene, Trajectory, View
 from mudg.core import trajectory
-from mudg.core.fusion import SweepShots
 from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
 from mudg.core.raster.cpu import release_memory
 from mudg.diffusion.condition import ConditionRules, PreparedImages, VacatedAt
-from mudg.diffusion.inputs import ConditionSources, InWeather, NearSweeps
+from mudg.diffusion.inputs import ConditionSources, InWeather
 from mudg.diffusion.requests import GeneratedClip
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.diffusion.views import (
-    COLOR_ALONE,
     EDITED_IMAGES_PER_VIEW,
-    FREEVS,
-    SOURCE,
     DiffusionModel,
     ViewMaker,
     half_of,
     load_any,
     recorded_images,
+    source_of,
 )
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import render_planes
 from mudg.gaussians.storage import load_model
-from mudg.scene import fuse
 from mudg.scene.clouds import read_fused
 from mudg.scene.observations import ObservationWriter
 from mudg.scene.read import read_scene
-from mudg.scene.settings import FuseConfig
 
 FITS = "depth_fits.json"
 """Frame -> [scale, shift in metres, median relative residual before, after] of the alignment of its depth."""
@@ -163,17 +158,6 @@ def usual_processes(config: SynthesizeConfig, paths: Sequence[Trajectory]) -> in
 # one trajectory -----------------------------------------------------------------------------------
 
 
-def near_sweeps(scene: Scene, cloud: FusedCloud, views: Sequence[View]) -> NearSweeps:
-    """The sweeps of a scene for FreeVS' condition, each coloured by the images of its time that are not held out."""
-    times = [view.time_s for view in views]
-    period_s = float(np.median(np.diff(times))) if len(times) > 1 else 0.1
-
-    def read(number: int) -> SweepShots:
-        return next(iter(fuse.scene_sweeps(replace(scene, sweeps=(scene.sweeps[number],)), FuseConfig())))
-
-    return NearSweeps(tuple(sweep.time_s for sweep in scene.sweeps), read, scene.tracks, period_s, cloud.colors)
-
-
 def without_classes(cloud: FusedCloud) -> FusedCloud:
     """The cloud without its points' classes."""
     objects = {name: replace(points, semantics=None) for name, points in cloud.objects.items()}
@@ -197,7 +181,7 @@ def make_trajectory(
     with understood("depth fits of an interrupted synthesis", str(state / FITS)):
         fits: dict[str, list[float | None]] = dict(store.read_json(state / FITS)) if (state / FITS).is_file() else {}
     every = max(1, len(path) // 5)
-    with ObservationWriter(folder, path.name, COLOR_ALONE.get(config.condition, SOURCE)) as writer:
+    with ObservationWriter(folder, path.name, source_of(config.condition)) as writer:
         for view in path.views[: spans[first - 1].stop if first else 0]:
             writer.skip(maker.sized(view))
         for number, fresh, (sample, condition, observations) in maker.along(path.views, spans, first, tail):
@@ -241,9 +225,8 @@ def view_maker(
     rules = ConditionRules(width, height, *fine, published=model.points_alone)
     rules = rules if inputs.edited is None else replace(rules, images_per_view=EDITED_IMAGES_PER_VIEW)
     render_at = None if drive.fit is None else functools.partial(render_planes, drive.fit)
-    near = near_sweeps(drive.scene, cloud, views) if config.condition == FREEVS else None
     sources = ConditionSources(
-        cloud, drive.scene.tracks, drive.recorded, rules, render_at, near, drive.vacated, drive.weather
+        cloud, drive.scene.tracks, drive.recorded, rules, render_at, drive.vacated, drive.weather
     )
     return ViewMaker(model, sources, config, images=drive.images.setdefault(fine, PreparedImages(scratch)))
 

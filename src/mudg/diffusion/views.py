@@ -78,12 +78,12 @@ def check_config(config: SynthesizeConfig, fitted: bool, *, weather: bool = Fals
             got="repair",
             remedy="give the folder of a finished fit as --fitted",
         )
-    if full_size and config.condition in ("freevs", "repair"):
+    if full_size and repairs:
         raise UsageError(
             "a published-type model does not know this condition",
             where="--condition",
             expected="full, reference, points, concat",
-            got=config.condition,
+            got="repair",
             remedy="leave it out, or choose another --model",
         )
     if config.condition != "full" and fitted and not repairs:
@@ -202,12 +202,14 @@ def _choose_split(model: PublishedMDM, config: SynthesizeConfig, budget_gb: floa
 # views --------------------------------------------------------------------------------------------
 
 
-SOURCE, FREEVS = "mudg_r", "freevs"
-COLOR_ALONE = {FREEVS: FREEVS, "repair": "difix"}
-"""Conditions of which only the colour counts, and the method that views made from them belong to."""
 SKY = palette.ID["sky"]
 EDITED_IMAGES_PER_VIEW = 24
 """Recorded images tried per view of an edited drive: what an object hid at one moment others show."""
+
+
+def source_of(condition: ConditionParts) -> str:
+    """The method that views made from a condition belong to. Of repaired renders only the colour counts."""
+    return "difix" if condition == "repair" else "mudg_r"
 
 
 def windows(frames: int, window: int, overlap: int) -> list[range]:
@@ -316,8 +318,8 @@ class ViewMaker:
         if self._model.points_alone and not recorded_at_pose(views[0], self._given.recorded):
             usable[0] = False
         trust = made.confidence * usable
-        source, nothing = COLOR_ALONE.get(self._parts, SOURCE), [None] * len(made_views)
-        depth, ids = (nothing, nothing) if self._parts in COLOR_ALONE else (made.depth, made.semantics)
+        source, nothing = source_of(self._parts), [None] * len(made_views)
+        depth, ids = (nothing, nothing) if self._parts == "repair" else (made.depth, made.semantics)
         planes = zip(made_views, made.rgb, depth, ids, trust, usable, strict=True)
         return sample, condition, [Observation(*one, "virtual", source) for one in planes]
 
@@ -327,7 +329,7 @@ class ViewMaker:
         """The clip at the size the model works at; it and its views at the size that is written, without depth in the
         sky."""
         model = self._model
-        if self._full_size and isinstance(model, MDM) and model.finisher is not None and self._parts != FREEVS:
+        if self._full_size and isinstance(model, MDM) and model.finisher is not None:
             sample, finished = generated_and_finished(model, condition, fine, request)
             return sample, without_sky_depth(finished, fine), tuple(views)
         sample = generated(model, condition, request)
@@ -335,7 +337,7 @@ class ViewMaker:
         if not self._full_size:
             return sample, made, condition.views
         size = views[0].camera.height, views[0].camera.width
-        conditions = None if model.points_alone or self._parts == FREEVS else (condition, fine)
+        conditions = None if model.points_alone else (condition, fine)
         return sample, enlarge(made, size, conditions), tuple(views)
 
 

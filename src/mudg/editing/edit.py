@@ -22,7 +22,7 @@ from mudg.core.raster.rasterize import drawing_device
 from mudg.diffusion.published import is_published
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.diffusion.synthesize import DriveInputs, JobInputs
-from mudg.diffusion.views import FREEVS, recorded_images
+from mudg.diffusion.views import recorded_images
 from mudg.editing.apply import EditedDrive, carry_out, weather_of
 from mudg.editing.harmonised import check_paths, repairing
 from mudg.editing.recorded import (
@@ -126,12 +126,8 @@ def _report_of(parts: RunParts, cloud: FusedCloud) -> dict[str, object]:
 
 
 def edited_scene(script: EditScript, config: SynthesizeConfig, inputs: JobInputs, scene: Scene) -> Scene:
-    """The scene as the script leaves it. What cannot be done is told here, before anything is written. UsageError: a
-    condition that shows no edits, or an edit that the drive does not allow."""
-    if config.condition == FREEVS:
-        what = "this condition is made of recorded sweeps, which show no edits"
-        remedy = "edit a whole run with `mudg edit` and give its scene"
-        raise UsageError(what, where="--condition", got=FREEVS, remedy=remedy)
+    """The scene as the script leaves it. What cannot be done is told here, before anything is written. UsageError: an
+    edit that the drive does not allow."""
     told = not shows_weather(config, script, inputs.fitted is not None)
     fitted = None if inputs.fitted is None else load_model(inputs.fitted)
     return drive_of_edits(script, scene, read_fused(inputs.fused), fitted, told=told).scene

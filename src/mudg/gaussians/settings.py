@@ -240,7 +240,6 @@ METHODS: Final[dict[str, Method]] = {
     "emernerf": Method("EmerNeRF, small", "render", (), ("color", "lidar", "sky"), "radiance", boxes=False),
     "difix": Method("Difix3D scheme, our network, no last repair", "render", _WHOLE, (*_STREET, "repaired")),
     "mudg_r": Method("Diffusion output", "synthesize"),
-    "freevs": Method("FreeVS condition, our network", "synthesize"),
     "mudg_s": Method("Gaussians with diffusion", "render", _WHOLE, (*_STREET, "virtual")),
 }
 

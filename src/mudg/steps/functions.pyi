@@ -73,7 +73,6 @@ def bench(
     processes: int = 0,
     videos: bool = True,
     table: Literal['mudg1', 'mudg2', 'mudg3', 'recondreamer', 'drivedreamer4d', 'streetcrafter', 'freesim', 'recam', 'spvc', 'panda', 'dist'] = 'mudg1',
-    freevs_model: str = '',
     protocols: tuple[str, ...] = ('gap', 'camera', 'lidar', 'classes'),
     shown: tuple[str, ...] = (),
     resolution: str = '',
@@ -107,7 +106,7 @@ def bench(
         seed: Seed of all random numbers; the same seed gives the same result.
         list: shift, loop: list of logs. Choose settings on development; report results on reported, on which nothing was chosen.
         logs: shift, loop; paper with a list of cities: number of logs taken from the list, 1 to 8 (the development list has 4).
-        methods: shift, real, loop: methods to compare: those of the default (loop: street_gaussians and mudg_s); pvg, s3gaussian, bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on until it has as many steps as mudg_s, without generated views. shift: also mudg_f, renders of mudg_s that the diffusion model repairs. paper: any of these of shift but mudg_f, and freevs; with the default, all of them.
+        methods: shift, real, loop: methods to compare: those of the default (loop: street_gaussians and mudg_s); pvg, s3gaussian, bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on until it has as many steps as mudg_s, without generated views. shift: also mudg_f, renders of mudg_s that the diffusion model repairs. paper: any of these of shift but mudg_f; with the default, all of them.
         iterations: shift, real, loop, paper: optimisation steps of every fit without virtual views.
         guided_share: shift, real, loop, paper: steps of fits under virtual views, as a multiple of the others'.
         ablation: shift: add rows for mudg_s with only some virtual loss terms (colour; colour and depth; colour and classes), and with exact views instead of generated ones. real: add street_gaussians-longer.
@@ -115,7 +114,6 @@ def bench(
         processes: shift, real, loop, paper: number of logs (real: also ways of hiding frames) processed at the same time, with one thread each (0 = one per core). Results do not depend on it.
         videos: shift, paper: also write videos of all methods side by side.
         table: paper: the table to fill (docs/paper_tables.md).
-        freevs_model: paper: diffusion model for the row freevs, learned with `--data.condition freevs` (empty = the row has no numbers).
         protocols: real: protocols, out of the four of the default. Instead of gap also gap-1, gap-3 and gap-5 alone.
         shown: real: cameras that the methods see in protocol camera; the first one gives the views beside the recorded path (empty = front, or the first camera).
         resolution: real, paper: image size of logs that are imported, as for ingest (empty = as recorded; paper: as the table says). paper with a list of cities: WIDTHxHEIGHT (empty = 384x256).
@@ -763,7 +761,7 @@ def synthesize(
     steps: int = 2,
     sampler: Literal['ddim', 'dpm_solver'] = 'ddim',
     eta: float | None = None,
-    condition: Literal['full', 'reference', 'points', 'concat', 'freevs', 'repair'] = 'full',
+    condition: Literal['full', 'reference', 'points', 'concat', 'repair'] = 'full',
     given_classes: bool = True,
     align_depth: bool = True,
     overlap: int = 2,
@@ -796,7 +794,7 @@ def synthesize(
         steps: Denoising steps. More add texture and agree less with the truth pixel by pixel. Use 50 for published-type models.
         sampler: Sampler of the diffusion model. ddim: first order, with fresh noise between steps. dpm_solver: second order and deterministic, for many steps. Both cost one network pass per step.
         eta: Sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given: 1).
-        condition: Which parts of the model's condition are given, to measure what each brings. reference: the nearest recorded image alone. points: LiDAR points alone. concat: both, without images warped by depth (published-type models: the image in frame 0, not in the image tokens). The shipped models were trained on whole conditions. freevs: the condition of FreeVS, for models learned with `--data.condition freevs`; gives colour alone. repair: renders of `--fitted` and the nearest recorded image, without points; gives colour alone.
+        condition: Which parts of the model's condition are given, to measure what each brings. reference: the nearest recorded image alone. points: LiDAR points alone. concat: both, without images warped by depth (published-type models: the image in frame 0, not in the image tokens). The shipped models were trained on whole conditions. repair: renders of `--fitted` and the nearest recorded image, without points; gives colour alone.
         given_classes: Use the classes of labelled points and recorded images in the model's condition, if the scene has labels.
         align_depth: Align generated depth to the LiDAR points in the same view (one scale and one shift per frame).
         overlap: Frames that a window of the model shares with the previous window; they are kept, so that the video continues smoothly. Published-type models: 8.

@@ -40,13 +40,13 @@ class Learn(Watched):
     def act(self) -> Path:
         from mudg.diffusion import learn
 
-        learn.train(learn.check(self.settings), self.out, self.output(), lambda: opened(self)[1])
-        return self.out / "model"
+        return learn.train(self.settings, self.out, self.output(), lambda: opened(self)[1])
 
     def checked(self) -> Self:
         from mudg.diffusion import learn
 
-        return replace(self, settings=learn.check(self.settings))
+        learn.check_clips(self.settings)
+        return self
 
     def reads(self) -> dict[str, Path | str | None]:
         from mudg.diffusion import learn
