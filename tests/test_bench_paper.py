@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from test_bench import SMALL
+from tiny_networks import small_mdm
 
 from mudg.base import config as configuration
 from mudg.base import store
@@ -468,7 +468,7 @@ def test_an_interrupted_table_goes_on(tmp_path, monkeypatch):
 def filled(tmp_path_factory):
     torch.manual_seed(0)
     model = tmp_path_factory.mktemp("model") / "model"
-    mdm_files.save(MDM(dataclasses.replace(SMALL, renders=True)), model, "a model of tests", {})
+    mdm_files.save(MDM(small_mdm(window=8, renders=True)), model, "a model of tests", {})
     size = {"logs": 2, "processes": 1, "videos": False, "resolution": "96x64", "frames": "0:5"}
     methods = ("street_gaussians", "mudg_r", "freevs", "mudg_s")
     config = BenchConfig(**size, iterations=20, model=str(model), methods=methods)

@@ -9,7 +9,7 @@ import torch
 import write_custom
 import write_pandaset
 from pandas_pickles import write_frame
-from test_bench import SMALL
+from tiny_networks import small_mdm
 
 from mudg.base import store
 from mudg.base.camera_colors import ColorMap
@@ -145,7 +145,7 @@ def model(tmp_path_factory):
     """A small model that uses renders."""
     folder = tmp_path_factory.mktemp("model") / "model"
     torch.manual_seed(0)
-    mdm_files.save(MDM(dataclasses.replace(SMALL, renders=True)), folder, "a model of tests", {})
+    mdm_files.save(MDM(small_mdm(window=8, renders=True)), folder, "a model of tests", {})
     return str(folder)
 
 

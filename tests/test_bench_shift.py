@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from test_bench import SMALL
+from tiny_networks import small_mdm
 
 from mudg.base import seeds, store
 from mudg.base.errors import InputError, UsageError
@@ -220,7 +220,7 @@ def test_the_command_compares_methods_and_reuses_what_is_there(made):
 def test_fits_under_virtual_views_begin_from_nothing_and_their_control_goes_on(made, tmp_path):
     out, config = made
     torch.manual_seed(0)
-    model_files.save(MDM(dataclasses.replace(SMALL, renders=True)), tmp_path / "model", "a model of tests", {})
+    model_files.save(MDM(small_mdm(window=8, renders=True)), tmp_path / "model", "a model of tests", {})
     log = out / str(city_logs.DEVELOPMENT[0])
     methods, variants = ("mudg_s", "mudg_f", LONGER), ("louder=virtual.color_weight:2", "flat=sh_degree:1")
     changes = {"methods": methods, "model": str(tmp_path / "model"), "variant": variants, "videos": False}
