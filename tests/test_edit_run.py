@@ -15,7 +15,7 @@ from toy_world import CAR_SIZE, car_pose, ego_pose
 
 import mudg
 from mudg import app
-from mudg.base import geometry, store
+from mudg.base import geometry, log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Scene
@@ -38,6 +38,11 @@ FRAMES = 4
 LAST_S = 0.3 * (FRAMES - 1)
 
 
+@pytest.fixture
+def run(street_run: Path) -> Path:
+    return street_run
+
+
 def script(folder: Path, text: str, name: str = "edits.yaml") -> Path:
     store.write_text(folder / name, text)
     return folder / name
@@ -58,14 +63,14 @@ def edited(source: Path, script: Path, out: Path, **more: Any) -> Path:
     return Edit(source=source, script=script, out=out, settings=EditConfig(), **more).run()
 
 
-def test_an_edited_fit_renders_as_render_with_edits_does(street_run: Path, tmp_path: Path) -> None:
+def test_an_edited_fit_renders_as_render_with_edits_does(run: Path, tmp_path: Path) -> None:
     lane_change = "- lane_change: {id: ego, left_m: 0.4, start_s: 0, duration_s: 0.8, ground: false}"
     text = f"- move: {{id: car, left_m: 1.5, along_m: 1}}\n{lane_change}"
-    edits, model = script(tmp_path, text), street_run / "fit" / "street_gaussians"
-    made = edited(model, edits, tmp_path / "edited", scene=street_run / "scene")
-    before = rendered(street_run / "scene", model, tmp_path / "a")
-    after = rendered(street_run / "scene", made, tmp_path / "b")
-    on_the_way = rendered(street_run / "scene", model, tmp_path / "c", edits)
+    edits, model = script(tmp_path, text), run / "fit" / "street_gaussians"
+    made = edited(model, edits, tmp_path / "edited", scene=run / "scene")
+    before = rendered(run / "scene", model, tmp_path / "a")
+    after = rendered(run / "scene", made, tmp_path / "b")
+    on_the_way = rendered(run / "scene", model, tmp_path / "c", edits)
     for two, three in zip(after, on_the_way, strict=True):
         assert torch.equal(two, three)
     assert not torch.equal(before[2], after[2])
@@ -79,14 +84,14 @@ def test_an_edited_fit_renders_as_render_with_edits_does(street_run: Path, tmp_p
     assert "lateral acceleration" in kinds
 
 
-def test_renders_show_weather_and_light(street_run: Path, tmp_path: Path) -> None:
+def test_renders_show_weather_and_light(run: Path, tmp_path: Path) -> None:
     """Fog of 20 m: colours come nearer to those of the fog, more so far away; depth and classes stay. An edited fit and
     a script on the way show the same."""
-    edits, model = script(tmp_path, "- weather: {fog: {visibility_m: 20}}"), street_run / "fit" / "street_gaussians"
-    plain = views_of(street_run / "scene", model, tmp_path / "plain")[1]
-    foggy = views_of(street_run / "scene", model, tmp_path / "foggy", edits)[1]
-    made = edited(model, edits, tmp_path / "edited", scene=street_run / "scene")
-    again = views_of(street_run / "scene", made, tmp_path / "again")[1]
+    edits, model = script(tmp_path, "- weather: {fog: {visibility_m: 20}}"), run / "fit" / "street_gaussians"
+    plain = views_of(run / "scene", model, tmp_path / "plain")[1]
+    foggy = views_of(run / "scene", model, tmp_path / "foggy", edits)[1]
+    made = edited(model, edits, tmp_path / "edited", scene=run / "scene")
+    again = views_of(run / "scene", made, tmp_path / "again")[1]
     assert torch.equal(foggy.rgb, again.rgb) and not torch.equal(foggy.rgb, plain.rgb)
     assert torch.equal(foggy.depth.nan_to_num(), plain.depth.nan_to_num())
     assert torch.equal(foggy.semantics, plain.semantics)
@@ -97,10 +102,10 @@ def test_renders_show_weather_and_light(street_run: Path, tmp_path: Path) -> Non
     assert spread(foggy, far) / spread(plain, far) < spread(foggy, solid & ~far) / spread(plain, solid & ~far)
 
 
-def test_an_edited_run_is_one_like_any_other(street_run: Path, tmp_path: Path) -> None:
+def test_an_edited_run_is_one_like_any_other(run: Path, tmp_path: Path) -> None:
     edits = script(tmp_path, "- move: {id: car, along_m: 1, ground: false}")
-    out = edited(street_run, edits, tmp_path / "edited")
-    old, new = read_scene(street_run / "scene"), read_scene(out / "scene")
+    out = edited(run, edits, tmp_path / "edited")
+    old, new = read_scene(run / "scene"), read_scene(out / "scene")
     assert not [finding for finding in check_scene(out / "scene") if finding.level == "error"]
     step = geometry.yaw_matrix(0.0, (1.0, 0, 0))
     assert np.allclose(new.track("car").world_from_object, old.track("car").world_from_object @ step)
@@ -132,14 +137,13 @@ def test_an_edited_run_is_one_like_any_other(street_run: Path, tmp_path: Path) -
     assert read_fused(again / "fuse").objects == {}
 
 
-def test_sweeps_of_an_edited_run_are_in_fog_and_its_images_as_recorded(
-    street_run: Path, tmp_path: Path, capsys
-) -> None:
+def test_sweeps_of_an_edited_run_are_in_fog_and_its_images_as_recorded(run: Path, tmp_path: Path, capsys) -> None:
     """Fog takes returns of far surfaces and adds some of its own, nearer than what stands there, on beams of the
     recording."""
-    out = edited(street_run, script(tmp_path, "- weather: {fog: {visibility_m: 12}}"), tmp_path / "foggy")
+    log.set_quiet(False)
+    out = edited(run, script(tmp_path, "- weather: {fog: {visibility_m: 12}}"), tmp_path / "foggy")
     assert "LiDAR sweeps are in fog and rain" in capsys.readouterr().err
-    old, new = read_scene(street_run / "scene"), read_scene(out / "scene")
+    old, new = read_scene(run / "scene"), read_scene(out / "scene")
     for a, b in zip(old.frames, new.frames, strict=True):
         assert np.array_equal(read_image(old, a), read_image(new, b))
     clear, foggy = (sum(len(read_points(scene, sweep).xyz) for sweep in scene.sweeps) for scene in (old, new))
@@ -156,9 +160,9 @@ def test_sweeps_of_an_edited_run_are_in_fog_and_its_images_as_recorded(
     assert 0 < became["droplets"] == pytest.approx(droplets, abs=2)
 
 
-def test_the_vehicle_of_a_run_changes_lanes(street_run: Path, tmp_path: Path) -> None:
+def test_the_vehicle_of_a_run_changes_lanes(run: Path, tmp_path: Path) -> None:
     edits = script(tmp_path, "- lane_change: {id: ego, left_m: 0.5, start_s: 0, duration_s: 0.9}")
-    out = edited(street_run, edits, tmp_path / "edited")
+    out = edited(run, edits, tmp_path / "edited")
     new = read_scene(out / "scene")
     assert (geometry.invert(ego_pose(LAST_S)) @ new.ego.pose_at(LAST_S))[1, 3] == pytest.approx(0.5, abs=0.02)
     again = rendered(out / "scene", out / "fit" / "street_gaussians", tmp_path / "render")
@@ -166,26 +170,24 @@ def test_the_vehicle_of_a_run_changes_lanes(street_run: Path, tmp_path: Path) ->
         assert np.abs(read_image(new, frame) / 255 - image.permute(1, 2, 0).numpy()).max() <= 1 / 255
 
 
-def test_bad_scripts_leave_nothing(street_run: Path, tmp_path: Path) -> None:
-    model, out = street_run / "fit" / "street_gaussians", tmp_path / "out"
+def test_bad_scripts_leave_nothing(run: Path, tmp_path: Path) -> None:
+    model, out = run / "fit" / "street_gaussians", tmp_path / "out"
     too_sharp = "- lane_change: {id: car, left_m: 9, start_s: 0, duration_s: 0.2}"
     for text in ("- mve: {id: car}", "- move: {id: nobody}", too_sharp):
         edits = script(tmp_path, text)
         with pytest.raises(InputError, match="line 1"):
             edited(model, edits, out)
         with pytest.raises(InputError, match="line 1"):
-            rendered(street_run / "scene", model, out, edits)
+            rendered(run / "scene", model, out, edits)
         assert not out.exists()
     with pytest.raises(UsageError, match="input"):
-        edited(street_run, script(tmp_path, "- remove: {ids: [car]}"), street_run / "edited")
+        edited(run, script(tmp_path, "- remove: {ids: [car]}"), run / "edited")
     with pytest.raises(InputError, match="no fitted scene"):
-        edited(street_run / "scene", tmp_path / "edits.yaml", out)
+        edited(run / "scene", tmp_path / "edits.yaml", out)
     assert not out.exists()
 
 
-def test_results_are_reused_refused_and_resumed(
-    street_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_results_are_reused_refused_and_resumed(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     edits, out = script(tmp_path, "- remove: {class: car}"), tmp_path / "out"
 
     def stop(*_: object) -> None:
@@ -194,38 +196,36 @@ def test_results_are_reused_refused_and_resumed(
     with monkeypatch.context() as patch:
         patch.setattr(edit, "write_edited_scene", stop)
         with pytest.raises(KeyboardInterrupt):
-            edited(street_run, edits, out)
+            edited(run, edits, out)
     assert (out / "fuse" / "fuse.json").is_file()
-    edited(street_run, edits, out)
-    whole = edited(street_run, edits, tmp_path / "whole")
+    edited(run, edits, out)
+    whole = edited(run, edits, tmp_path / "whole")
     assert store.digest(out) == store.digest(whole)
     stamp = (out / "edit.json").stat().st_mtime_ns
-    edited(street_run, script(tmp_path, "# the same\n- remove: {class: car}"), out)
+    edited(run, script(tmp_path, "# the same\n- remove: {class: car}"), out)
     assert (out / "edit.json").stat().st_mtime_ns == stamp
     with pytest.raises(UsageError, match="another configuration"):
-        edited(street_run, script(tmp_path, "- stop: {id: car, at_s: 0.2}"), out)
-    edited(street_run, tmp_path / "edits.yaml", out, overwrite=True)
+        edited(run, script(tmp_path, "- stop: {id: car, at_s: 0.2}"), out)
+    edited(run, tmp_path / "edits.yaml", out, overwrite=True)
     assert store.read_json(out / "edit.json")["changed"] == ["car"]
 
 
-def test_objects_go_from_one_run_to_another(
-    street_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_objects_go_from_one_run_to_another(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "shelf" / "red.safetensors"
-    assert app.main(["asset", "export", str(street_run), "car", "--out", str(file)]) == 0
-    assert mudg.export_asset(street_run, "car", out=file) == file  # the same again: verified
-    assert mudg.export_asset(street_run / "fit" / "street_gaussians", "car", out=file) == file  # a fit knows its scene
+    assert app.main(["asset", "export", str(run), "car", "--out", str(file)]) == 0
+    assert mudg.export_asset(run, "car", out=file) == file  # the same again: verified
+    assert mudg.export_asset(run / "fit" / "street_gaussians", "car", out=file) == file  # a fit knows its scene
     with pytest.raises(UsageError, match="no dynamic object"):
-        mudg.export_asset(street_run, "nobody", out=tmp_path / "x.safetensors")
+        mudg.export_asset(run, "nobody", out=tmp_path / "x.safetensors")
     text = """
 - insert:
     asset: {file: shelf/red.safetensors}
     id: second
     near: {id: ego, at_s: 0, ahead_m: 14, left_m: 2, yaw_deg: 180}
 - replace: {id: car, by: {run: RUN, id: car}}
-""".replace("RUN", str(street_run))
+""".replace("RUN", str(run))
     out = tmp_path / "out"
-    assert app.main(["edit", str(street_run), str(script(tmp_path, text)), "--out", str(out), "--quiet"]) == 0
+    assert app.main(["edit", str(run), str(script(tmp_path, text)), "--out", str(out), "--quiet"]) == 0
     assert "edited" in capsys.readouterr().out
     scene, fused = read_scene(out / "scene"), read_fused(out / "fuse")
     assert {track.id for track in scene.tracks} == {"car", "second"}
@@ -237,29 +237,27 @@ def test_objects_go_from_one_run_to_another(
     assert "seldom-seen side" in kinds  # the recording saw its back only
 
 
-def test_the_street_of_another_run(street_run: Path, tmp_path: Path) -> None:
+def test_the_street_of_another_run(run: Path, tmp_path: Path) -> None:
     """Its own street put in again changes nothing but the sky's texels."""
-    model = street_run / "fit" / "street_gaussians"
-    edits = script(tmp_path, f"- background: {{run: {street_run}}}")
-    made = edited(model, edits, tmp_path / "out", scene=street_run / "scene", fused=street_run / "fuse")
-    before, after = (
-        rendered(street_run / "scene", folder, tmp_path / name) for folder, name in ((model, "a"), (made, "b"))
-    )
+    model = run / "fit" / "street_gaussians"
+    edits = script(tmp_path, f"- background: {{run: {run}}}")
+    made = edited(model, edits, tmp_path / "out", scene=run / "scene", fused=run / "fuse")
+    before, after = (rendered(run / "scene", folder, tmp_path / name) for folder, name in ((model, "a"), (made, "b")))
     for one, two in zip(before, after, strict=True):
         assert (one - two).abs().mean() < 0.01
-    whole = edited(street_run, edits, tmp_path / "whole")
+    whole = edited(run, edits, tmp_path / "whole")
     scene = read_scene(whole / "scene")
     assert not [finding for finding in check_scene(whole / "scene") if finding.level == "error"]
-    assert scene.sweeps == () and len(scene.frames) == len(read_scene(street_run / "scene").frames)
-    old, new = (read_fused(folder / "fuse") for folder in (street_run, whole))
+    assert scene.sweeps == () and len(scene.frames) == len(read_scene(run / "scene").frames)
+    old, new = (read_fused(folder / "fuse") for folder in (run, whole))
     assert np.abs(old.static.xyz - new.static.xyz).max() < 1e-3 and new.objects.keys() == old.objects.keys()
     own = script(tmp_path, f"- background: {{run: {model}}}")
-    alone = edited(model, own, tmp_path / "fit", scene=street_run / "scene")
+    alone = edited(model, own, tmp_path / "fit", scene=run / "scene")
     assert (alone / "model.json").is_file()  # a fit knows its scene, and with it where its street lies
 
 
-def test_streets_of_recordings_are_closed_and_those_of_generated_cities_stay(street_run: Path) -> None:
-    model, scene = load_model(street_run / "fit" / "street_gaussians"), read_scene(street_run / "scene")
+def test_streets_of_recordings_are_closed_and_those_of_generated_cities_stay(run: Path) -> None:
+    model, scene = load_model(run / "fit" / "street_gaussians"), read_scene(run / "scene")
     city = replace(scene, source=replace(scene.source, recipe={"seed": 1}))
 
     def carried(where: Scene | None, text: str = "") -> EditedDrive:
@@ -279,13 +277,13 @@ def test_streets_of_recordings_are_closed_and_those_of_generated_cities_stay(str
     assert rows[1] == rows[2] != rows[0]
 
 
-def test_from_python(street_run: Path, tmp_path: Path) -> None:
-    fitted = mudg.FittedScene.read(street_run / "fit" / "street_gaussians")
-    scene = mudg.read_scene(street_run / "scene")
+def test_from_python(run: Path, tmp_path: Path) -> None:
+    fitted = mudg.FittedScene.read(run / "fit" / "street_gaussians")
+    scene = mudg.read_scene(run / "scene")
     edits = script(tmp_path, "- stop: {id: car, at_s: 0.3}")
     stopped = fitted.edited(edits, scene)
     assert stopped.object_pose("car", 0.9)[0, 3] < fitted.object_pose("car", 0.9)[0, 3] - 0.5
-    made = mudg.edit(street_run / "fit" / "street_gaussians", edits, out=tmp_path / "out", scene=street_run / "scene")
+    made = mudg.edit(run / "fit" / "street_gaussians", edits, out=tmp_path / "out", scene=run / "scene")
     view = scene.frames[2].view
     pictures = [
         s.render(view.camera, view.world_from_cam, view.time_s).rgb for s in (stopped, mudg.FittedScene.read(made))
