@@ -1,4 +1,4 @@
-"""Images that no camera of a data set writes: refused by name, or taken and noted, in every format, nothing half-written;
+"""Images that no camera of a data set writes: refused by name or taken and noted in every format, nothing half-written;
 headers that claim 60,000 x 60,000 pixels are refused by every reader, without the memory they claim."""
 
 from __future__ import annotations

@@ -20,8 +20,6 @@ pytestmark = pytest.mark.skipif(not FOLDER.exists(), reason="the build back-end 
 
 def _load(name: str) -> ModuleType:
     spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     spec.loader.exec_module(module)

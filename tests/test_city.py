@@ -60,7 +60,6 @@ def moved(view: View, by_m: np.ndarray) -> View:
 
 def left_of_ego(world: CityWorld, time_s: float) -> np.ndarray:
     pose = world.ego_path().pose_at(time_s)
-    assert pose is not None
     left = pose[:3, 1].copy()
     left[2] = 0
     return left / np.linalg.norm(left)
@@ -162,7 +161,6 @@ def test_instances_lie_in_their_boxes(world: CityWorld) -> None:
     for instance in seen:
         track = boxes[int(instance)]
         pose = track.pose_at(view.time_s)
-        assert pose is not None
         local = geometry.transform_points(geometry.invert(pose), points[truth.instance == instance])
         # door mirrors stick out sideways, roof rails and lamps upwards
         assert (np.abs(local) < track.size_m / 2 + [0.15, 0.3, 0.3]).all(), track.id
@@ -183,7 +181,6 @@ def test_every_return_is_where_a_camera_ray_ends(clean_world: CityWorld) -> None
     for i in chosen:
         time_s = sweep.time_s + float(sweep.points.dt_s[i])
         ego = clean_world.ego_path().pose_at(time_s)
-        assert ego is not None
         origin = (ego @ mount)[:3, 3]
         probe = clean_world.render(looking_at(origin, points[i], time_s), supersample=1)
         distance = float(np.linalg.norm(points[i] - origin))
@@ -204,7 +201,6 @@ def world_points(sweep: CitySweep) -> np.ndarray:
 def scanner_mount(world: CityWorld) -> np.ndarray:
     sweep_pose = world.lidar_sweep(0).world_from_lidar
     ego = world.ego_path().pose_at(0.0)
-    assert ego is not None
     return geometry.invert(ego) @ sweep_pose
 
 
@@ -261,7 +257,6 @@ def test_boxes_contain_the_returns_of_their_objects(world: CityWorld) -> None:
             for dt in np.unique(sweep.points.dt_s[mine]):
                 rows = mine[sweep.points.dt_s[mine] == dt]
                 pose = track.pose_at(sweep.time_s + float(dt))
-                assert pose is not None
                 local = geometry.transform_points(geometry.invert(pose), points[rows])
                 outside += int((np.abs(local) > track.size_m / 2 + 0.12).any(1).sum())
                 total += len(rows)
@@ -278,7 +273,6 @@ def test_the_drive_starts_at_the_origin_and_curves_and_changes_speed() -> None:
         world = CityWorld(replace(CONFIG, seed=seed, n_frames=60, crossing="auto"))
         ego = world.ego_path()
         start = ego.pose_at(0.0)
-        assert start is not None
         np.testing.assert_allclose(start, np.eye(4), atol=1e-12)
         steps = np.linalg.norm(np.diff(ego.world_from_ego[:, :3, 3], axis=0), axis=1) / np.diff(ego.times_s)
         assert 0.3 < steps.min()
@@ -294,7 +288,6 @@ def test_frame_views_follow_the_vehicle(world: CityWorld) -> None:
     for name, yaw_deg in (("front", 0), ("front_left", 50), ("front_right", -50)):
         for view in world.frame_views(name):
             ego = world.ego_path().pose_at(view.time_s)
-            assert ego is not None
             ego_from_cam = geometry.invert(ego) @ view.world_from_cam
             forward = ego_from_cam[:3, 2]
             assert abs(np.rad2deg(np.arctan2(forward[1], forward[0])) - yaw_deg) < 0.01
@@ -313,7 +306,6 @@ def test_tracks_move_as_the_world_renders_them(world: CityWorld) -> None:
         if track.label != "car" or mine.sum() < 25:
             continue
         pose = track.pose_at(time_s)
-        assert pose is not None
         local = geometry.transform_points(geometry.invert(pose), points[mine])
         assert (np.abs(local) < track.size_m / 2 + [0.15, 0.3, 0.1]).all()
         checked += 1
@@ -444,8 +436,6 @@ def test_observation_matches_the_render(world: CityWorld) -> None:
     view = world.frame_views("front")[2]
     truth, seen = world.render(view), world.observation(view)
     np.testing.assert_array_equal(seen.rgb.permute(1, 2, 0).numpy(), truth.rgb)
-    assert seen.depth is not None
-    assert seen.semantics is not None
     np.testing.assert_array_equal(seen.depth[0].numpy() == 0, truth.sky)
     np.testing.assert_array_equal(seen.semantics.numpy(), truth.semantics)
     assert bool(seen.mask.all())

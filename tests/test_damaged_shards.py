@@ -35,7 +35,7 @@ DAMAGE: dict[str, Callable[[bytes, Arrays], bytes]] = {
     "header longer than the file": lambda content, _: b"\xff" * 7 + content[7:],
     "no array": lambda _, __: save({}),
     "fewer frames": lambda _, a: save(
-        {n: v[:, :2].copy() if v.shape[1:2] == (4,) < v.shape[2:] else v for n, v in a.items()}
+        {n: v[:, :2].copy() if v.ndim > 2 and v.shape[1] == 4 else v for n, v in a.items()}
     ),
     "no clip": lambda _, a: save({n: v[:0].copy() for n, v in a.items()}),
     "without its patches' place in two numbers": lambda _, a: save({**a, "fine_place": a["fine_place"][:, :2].copy()}),

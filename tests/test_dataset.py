@@ -185,7 +185,6 @@ def test_returns_lie_on_what_the_log_measured_and_are_counted_by_box(run: tuple[
     labeller = Labeller(Session(run[1], scene=run[0]), "hdl64")
     scene, view = labeller.scene, labeller.scene.frames_of("front")[2].view
     labelled = labeller.label("x", view, ("rgb",))
-    assert labelled.sweep is not None
     world = geometry.transform_points(labelled.sweep.world_from_lidar, labelled.sweep.reply.xyz.astype(float))
     (recorded,) = (sweep for sweep in scene.sweeps if abs(sweep.time_s - view.time_s) < 1e-6)
     measured = geometry.transform_points(recorded.world_from_lidar, mudg.read_points(scene, recorded).xyz.astype(float))
@@ -268,7 +267,6 @@ def test_its_own_reader_loads_123d(run: tuple[Path, Path], tmp_path: Path) -> No
             center = boxes[one["id"]].bounding_box_se3.center_se3
             assert np.abs(np.array([center.x, center.y, center.z]) - one["position_world_m"]).max() < 1e-6
         lidar = scene.get_lidar_at_iteration(index, LidarID.LIDAR_TOP)
-        assert labelled.sweep is not None and labelled.mount is not None
         vehicle = labelled.view.world_from_cam @ geometry.invert(labelled.mount)
         ours = geometry.transform_points(labelled.sweep.world_from_lidar, labelled.sweep.reply.xyz.astype(float))
         assert np.abs(geometry.transform_points(vehicle, lidar.xyz.astype(float)) - ours).max() < 1e-3
@@ -402,7 +400,6 @@ def test_masks_and_boxes_beside_the_path_are_those_of_the_city(tmp_path: Path) -
                     continue
                 drawn = labelled.layers["instances"] == box.number
                 masks.append((exact & drawn).sum() / (exact | drawn).sum())
-                assert box.visible_px is not None
                 boxes.append(overlap(box.visible_px, around(exact)))
                 others = {track.id: None for track in world.tracks() if track.id != box.track_id}
                 alone = world.rearranged(others).render(view).instance == world.instance_of(box.track_id)

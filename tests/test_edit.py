@@ -350,7 +350,6 @@ def test_an_asset_goes_through_its_file_and_renders_as_the_object_did(tmp_path: 
     read = assets.read_asset(tmp_path / "car.safetensors")
     assert (read.label, read.size_m, len(read), read.origin) == ("car", SIZE, 50, "toy")
     assert read.seen_rad == pytest.approx((0.5, 3.0), abs=1e-3)
-    assert read.certainty is not None
     assert np.allclose(read.certainty, 0.5)
     bare = model.without_nodes(["car-1"])
     again = edited.with_asset(bare, read, "car-1", edited.motion_of(model.dynamic_object("car-1")))

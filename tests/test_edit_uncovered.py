@@ -297,7 +297,6 @@ def behind(label: str = "car", flank: float | None = None) -> SceneModel:
 
 def made_sides(before: SceneModel, after: SceneModel) -> tuple[np.ndarray, np.ndarray]:
     """Places and colours of the new rows, which are those of certainty 0."""
-    assert after.certainty is not None
     new = (after.certainty == 0).numpy()
     assert new.sum() == len(after.table) - len(before.table)
     for name, value in before.table.columns.items():

@@ -117,8 +117,6 @@ def _compare(
         pairs["d means2d"] = (got.trace.means2d.grad, want.trace.means2d.grad)
         pairs["abs"] = (got.trace.abs_grad2d, want.trace.abs_grad2d)
     for name, (mine, reference) in pairs.items():
-        assert mine is not None
-        assert reference is not None
         assert reference.norm() > 0, name
         found[name] = float((mine.double() - reference).norm() / reference.norm())
     assert not (want.trace.visible & ~got.trace.visible).any()
@@ -375,7 +373,6 @@ def test_discs_hand_out_the_gradient_that_densification_needs(gsplat: ModuleType
     leaves = _leaves(p)
     out = rasterize(_gaussians(leaves), view, RasterConfig(backend="gsplat", primitive="disc"))
     out.rgb.square().sum().backward()
-    assert out.trace.means2d.grad is not None
     assert (out.trace.means2d.grad[out.trace.visible].norm(dim=1) > 0).all()
     assert leaves["scales"].grad[:, 2].abs().max() == 0
 
