@@ -82,7 +82,7 @@ def total(size: cost.SceneSize = DEMO, *, iterations: int = 1000, steps: int = 2
     return found
 
 
-def test_more_of_anything_takes_longer_and_more_cores_less() -> None:
+def test_more_of_anything_takes_longer_and_a_faster_machine_less() -> None:
     usual = total()
     assert total(replace(DEMO, images=144)) > usual
     assert total(replace(DEMO, path_images=48)) > usual
@@ -90,9 +90,6 @@ def test_more_of_anything_takes_longer_and_more_cores_less() -> None:
     assert total(iterations=2000) > usual
     assert total(steps=8) > usual
     assert total(cores=1) > usual > total(cores=4)
-
-
-def test_a_faster_machine_takes_less_and_the_same_memory() -> None:
     slow, fast = (cost.estimate(run_preset(), DEMO, 2, speed) for speed in (1.0, 2.0))
     assert slow.total_s is not None and slow.total_s == pytest.approx(2 * (fast.total_s or 0))
     assert slow.memory_bytes == fast.memory_bytes and slow.written_bytes == fast.written_bytes
@@ -162,12 +159,11 @@ def test_memory_and_disk_decide_which_presets_fit_this_machine() -> None:
     assert "suffice for: none" in text and "NOT free here" in text
 
 
-def test_the_probe_measures_this_machine() -> None:
+def test_the_probe_measures_this_machine_and_one_of_half_the_speed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     speed = probe.speed(2)
     assert 0.001 < speed.now <= speed.idle < 30
-
-
-def test_the_probe_sees_a_machine_of_half_the_speed_of_which_others_take_half(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = {"processor": 0.0}
 
     def one_pass(*_given: object) -> None:
