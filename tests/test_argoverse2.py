@@ -210,8 +210,6 @@ def test_real_flow_follows_from_poses_and_boxes(shared_data: Callable[[str], Pat
     flow, dynamic = flow_truth(shared_data("av2_two_sweeps") / "7fab2350")
     one, two = scene.sweeps
     first, second = scene.ego.pose_at(one.time_s), scene.ego.pose_at(two.time_s)
-    assert first is not None
-    assert second is not None
     assert np.abs((invert(second) @ first)[:3, 3] - [-0.066, 0.003, 0.002]).max() < 1e-3
     world = transform_points(one.world_from_lidar, read_points(scene, one).xyz.astype(np.float64))
     assert len(world) == len(flow) == 99_229

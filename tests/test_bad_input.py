@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import shutil
 from collections.abc import Callable
@@ -15,6 +14,7 @@ import kitti_folders as made
 import numpy as np
 import pytest
 from bad_logs import refused
+from byte_faults import damaged
 from PIL import Image
 from toy_scene import ToyStreet
 
@@ -24,7 +24,7 @@ from mudg.formats.settings import IngestConfig
 from mudg.labels.settings import AnnotateConfig
 from mudg.scene.check import check_scene
 from mudg.scene.clouds import read_fused
-from mudg.scene.read import decode_image, read_image, read_points, read_scene
+from mudg.scene.read import read_image, read_points, read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.steps.ingest import Annotate, Fuse, Ingest
 from mudg.steps.run import Run
@@ -207,12 +207,16 @@ def through(source: Path, tmp_path: Path) -> tuple[Any, Any]:
     return read_scene(labelled), read_fused(Fuse(scene=labelled, out=tmp_path / "fuse", settings=settings).run())
 
 
-def test_no_tracks(drive: Path, tmp_path: Path) -> None:
+def test_a_log_without_tracks_and_with_a_scan_without_points_is_fused(drive: Path, tmp_path: Path) -> None:
     (drive / "derived/label_02.txt").unlink()
+    (drive / SCAN).write_bytes(b"")
     scene, cloud = through(drive, tmp_path)
     assert scene.tracks == ()
     assert dict(cloud.objects) == {}
     assert any("no boxes found" in note for note in scene.source.notes)
+    assert len(read_points(scene, scene.sweeps[3]).xyz) == 0
+    assert len(cloud.static) > 0
+    assert any("no points" in f.message for f in check_scene(scene.root))
 
 
 def test_one_frame(tmp_path: Path) -> None:
@@ -234,14 +238,6 @@ def test_no_lidar(drive: Path, tmp_path: Path) -> None:
     refused("no LiDAR sweeps", Run(source=drive, out=tmp_path / "run", settings=RunConfig()).run)
     assert not (tmp_path / "run" / "annotate").exists()  # before minutes of work, not after
     assert any("no LiDAR" in f.message and f.level == "warning" for f in check_scene(scene.root))
-
-
-def test_scan_with_zero_points(drive: Path, tmp_path: Path) -> None:
-    (drive / SCAN).write_bytes(b"")
-    scene, cloud = through(drive, tmp_path)
-    assert len(read_points(scene, scene.sweeps[3]).xyz) == 0
-    assert len(cloud.static) > 0
-    assert any("no points" in f.message for f in check_scene(scene.root))
 
 
 # --- broken scenes reach every stage the same way -------------------------------------------------
@@ -333,27 +329,6 @@ def test_images_with_colour_maps_and_grey_are_read_as_rgb(tmp_path: Path) -> Non
 
 
 # --- damage at random: only our own errors, never a crash and never a picture of another size -----
-
-
-def damaged(content: bytes, rng: np.random.Generator) -> bytes:
-    changed = bytearray(content)
-    for _ in range(rng.integers(1, 4)):
-        changed[rng.integers(len(changed))] = rng.integers(256)
-    return bytes(changed[: rng.integers(len(changed))] if rng.random() < 0.3 else changed)
-
-
-@pytest.mark.parametrize("kind", ["PNG", "JPEG"])
-def test_damaged_images_end_in_words(kind: str) -> None:
-    rng = np.random.default_rng(0)
-    buffer = io.BytesIO()
-    Image.fromarray(made.image(1)).save(buffer, kind)
-    refused = 0
-    for _ in range(100):
-        try:
-            assert decode_image(damaged(buffer.getvalue(), rng), "damaged").dtype == np.uint8
-        except InputError:
-            refused += 1
-    assert refused > 25
 
 
 def test_damaged_indices_end_in_words(good_scene: Path, tmp_path: Path) -> None:

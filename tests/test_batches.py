@@ -142,16 +142,45 @@ def test_settings_of_a_line_are_those_of_ingest_also_in_the_chain() -> None:
         app.parse(words[3:])
 
 
-def test_a_scene_stays_in_its_shard_when_the_list_grows() -> None:
-    names = [f"scene{number}" for number in range(200)]
-    counts = [sum(shard_of(name, 4) == i for name in names) for i in range(4)]
-    assert sum(counts) == 200 and min(counts) > 20
+def test_a_list_names_sources_folders_and_settings(tmp_path: Path) -> None:
+    drives = "a/drive_1\n'b/drive 2' name=two sequence=07\n/abs/drive_3.zip   # comment\ncity name=c\n"
+    (tmp_path / "list.txt").write_text(f"# drives\n\n{drives}s3://bucket/logs/a\n")
+    entries = read_list(tmp_path / "list.txt", ("sequence",))
+    assert [(e.name, e.source, dict(e.settings)) for e in entries] == [
+        ("drive_1", str(tmp_path / "a/drive_1"), {}),
+        ("two", str(tmp_path / "b/drive 2"), {"sequence": "07"}),
+        ("drive_3.zip", "/abs/drive_3.zip", {}),
+        ("c", "city", {}),
+        ("a", "s3://bucket/logs/a", {}),
+    ]
+    for name in ("b", "a.tfrecord", "_batch", ".hidden", "status.yaml"):  # what a batch wrote there is no log
+        (tmp_path / "logs" / name).mkdir(parents=True)
+    named = [Path(entry.source).name for entry in read_list(tmp_path / "logs")]
+    assert named == ["a.tfrecord", "b", "status.yaml"]
 
 
-def test_sources_may_be_addresses(tmp_path: Path) -> None:
-    (tmp_path / "list.txt").write_text("s3://bucket/logs/a revision=3\nlocal/b\n")
-    listed = read_list(tmp_path / "list.txt", ("revision",))
-    assert [(e.name, e.source) for e in listed] == [("a", "s3://bucket/logs/a"), ("b", str(tmp_path / "local/b"))]
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "list is empty"),
+        ("# nothing\n", "list is empty"),
+        ("a/x\nb/x\n", "the same folder"),
+        ("a b\n", "unknown setting"),
+        ("a speed=3\n", "unknown setting"),
+        ("'a\n", "cannot parse the line"),
+        ("a name=../up\n", "folder name"),
+    ],
+)
+def test_bad_lists_are_refused_with_their_line(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "list.txt").write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_list(tmp_path / "list.txt")
+
+
+def test_shards_are_a_partition() -> None:
+    entries = [Entry(str(n), str(n)) for n in range(60)]
+    parts = [[e for e in entries if shard_of(e.name, 3) == i] for i in range(3)]
+    assert sorted(int(e.name) for part in parts for e in part) == list(range(60)) and min(map(len, parts)) >= 10
 
 
 @pytest.mark.parametrize(
@@ -170,7 +199,7 @@ def test_schedulers_number_the_shards(text: str, environment: Mapping[str, str],
     assert parse_shard(text, environment) == wanted
 
 
-@pytest.mark.parametrize("text", ["5/5", "a/b", "env", "env/5", "env/7"])
+@pytest.mark.parametrize("text", ["5/5", "1", "a/b", "-1/3", "1/0", "env", "env/5", "env/7"])
 def test_what_is_no_shard_is_refused(text: str) -> None:
     for environment in ({}, {"JOB_COMPLETION_INDEX": "7"}, {"JOB_COMPLETION_INDEX": "x"}):
         with pytest.raises(UsageError, match="shard|numbered"):
@@ -450,11 +479,8 @@ def test_a_slurm_task_stops_for_its_checkpoint(tmp_path: Path) -> None:
     handler = signal.getsignal(signal.SIGTERM)
     try:
         assert task() == {"stopped": 1} and (tmp_path / "stopped").exists()
-    finally:
-        signal.signal(signal.SIGTERM, handler)
-    thread.join()
-    made.does("s0", "")
-    try:
+        thread.join()
+        made.does("s0", "")
         assert answers[0].function() == {"done": 2}
     finally:
         signal.signal(signal.SIGTERM, handler)
@@ -476,20 +502,19 @@ def test_submitit_runs_the_tasks(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("option", ["array=0-3", "time=1\n#SBATCH --wrap=x", "--partition=gpu", ""])
-def test_options_that_are_none_for_slurm(option: str, tmp_path: Path) -> None:
-    pytest.importorskip("submitit")
-    made = Scenes(tmp_path, 1)
-    for options in ((option, "time=3"), ("partition=gpu",)):
-        with pytest.raises(UsageError, match="slurm-options"):
-            engines.submit_to_slurm(Job(made.batch, made.plan), made.entries, BatchConfig(slurm_options=options))
-
-
-def test_a_machine_without_slurm_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_options_that_are_none_for_slurm_and_a_machine_without_it_are_told(
+    option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("submitit")
     monkeypatch.setenv("PATH", str(tmp_path))
     made = Scenes(tmp_path, 1)
-    with pytest.raises(ResourceError, match="another --engine"):
-        engines.submit_to_slurm(Job(made.batch, made.plan), made.entries, BatchConfig(slurm_options=("time=3",)))
+    for options, error, said in (
+        ((option, "time=3"), UsageError, "slurm-options"),
+        (("partition=gpu",), UsageError, "slurm-options"),
+        (("time=3",), ResourceError, "another --engine"),
+    ):
+        with pytest.raises(error, match=said):
+            engines.submit_to_slurm(Job(made.batch, made.plan), made.entries, BatchConfig(slurm_options=options))
 
 
 def test_last_words() -> None:

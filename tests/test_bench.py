@@ -1,38 +1,31 @@
-"""Measurements of the diffusion model: flicker at known values, the command end to end."""
+"""``mudg bench mdm``, ``poses`` and ``edit``: measures with known answers, and the commands on generated cities."""
+
+from __future__ import annotations
 
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from tiny_networks import small_mdm
 
+from mudg.base import geometry
 from mudg.base.errors import MudgError, UsageError
+from mudg.base.types import Track
+from mudg.benchmarks import cities
 from mudg.benchmarks import run as bench
+from mudg.benchmarks.cities import NOISE_M, NOISE_RAD, disturbed, pose_errors
 from mudg.benchmarks.settings import BenchConfig
 from mudg.core import metrics
 from mudg.diffusion import city_clips, model_files
-from mudg.diffusion.model import MDM, MDMConfig
-from mudg.networks.codec import CodecConfig
-
-SMALL = MDMConfig(
-    widths=(16, 24),
-    blocks=(1, 1),
-    spatial_attention=(False, True),
-    temporal_attention=(False, True),
-    head_width=8,
-    embed_width=16,
-    patch=2,
-    codec=CodecConfig(decoder_width=8, decoder_blocks=1),
-    refine_widths=(8, 16),
-    refine_blocks=(1, 1),
-    window=8,
-    area_px=24576,
-)
+from mudg.diffusion.model import MDM
+from mudg.editing.model import display_of
 
 
-def still_wall(frames=3, height=12, width=16):
+def still_wall(frames: int = 3, height: int = 12, width: int = 16) -> tuple[torch.Tensor, list[metrics.TrueFrame]]:
     """A wall 10 m ahead, camera moving 0.5 m sideways (so 1 pixel) per frame: its picture moves, its surface does not
     change."""
     poses = np.tile(np.eye(4), (frames, 1, 1))
@@ -45,16 +38,12 @@ def still_wall(frames=3, height=12, width=16):
     return rgb, [metrics.TrueFrame(*one) for one in zip(depth, ids, torch.from_numpy(poses), lens, strict=True)]
 
 
-def test_a_moving_camera_alone_is_no_change():
+def test_flicker_is_change_relative_to_the_truth_and_leaves_movers_and_the_camera_out() -> None:
     rgb, frames = still_wall()
     blinking = rgb + torch.tensor([0.0, 0.1, 0.0]).view(3, 1, 1, 1)
     for made, truth in metrics.changes(blinking, rgb, frames):
         assert truth == pytest.approx(0.0, abs=1e-3)
         assert made == pytest.approx(0.1 * 12 * 15, rel=1e-3)
-
-
-def test_flicker_is_relative_to_the_truth_and_leaves_movers_out():
-    rgb, frames = still_wall()
     noise = torch.randn(rgb.shape, generator=torch.Generator().manual_seed(1))
     truth, made = rgb + 0.1 * noise, rgb + 0.3 * noise
     assert metrics.flicker(made, truth, frames) == pytest.approx(3.0, rel=1e-3)
@@ -63,28 +52,32 @@ def test_flicker_is_relative_to_the_truth_and_leaves_movers_out():
     assert math.isnan(metrics.flicker(made[:1], truth[:1], frames[:1]))
 
 
-def test_reported_and_development_cities_differ():
+def test_reported_cities_are_neither_those_of_development_nor_of_training() -> None:
     assert not set(city_clips.REPORTED) & set(city_clips.DEVELOPMENT)
     assert min(city_clips.REPORTED + city_clips.DEVELOPMENT) >= city_clips.HELD_OUT
     rules = city_clips.CityClipRules()
     for number in (city_clips.REPORTED[0], city_clips.DEVELOPMENT[0]):
         assert city_clips.city_config(rules, number) == city_clips.city_config(replace(rules, seed=7), number)
+    assert not set(cities.LISTS["development"]) & set(cities.LISTS["reported"])
 
 
-def test_what_reads_no_model_takes_none(tmp_path, monkeypatch):
+def test_what_reads_no_model_takes_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(bench.BENCHES, "poses", lambda config, out: ({"cities": []}, "nothing"))
     out = bench.run("poses", BenchConfig(), tmp_path / "out")
     assert json.loads((out / "run.json").read_text())["inputs"] == {}
     absent = BenchConfig(model=str(tmp_path / "no model here"))
-    with pytest.raises(UsageError, match="does not use this setting"):
-        bench.run("poses", absent, tmp_path / "other")
-    with pytest.raises(MudgError, match="no such file or folder"):
-        bench.run("mdm", absent, tmp_path / "other")
+    for name, error, said in (
+        ("poses", UsageError, "does not use this setting"),
+        ("mdm", MudgError, "no such file or folder"),
+        ("nothing", UsageError, "no such benchmark"),
+    ):
+        with pytest.raises(error, match=said):
+            bench.run(name, absent, tmp_path / "other")
 
 
 @pytest.mark.slow
-def test_the_command_measures_a_model(tmp_path):
-    model_files.save(MDM(SMALL), tmp_path / "model", "card", {})
+def test_the_command_measures_a_model(tmp_path: Path) -> None:
+    model_files.save(MDM(small_mdm(window=8)), tmp_path / "model", "card", {})
     config = BenchConfig(model=str(tmp_path / "model"), cities="development", count=1, steps=(1,), precision="float32")
     out = bench.run("mdm", config, tmp_path / "out")
     content = json.loads((out / "bench.json").read_text())
@@ -93,5 +86,102 @@ def test_the_command_measures_a_model(tmp_path):
     assert {"psnr", "psnr_points", "psnr_reference", "flicker", "miou"} <= set(average)
     assert content["seam"]["seams"] == [7, 13, 19]
     assert "Seam" in (out / "bench.md").read_text()
-    with pytest.raises(UsageError, match="no such benchmark"):
-        bench.run("nothing", config, tmp_path / "other")
+
+
+# -- poses -----------------------------------------------------------------------------------------
+
+
+def tracks(count: int = 6, keys: int = 60) -> tuple[Track, ...]:
+    times = 0.1 * np.arange(keys)
+    path = np.stack([geometry.yaw_matrix(0.1 * t, (5 * t, 0.2 * t * t, 1.0)) for t in times])
+    return tuple(Track(f"car-{n:03d}", "car", [4.0, 2.0, 1.5], times, path) for n in range(count))
+
+
+@pytest.mark.parametrize("kind", ["noise", "drift", "offset"])
+def test_disturbances_have_the_size_they_say(kind: str) -> None:
+    pairs = zip(tracks(), disturbed(tracks(), kind, 0), strict=True)
+    moves = [geometry.invert(a.world_from_object) @ b.world_from_object for a, b in pairs]
+    yaws = np.array([[geometry.yaw_of(m) for m in one] for one in moves])
+    places = np.stack([one[:, :3, 3] for one in moves])
+    few = kind != "noise"  # drift and offsets hold few independent draws
+    assert places.std() == pytest.approx(NOISE_M, rel=0.35 if few else 0.05)
+    assert yaws.std() == pytest.approx(NOISE_RAD, rel=0.6 if few else 0.1)
+    steps = np.abs(np.diff(places, axis=1)).mean() / NOISE_M
+    assert steps > 1.0 if kind == "noise" else steps < 0.3 if kind == "drift" else steps == pytest.approx(0, abs=1e-9)
+
+
+def test_a_constant_motion_in_the_box_frame_is_no_error_and_the_rest_is() -> None:
+    truth = tracks(1)[0].world_from_object
+    shifted = truth @ geometry.yaw_matrix(0.3, (0.5, -0.2, 0.1))
+    assert pose_errors(truth, shifted) == pytest.approx((0, 0), abs=1e-9)
+    absolute = pose_errors(truth, shifted, free=False)
+    assert absolute == pytest.approx((math.sqrt(0.25 + 0.04 + 0.01), 0.3), abs=1e-9)
+    sway = np.stack([geometry.yaw_matrix(0.02 * (-1) ** n, (0.1 * (-1) ** n, 0, 0)) for n in range(60)])
+    position_m, yaw_rad = pose_errors(truth, truth @ geometry.yaw_matrix(0.3) @ sway)
+    assert position_m == pytest.approx(0.1, rel=1e-2) and yaw_rad == pytest.approx(0.02, rel=1e-3)
+
+
+def test_the_summary_of_poses_pools_keys_and_says_what_was_recovered() -> None:
+    errors = {"before_m": 0.2, "before_rad": 0.2, "after_m": 0.1, "after_rad": 0.1}
+    one = {"keys": 10, **errors, **{name.replace("_", "_absolute_"): value for name, value in errors.items()}}
+    rows = [{"boxes": "noise", "poses": "learnt", "objects": [one, {**one, "keys": 30}], "psnr_moving": 20.0}]
+    (pooled,) = cities.summary(rows)
+    assert pooled["recovered_m"] == pytest.approx(0.5) and pooled["keys"] == 40
+    text = cities.table({"cities": [1], "iterations": 3, "summary": [pooled]})
+    assert "| noise | learnt | 2 | 0.200 | 0.100 | 50% |" in text
+
+
+# -- edits of cities -------------------------------------------------------------------------------
+
+
+def seen(vehicle: float, truth: float) -> cities.Seen:
+    """Grey render and truth, in linear light, where the vehicle is; elsewhere they differ grossly, which must not
+    count."""
+    mask = np.zeros((48, 64), bool)
+    mask[16:40, 16:56] = True
+    made, true = (
+        np.where(mask, display_of(np.array(v)), other)[..., None].repeat(3, 2)
+        for v, other in ((vehicle, 0.0), (truth, 1.0))
+    )
+    return made.astype(np.float32), true.astype(np.float32), mask
+
+
+def test_scores_are_those_of_the_vehicle_alone() -> None:
+    scores = cities.vehicle_scores([seen(0.1, 0.2)] * 2, [seen(0.3, 0.3)])
+    error = float(display_of(np.array(0.2)) - display_of(np.array(0.1)))
+    assert scores["psnr"] == pytest.approx(-20 * math.log10(error), abs=1e-3)
+    assert scores["light"] == pytest.approx(2.0, rel=1e-4)
+    assert scores["psnr_recorded"] > 80
+    right, wrong = (cities.vehicle_scores([seen(*tones)], [])["perceptual"] for tones in ((0.3, 0.3), (0.1, 0.4)))
+    assert right < wrong
+    nothing = cities.vehicle_scores([], [seen(0.3, 0.3)])
+    assert nothing["psnr"] is None and nothing["light"] is None and nothing["perceptual"] is None
+
+
+def test_the_summary_of_edits_leaves_out_what_no_frame_shows_and_takes_dark_and_bright_alike() -> None:
+    row = {"psnr": 20.0, "psnr_recorded": 30.0, "perceptual": 0.2, "perceptual_recorded": 0.1}
+    rows = [{"way": way, **row, "light": light} for way in cities.LIGHTS for light in (2.0, 0.5)]
+    rows.append({"way": "as recorded", **dict.fromkeys(row), "light": None})
+    one, two = cities.REPLACED.summary(rows)
+    assert one["light"] == pytest.approx(2.0) and (one["cities"], two["cities"]) == (2, 2)
+    assert "| as recorded | 20.00 | 30.00 | 0.2000 | 0.1000 | 2.0x | 2.00x |" in cities.REPLACED.table([one, two])
+
+
+@pytest.mark.slow
+def test_the_command_edits_cities_and_puts_vehicles_of_one_into_the_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fitted, case_of = [], cities.case_of
+    noted = lambda config, city, out: (fitted.append(city), case_of(config, city, out))[1]
+    monkeypatch.setattr(cities, "case_of", noted)
+    out = bench.run("edit", BenchConfig(cities="development", count=2, pose_iterations=60), tmp_path / "out")
+    content = json.loads((out / "bench.json").read_text())
+    assert len(content["rows"]) == 14 and len(content["insert"]["rows"]) == 4
+    assert "Vehicles of other cities" in (out / "bench.md").read_text()
+    assert fitted == content["cities"]  # each once, although three parts read it
+    assert all(row["psnr"] < row["psnr_recorded"] for row in content["insert"]["rows"])
+    for row in content["rows"]:  # edits are as good as the fit
+        assert row["outside"] < 0.03 and (row["edit"] != "remove" or row["vehicle"] is None)
+        if row["overlap"] is not None:
+            assert row["overlap"] > row["overlap_before"] - 0.05
+            assert row["vehicle"] > row["vehicle_before"] - 3

@@ -3,14 +3,12 @@ log."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from fit_settings import fit_config
 
 from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
@@ -22,25 +20,15 @@ from mudg.core import view_metrics
 from mudg.core.table import Table
 from mudg.editing.runs import find_run
 from mudg.editing.script import parse_edits
-from mudg.formats.settings import IngestConfig
 from mudg.gaussians.storage import load_model
-from mudg.labels.settings import AnnotateConfig
-from mudg.scene.settings import FuseConfig
-from mudg.steps.fit import Fit
-from mudg.steps.ingest import Annotate, Fuse, Ingest
 
 FRAMES = 4
 
 
 @pytest.fixture(scope="module")
-def run(street_run: Path) -> Path:
-    """A folder like that of ``mudg run``, of a car that drives ahead."""
-    return street_run
-
-
-@pytest.fixture(scope="module")
-def case(run: Path) -> RunCase:
-    return edit_runs.case_of("street", find_run(run), torch.device("cpu"))
+def case(street_run: Path) -> RunCase:
+    """The run of a car that drives ahead."""
+    return edit_runs.case_of("street", find_run(street_run), torch.device("cpu"))
 
 
 def test_an_edit_that_does_nothing_changes_nothing(case: RunCase) -> None:
@@ -97,30 +85,27 @@ def test_fog_keeps_depth_and_loses_edges_with_its_density(case: RunCase) -> None
     assert 1 > rows[0]["structure"] > rows[1]["structure"] > 0
 
 
-def test_gradients_agree_under_another_exposure_and_not_with_the_negative() -> None:
+def test_measures_of_two_images_by_hand() -> None:
+    """Gradients agree under another exposure; a byte step is no change; masks count in both and in either."""
     image = torch.from_numpy(np.random.default_rng(0).random((3, 12, 16), np.float32))
     assert view_metrics.gradient_correlation(0.5 * image + 0.1, image) == pytest.approx(1)
     assert view_metrics.gradient_correlation(1 - image, image) == pytest.approx(-1)
     assert view_metrics.gradient_correlation(torch.zeros_like(image), image) is None
-
-
-def test_one_step_of_a_byte_is_no_change_and_two_are() -> None:
     image = torch.full((3, 2, 2), 0.5)
     other = image.clone()
     other[0, 0, 0] += 1 / 255
     other[2, 1, 1] -= 2 / 255
     assert view_metrics.changed_pixels(other, image).tolist() == [[False, False], [False, True]]
-
-
-def test_masks_are_counted_in_both_and_in_either() -> None:
     a, b = np.eye(3, dtype=bool), np.zeros((3, 3), bool)
     b[0] = True
     assert view_metrics.mask_counts(a, b) == (1, 5)
 
 
-def test_two_drives_give_a_table_a_page_and_resume(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_drives_give_a_table_a_page_and_resume(
+    street_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     other = tmp_path / "other"
-    other.symlink_to(run)
+    other.symlink_to(street_run)
     monkeypatch.setattr(edit_runs, "EDITS", {name: edit_runs.EDITS[name] for name in ("move 1 m left", "insert")})
     out, rounds = tmp_path / "out", []
     inner = edit_runs.measured
@@ -133,8 +118,8 @@ def test_two_drives_give_a_table_a_page_and_resume(run: Path, tmp_path: Path, mo
 
     monkeypatch.setattr(edit_runs, "measured", stopped)
     with pytest.raises(KeyboardInterrupt):
-        bench.run("edit", BenchConfig(device="cpu"), out, sources=[run, other])
-    bench.run("edit", BenchConfig(device="cpu"), out, sources=[run, other])
+        bench.run("edit", BenchConfig(device="cpu"), out, sources=[street_run, other])
+    bench.run("edit", BenchConfig(device="cpu"), out, sources=[street_run, other])
     assert len(rounds) == 5  # the row that was finished was not measured again
     doc = store.read_json(out / "bench.json")
     assert [(row["run"], row["edit"], row["given_by"]) for row in doc["rows"]] == [
@@ -146,22 +131,23 @@ def test_two_drives_give_a_table_a_page_and_resume(run: Path, tmp_path: Path, mo
     assert doc["rows"][1]["overlap"] > 0.3 and doc["rows"][1]["overlap_before"] == doc["rows"][0]["overlap_before"]
     page, text = (out / "page.html").read_text(), (out / "bench.md").read_text()
     assert page.count("<img ") == 4 * 2 * 3 and "http" not in page.split("<main")[1] and text.count("\n| street |") == 2
-    bench.run("edit", BenchConfig(device="cpu"), out, sources=[run, other])
+    bench.run("edit", BenchConfig(device="cpu"), out, sources=[street_run, other])
     assert len(rounds) == 5
 
 
 def test_what_cannot_be_measured_is_refused_in_words(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    street_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(InputError, match="no fitted scene"):
-        bench.run("edit", BenchConfig(), tmp_path / "a", sources=[tmp_path / "nothing"])
-    with pytest.raises(InputError, match="of a fit alone"):
-        bench.run("edit", BenchConfig(), tmp_path / "a", sources=[run / "fit" / "street_gaussians"])
-    with pytest.raises(UsageError, match="harmonize"):
-        bench.run("edit", BenchConfig(harmonize=True), tmp_path / "a", sources=[run])
+    for source, config, error, said in (
+        (tmp_path / "nothing", BenchConfig(), InputError, "no fitted scene"),
+        (street_run / "fit" / "street_gaussians", BenchConfig(), InputError, "of a fit alone"),
+        (street_run, BenchConfig(harmonize=True), UsageError, "harmonize"),
+    ):
+        with pytest.raises(error, match=said):
+            bench.run("edit", config, tmp_path / "a", sources=[source])
     assert not (tmp_path / "a").exists()
-    model = load_model(run / "fit" / "street_gaussians")
-    parts = find_run(run)
+    model = load_model(street_run / "fit" / "street_gaussians")
+    parts = find_run(street_run)
     with monkeypatch.context() as patch:
         patch.setattr(edit_runs, "model_of_scene", lambda *_: replace(model, classes=()))
         with pytest.raises(InputError, match="without labels"):
@@ -169,19 +155,3 @@ def test_what_cannot_be_measured_is_refused_in_words(
     scene = edit_runs.case_of("street", parts, torch.device("cpu"))
     with pytest.raises(InputError, match="no vehicle moves"):
         edit_runs.lead_of(scene.scene, replace(model, nodes=model.nodes[:1]), scene.frames, scene.points)
-
-
-@pytest.mark.slow
-def test_a_recorded_drive(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
-    root = tmp_path / "kitti"
-    settings = IngestConfig(resolution="320", contact_sheet=False)
-    Ingest(log=shared_data("kitti_2011_09_26"), out=tmp_path / "raw", settings=settings).run()
-    Annotate(scene=tmp_path / "raw", out=root / "scene", settings=AnnotateConfig()).run()
-    Fuse(scene=root / "scene", out=root / "fuse", settings=FuseConfig()).run()
-    config = fit_config(method="street_gaussians", iterations=100, start__gaussians=6000, densify__max_gaussians=8000)
-    Fit(scene=root / "scene", fused=root / "fuse", out=root / "fit" / "street_gaussians", settings=config).run()
-    out = bench.run("edit", BenchConfig(), tmp_path / "out", sources=[root])
-    rows = {row["edit"]: row for row in store.read_json(out / "bench.json")["rows"]}
-    assert rows["remove"]["object"] == "0" and rows["remove"]["outside"] < 0.03
-    assert rows["fog"]["lidar"] == rows["fog"]["lidar_before"] and 0 < rows["dusk"]["structure"] < 1
-    assert all(row["warp"] < 0.2 for row in rows.values()) and rows["move 3 m ahead"]["overlap"] > 0.3

@@ -9,7 +9,7 @@ import torch
 import write_custom
 import write_pandaset
 from pandas_pickles import write_frame
-from test_bench import SMALL
+from tiny_networks import small_mdm
 
 from mudg.base import store
 from mudg.base.camera_colors import ColorMap
@@ -52,6 +52,11 @@ def city(tmp_path_factory):
     return Ingest(log=ingest.CITY, out=tmp_path_factory.mktemp("log") / "city", settings=settings).run()
 
 
+@pytest.fixture(scope="module")
+def scene(city):
+    return read_scene(city)
+
+
 def job_of(out, source, split, config, rows=()):
     """A log under a way of hiding."""
     return real.SplitJob(out, source, split, (), rows, config, False)
@@ -78,8 +83,7 @@ def test_blocks_are_spread_and_leave_both_ends(moments, length, blocks):
     assert len(found) == 0 or (len(runs) == len(found) + 1 and runs.max() - runs.min() <= 1)
 
 
-def test_a_block_hides_all_cameras_and_the_sweeps_of_its_moments(city):
-    scene = read_scene(city)
+def test_a_block_hides_all_cameras_and_the_sweeps_of_its_moments(scene):
     held = places.held_out(scene, SPLITS["gap-3"], ())
     first, last = dict(held.facts)["blocks"][0]
     times = [frame.view.time_s for frame in scene.frames_of("front")]
@@ -89,23 +93,27 @@ def test_a_block_hides_all_cameras_and_the_sweeps_of_its_moments(city):
     assert all(times[first] - 0.05 <= s.time_s <= times[last] + 0.05 for s in scene.sweeps if s.id in held.sweeps)
 
 
-def test_a_log_that_is_too_short_is_left_out_with_the_reason(city):
-    scene = dataclasses.replace(read_scene(city), frames=read_scene(city).frames[:8])
-    assert "too few" in places.held_out(scene, SPLITS["gap-3"], ()).reason
+def test_a_log_that_is_too_short_is_left_out_with_the_reason(scene):
+    short = dataclasses.replace(scene, frames=scene.frames[:8])
+    assert "too few" in places.held_out(short, SPLITS["gap-3"], ()).reason
     one = dataclasses.replace(scene, cameras={"front": scene.cameras["front"]}, frames=scene.frames_of("front"))
     assert "no camera besides" in places.held_out(one, SPLITS["camera"], ()).reason
 
 
-def test_a_part_holds_nothing_of_what_is_hidden(city, tmp_path):
-    scene = read_scene(city)
+def test_a_part_holds_nothing_of_what_is_hidden_nor_classes_of_points(scene, tmp_path):
     held = places.held_out(scene, SPLITS["gap-3"], ())
     hidden = held.places(scene)
     shown = {f.id for f in scene.frames} - set(held.frames)
-    part = write_part(scene, tmp_path / "part", shown, {s.id for s in scene.sweeps} - set(held.sweeps), hidden)
+    classed = with_classes(scene, tmp_path / "classed", lambda count: np.arange(count, dtype=np.uint8) % 19)
+    assert read_points(classed, classed.sweeps[0]).classes is not None
+    part = write_part(classed, tmp_path / "part", shown, {s.id for s in scene.sweeps} - set(held.sweeps), hidden)
     assert part.source.recipe is None
+    assert [s.id for s in part.sweeps] == [s.id for s in scene.sweeps if s.id not in held.sweeps] != []
+    for sweep, original in zip(part.sweeps, (s for s in scene.sweeps if s.id not in held.sweeps), strict=True):
+        points = read_points(part, sweep)
+        assert points.classes is None and np.array_equal(points.xyz, read_points(scene, original).xyz)
     assert {f.id for f in part.frames_in("test")} == set(held.frames)
     assert {f.id for f in part.frames_in("train")} == shown
-    assert not {s.id for s in part.sweeps} & set(held.sweeps)
     for frame in part.frames_in("test"):
         assert not read_image(part, frame).any() and not frame.labels
     frame = part.frames_in("train")[0]
@@ -145,7 +153,7 @@ def model(tmp_path_factory):
     """A small model that uses renders."""
     folder = tmp_path_factory.mktemp("model") / "model"
     torch.manual_seed(0)
-    mdm_files.save(MDM(dataclasses.replace(SMALL, renders=True)), folder, "a model of tests", {})
+    mdm_files.save(MDM(small_mdm(window=8, renders=True)), folder, "a model of tests", {})
     return str(folder)
 
 
@@ -169,30 +177,19 @@ def made_from(source, out, split, model):
     }
 
 
-@pytest.fixture(scope="module")
-def untouched(city, model, tmp_path_factory):
-    return {name: made_from(city, tmp_path_factory.mktemp(name), SPLITS[name], model) for name in ("gap-3", "camera")}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("split", ["gap-3", "camera"])
-def test_held_out_content_changes_no_fit_no_cloud_no_model_and_no_view(city, model, tmp_path, split, untouched):
-    scene, plain, split = read_scene(city), untouched[split], SPLITS[split]
-    held = places.held_out(scene, split, ())
+def test_held_out_content_changes_no_fit_no_cloud_no_model_and_no_view(scene, city, model, tmp_path, split):
+    split = SPLITS[split]
+    plain, held = made_from(city, tmp_path / "plain", split, model), places.held_out(scene, split, ())
     corrupted(scene, tmp_path / "noise", set(held.frames), set(held.sweeps))
     assert any("fit/mudg_s" in name for name in plain) and any("virtual/" in name for name in plain)
     assert any("render/mudg_s" in name for name in plain) and any("fuse/static" in name for name in plain)
     again = made_from(tmp_path / "noise", tmp_path / "out", split, model)
     assert [name for name in plain if again[name] != plain[name]] == [] and set(again) == set(plain)
-
-
-@pytest.mark.slow
-def test_shown_content_changes_the_fit(city, model, tmp_path, untouched):
-    scene, split = read_scene(city), SPLITS["gap-3"]
-    corrupted(scene, tmp_path / "noise", {"front/000000"}, ())
-    other = made_from(tmp_path / "noise", tmp_path / "out", split, model)
-    name = f"{split.name}/fit/mudg_s/gaussians.safetensors"
-    assert untouched["gap-3"][name] != other[name]
+    corrupted(scene, tmp_path / "seen", {"front/000000"}, ())  # what is shown does count
+    fitted = f"{split.name}/fit/mudg_s/gaussians.safetensors"
+    assert made_from(tmp_path / "seen", tmp_path / "other", split, model)[fitted] != plain[fitted]
 
 
 def with_classes(scene, out, classes):
@@ -206,21 +203,6 @@ def with_classes(scene, out, classes):
         for frame in scene.frames:
             writer.copy_frame(scene, frame)
         return writer.finish()
-
-
-def test_a_part_has_no_classes_of_points_and_else_the_same_points(city, tmp_path):
-    scene = read_scene(city)
-    rng = np.random.default_rng(0)
-    classed = with_classes(scene, tmp_path / "classed", lambda count: rng.integers(0, 19, count).astype(np.uint8))
-    assert read_points(classed, classed.sweeps[0]).classes is not None
-    frames, sweeps = {f.id for f in scene.frames}, {s.id for s in scene.sweeps[1:]}
-    part = write_part(classed, tmp_path / "part", frames, sweeps)
-    plain = write_part(scene, tmp_path / "plain", frames, sweeps)
-    assert [s.id for s in part.sweeps] == [s.id for s in plain.sweeps] and len(part.sweeps) == len(scene.sweeps) - 1
-    for one, other in zip(part.sweeps, plain.sweeps, strict=True):
-        assert read_points(part, one).classes is None
-        a, b = ((tmp_path / folder / of.points.path).read_bytes() for folder, of in (("part", one), ("plain", other)))
-        assert a == b
 
 
 # ---- measures with known answers -----------------------------------------------------------------
@@ -332,10 +314,10 @@ def test_comparisons_are_differences_or_ratios():
 @pytest.fixture(scope="module")
 def exact(city, tmp_path_factory):
     """A function that scores the exact views of the city under a protocol."""
+    scene = read_scene(city)
 
-    def of(name, classes=None):
-        out = tmp_path_factory.mktemp(name)
-        scene, protocol = read_scene(city), BY_NAME[name]
+    def of(name):
+        out, protocol = tmp_path_factory.mktemp(name), BY_NAME[name]
         split = SPLITS[protocol.split]
         held = places.held_out(scene, split, ())
         job = job_of(out, city, split, BenchConfig())
@@ -431,13 +413,11 @@ def test_finished_work_is_reused_and_a_method_can_be_added(made, city, model):
     assert [row["name"] for row in document["methods"]] == names
     assert isinstance(document["protocols"]["gap-1"]["against"]["mudg_s"]["psnr"], float)
     start = store.digest(split / "fit" / "street_gaussians")
-    states = {
-        name: store.read_json(split / "fit" / name / "run.json") for name in ("mudg_s", "street_gaussians-longer")
-    }
-    assert [states[name]["inputs"].get("start") for name in states] == [None, start]
-    assert [states[name]["summary"]["steps"] for name in states] == [config.iterations * 3 // 2, config.iterations // 2]
-    inputs = store.read_json(split / "fit" / "street_gaussians-longer" / "run.json")["inputs"]
-    assert not [name for name in inputs if "virtual" in name or "observations" in name]
+    both = ("mudg_s", "street_gaussians-longer")
+    guided, longer = (store.read_json(split / "fit" / name / "run.json") for name in both)
+    assert [state["inputs"].get("start") for state in (guided, longer)] == [None, start]
+    assert [s["summary"]["steps"] for s in (guided, longer)] == [config.iterations * 3 // 2, config.iterations // 2]
+    assert not [name for name in longer["inputs"] if "virtual" in name or "observations" in name]
     assert "fitted" not in store.read_json(split / "virtual" / "run.json")["inputs"]
 
 
@@ -483,8 +463,8 @@ def test_classes_of_points_are_scored_where_a_log_has_them_and_hidden_from_metho
         assert seen.sweeps and all(read_points(seen, sweep).classes is None for sweep in seen.sweeps)
 
 
-def test_classes_of_points_change_nothing_that_methods_make(city, tmp_path):
-    scene, found = read_scene(city), []
+def test_classes_of_points_change_nothing_that_methods_make(scene, tmp_path):
+    found = []
     for name, train_id in (("a", "road"), ("b", "sky")):
         with_classes(scene, tmp_path / name, lambda count, i=ID[train_id]: np.full(count, i, np.uint8))
         job = job_of(tmp_path / f"out_{name}", tmp_path / name, SPLITS["all"], BenchConfig())

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from test_bench import SMALL
+from tiny_networks import small_mdm
 
 from mudg.base import seeds, store
 from mudg.base.errors import InputError, UsageError
@@ -35,6 +35,9 @@ def test_lists_are_apart_from_each_other_and_from_all_training_cities():
     development, reported = city_logs.LISTS["development"], city_logs.LISTS["reported"]
     assert (len(development), len(reported)) == (4, 8)
     assert not set(development) & set(reported)
+    for seeds_ in (development, reported):
+        turns = [city_logs.turn_deg(city_logs.log_config(seed)) for seed in seeds_]
+        assert sum(turn >= city_logs.CHOICE.curved_deg for turn in turns) == len(turns) / 2
     trained = {seeds.key(0, city, "city") & 0x7FFFFFFF for city in range(5000)}
     scored = {
         city_clips.city_config(city_clips.CityClipRules(), c).seed for of in city_clips.LISTS.values() for c in of
@@ -42,30 +45,20 @@ def test_lists_are_apart_from_each_other_and_from_all_training_cities():
     assert not (trained | scored) & set(development + reported)
 
 
-@pytest.mark.parametrize("name", ["development", "reported"])
-def test_half_of_a_list_is_curved(name):
-    turns = [city_logs.turn_deg(city_logs.log_config(seed)) for seed in city_logs.LISTS[name]]
-    assert sum(turn >= city_logs.CURVED_DEG for turn in turns) == len(turns) / 2
-
-
-def test_the_development_list_is_what_the_rule_gives():
-    assert city_logs.choose(2_100_000, 4) == city_logs.DEVELOPMENT
+@pytest.mark.parametrize(
+    ("first", "name"), [(2_100_000, "development"), pytest.param(2_100_100, "reported", marks=pytest.mark.slow)]
+)
+def test_a_list_is_what_the_rule_gives(first, name):
+    assert city_logs.choose(first, len(city_logs.LISTS[name])) == city_logs.LISTS[name]
     with pytest.raises(UsageError, match="half"):
         city_logs.choose(0, 3)
 
 
-@pytest.mark.slow
-def test_the_reported_list_is_what_the_rule_gives():
-    assert city_logs.choose(2_100_100, 8) == city_logs.REPORTED
-
-
 def test_moving_instances_are_those_of_the_generator():
     world = CityWorld(city_logs.log_config(city_logs.DEVELOPMENT[0], TINY))
-    judged = set(city_logs.moving_instances(world))
     ways = [np.ptp(posed.keys[:, :2], axis=0).max() for posed in world.objects]
     still = {number for number, way in enumerate(ways, start=1) if way == 0}
-    assert judged
-    assert not judged & still
+    assert set(city_logs.moving_instances(world)) and not set(city_logs.moving_instances(world)) & still
 
 
 # ---- rows ----------------------------------------------------------------------------------------
@@ -101,22 +94,16 @@ def test_ablation_brings_the_rows_it_is_compared_with():
     assert rows["exact"] == full
 
 
-def test_published_methods_are_rows_where_they_are_asked_for():
+def test_rows_are_those_that_are_asked_for():
+    rows = shift_rows(BenchConfig(methods=("mudg_s", LONGER, "street_gaussians"), iterations=30))
+    assert [row.name for row in rows] == ["street_gaussians", LONGER, "mudg_s"]
+    assert rows[1].fit == rows[0].fit
     config = BenchConfig(methods=("pvg", "street_gaussians", "emernerf"), iterations=30)
     rows = {row.name: row.fit for row in shift_rows(config)}
     assert list(rows) == ["street_gaussians", "pvg", "emernerf"]
     assert {name: (fit.method, fit.iterations) for name, fit in rows.items()} == {name: (name, 30) for name in rows}
     assert not set(PUBLISHED) & set(BenchConfig().methods)
     assert set(PUBLISHED) < set(METHODS)
-
-
-def test_the_control_has_the_settings_of_the_first_fit():
-    rows = shift_rows(BenchConfig(methods=("mudg_s", LONGER, "street_gaussians"), iterations=30))
-    assert [row.name for row in rows] == ["street_gaussians", LONGER, "mudg_s"]
-    assert rows[1].fit == rows[0].fit
-
-
-def test_unknown_methods_and_repeated_names_are_refused():
     with pytest.raises(UsageError, match="unknown method"):
         shift_rows(BenchConfig(methods=("nerf",)))
     with pytest.raises(UsageError, match="same name"):
@@ -214,13 +201,15 @@ def test_the_command_compares_methods_and_reuses_what_is_there(made):
     again = shift.run(dataclasses.replace(config, **changes), out, rules=TINY, distances_m=(3.0,))
     assert (out / log / "fit" / "street_gaussians" / "run.json").stat().st_mtime_ns == before
     assert [m["name"] for m in store.read_json(again / "bench.json")["methods"]] == ["street_gaussians", "still"]
+    with pytest.raises(UsageError, match="another configuration"):
+        bench.run("shift", dataclasses.replace(config, iterations=31), out)
 
 
 @pytest.mark.slow
 def test_fits_under_virtual_views_begin_from_nothing_and_their_control_goes_on(made, tmp_path):
     out, config = made
     torch.manual_seed(0)
-    model_files.save(MDM(dataclasses.replace(SMALL, renders=True)), tmp_path / "model", "a model of tests", {})
+    model_files.save(MDM(small_mdm(window=8, renders=True)), tmp_path / "model", "a model of tests", {})
     log = out / str(city_logs.DEVELOPMENT[0])
     methods, variants = ("mudg_s", "mudg_f", LONGER), ("louder=virtual.color_weight:2", "flat=sh_degree:1")
     changes = {"methods": methods, "model": str(tmp_path / "model"), "variant": variants, "videos": False}
@@ -256,10 +245,3 @@ def test_stored_truth_is_the_drawn_truth(made):
         stored.at_view(dataclasses.replace(view, time_s=view.time_s + 0.05), None, "front_shift+3.0")
     with pytest.raises(InputError, match="lacks a trajectory"):
         stored.at_view(view, None, "front_shift+9.0")
-
-
-@pytest.mark.slow
-def test_other_settings_in_the_same_folder_are_refused(made):
-    out, config = made
-    with pytest.raises(UsageError, match="another configuration"):
-        bench.run("shift", dataclasses.replace(config, iterations=31), out)

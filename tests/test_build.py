@@ -20,8 +20,6 @@ pytestmark = pytest.mark.skipif(not FOLDER.exists(), reason="the build back-end 
 
 def _load(name: str) -> ModuleType:
     spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     spec.loader.exec_module(module)
@@ -115,32 +113,23 @@ def test_without_any_compiler_the_build_goes_on_and_says_so(mc: ModuleType, tmp_
     assert "no C++ compiler" in stored["reason"]
 
 
-def test_sources_that_do_not_compile_are_reported_in_words(mc: ModuleType, tmp_path: Path) -> None:
-    outcome = _build(mc, tmp_path, "auto", {"gcc", "zig"}, ["gcc", "zig"])
-    assert outcome.library is None
-    assert "does not compile with zig" in outcome.reason
-
-
-def test_require_turns_no_library_into_an_error(mc: ModuleType, tmp_path: Path) -> None:
+def test_the_mode_says_whether_there_has_to_be_a_library(mc: ModuleType, tmp_path: Path) -> None:
+    for mode, failing, working, said in (
+        ("auto", {"gcc", "zig"}, ["gcc", "zig"], "does not compile with zig"),
+        ("off", set(), ["gcc"], "off"),
+    ):
+        outcome = _build(mc, tmp_path, mode, failing, working)
+        assert outcome.library is None and said in outcome.reason
     with pytest.raises(mc.CompileError, match="MUDG_NATIVE=require"):
         _build(mc, tmp_path, "require", {"gcc"}, ["gcc"])
     assert _build(mc, tmp_path, "require", set(), ["gcc"]).library is not None
-
-
-def test_off_compiles_nothing(mc: ModuleType, tmp_path: Path) -> None:
-    outcome = _build(mc, tmp_path, "off", set(), ["gcc"])
-    assert outcome.library is None
-    assert "off" in outcome.reason
-
-
-def test_an_unknown_mode_is_refused(mc: ModuleType) -> None:
     with pytest.raises(mc.CompileError, match="auto, require, off"):
         mc.native_mode({"MUDG_NATIVE": "maybe"})
     assert mc.native_mode({}) == mc.native_mode({"MUDG_NATIVE": ""}) == "auto"
     assert mc.native_mode({"MUDG_NATIVE": " Off "}) == "off"
 
 
-def test_flags_follow_the_file_name_and_the_compiler(mc: ModuleType) -> None:
+def test_flags_and_sources_follow_the_processor_and_the_compiler(mc: ModuleType) -> None:
     gcc, zig = mc.Compiler(("g++",), "system", x86_64=True), mc.Compiler(("zig",), "ziglang", x86_64=True)
     assert "-mavx512f" in mc.flags_for(gcc, Path("kernels_avx512.cpp"))
     assert "-mavx2" in mc.flags_for(gcc, Path("kernels_avx2.cpp"))
@@ -151,9 +140,6 @@ def test_flags_follow_the_file_name_and_the_compiler(mc: ModuleType) -> None:
         flags = mc.flags_for(compiler, Path("kernels_avx2.cpp"))
         assert "-ffp-contract=off" in flags
         assert "-ffast-math" not in flags
-
-
-def test_other_processors_compile_no_x86_variants(mc: ModuleType) -> None:
     names = {p.name for p in mc.sources_for(mc.Compiler(("c++",), "system", x86_64=False))}
     assert "kernels_portable.cpp" in names
     assert not [n for n in names if "avx" in n]
@@ -174,11 +160,12 @@ def test_object_files_are_named_after_all_they_depend_on(mc: ModuleType, tmp_pat
     assert first != mc.digest_of(compiler, ("-O3",), tmp_path / "a.cpp")
 
 
-def test_zig_is_asked_for_only_where_it_exists(mc: ModuleType) -> None:
-    assert mc.zig_is_offered("linux", "x86_64")
-    assert mc.zig_is_offered("darwin", "arm64")
-    assert not mc.zig_is_offered("linux", "sparc64")
-    assert not mc.zig_is_offered("sunos5", "x86_64")
+@pytest.mark.parametrize(
+    ("system", "machine", "offered"),
+    [("linux", "x86_64", True), ("darwin", "arm64", True), ("linux", "sparc64", False), ("sunos5", "x86_64", False)],
+)
+def test_zig_is_asked_for_only_where_it_exists(mc: ModuleType, system: str, machine: str, offered: bool) -> None:
+    assert mc.zig_is_offered(system, machine) == offered
 
 
 @pytest.mark.skipif(importlib.util.find_spec("setuptools") is None, reason="setuptools is not installed")

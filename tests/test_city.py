@@ -1,21 +1,28 @@
-"""The generated city: exactness of its truth, agreement of its sensors, determinism."""
+"""The generated city: exactness of its truth, agreement of its sensors, determinism, its recordings and photographs."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from mudg import native
 from mudg.base import geometry, palette
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.base.types import Camera, Source, View
+from mudg.base.types import Camera, Scene, Source, View
 from mudg.city.config import CityConfig
-from mudg.city.world import CitySweep, CityWorld
+from mudg.city.light import SKY_SLOT, draw_photos, panorama, radiance, surface
+from mudg.city.logs import write_city
+from mudg.city.world import CitySweep, CityTruth, CityWorld
+from mudg.scene.labels import read_label
+from mudg.scene.read import read_image, read_points
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="the city needs the native library")
 
@@ -60,7 +67,6 @@ def moved(view: View, by_m: np.ndarray) -> View:
 
 def left_of_ego(world: CityWorld, time_s: float) -> np.ndarray:
     pose = world.ego_path().pose_at(time_s)
-    assert pose is not None
     left = pose[:3, 1].copy()
     left[2] = 0
     return left / np.linalg.norm(left)
@@ -133,9 +139,7 @@ def test_labels_come_from_the_pixel_centre_and_belong_together(world: CityWorld)
     view = world.frame_views("front_left")[7]
     one, two, three = (world.render(view, supersample=n) for n in (1, 2, 3))
     for other in (two, three):
-        np.testing.assert_array_equal(one.depth, other.depth)
-        np.testing.assert_array_equal(one.semantics, other.semantics)
-        np.testing.assert_array_equal(one.instance, other.instance)
+        assert_same_truth(one, replace(other, rgb=one.rgb))
     assert abs(float(one.rgb.mean() - two.rgb.mean())) < 0.02
     assert (one.sky == (one.semantics == palette.ID["sky"])).all()
     movable = np.isin(one.semantics, palette.DYNAMIC_IDS)
@@ -162,7 +166,6 @@ def test_instances_lie_in_their_boxes(world: CityWorld) -> None:
     for instance in seen:
         track = boxes[int(instance)]
         pose = track.pose_at(view.time_s)
-        assert pose is not None
         local = geometry.transform_points(geometry.invert(pose), points[truth.instance == instance])
         # door mirrors stick out sideways, roof rails and lamps upwards
         assert (np.abs(local) < track.size_m / 2 + [0.15, 0.3, 0.3]).all(), track.id
@@ -183,7 +186,6 @@ def test_every_return_is_where_a_camera_ray_ends(clean_world: CityWorld) -> None
     for i in chosen:
         time_s = sweep.time_s + float(sweep.points.dt_s[i])
         ego = clean_world.ego_path().pose_at(time_s)
-        assert ego is not None
         origin = (ego @ mount)[:3, 3]
         probe = clean_world.render(looking_at(origin, points[i], time_s), supersample=1)
         distance = float(np.linalg.norm(points[i] - origin))
@@ -204,7 +206,6 @@ def world_points(sweep: CitySweep) -> np.ndarray:
 def scanner_mount(world: CityWorld) -> np.ndarray:
     sweep_pose = world.lidar_sweep(0).world_from_lidar
     ego = world.ego_path().pose_at(0.0)
-    assert ego is not None
     return geometry.invert(ego) @ sweep_pose
 
 
@@ -237,9 +238,7 @@ def test_sweep_times_directions_and_intensity(world: CityWorld) -> None:
     period = 1 / CONFIG.rate_hz
     assert np.abs(points.dt_s).max() <= period / 2
     ahead = (np.abs(points.xyz[:, 1]) < 0.05 * points.xyz[:, 0]) & (points.xyz[:, 0] > 5)
-    assert np.abs(points.dt_s[ahead]).max() < 0.02 * period + 0.02 * period, (
-        "the scanner looks ahead at the sweep's time"
-    )
+    assert np.abs(points.dt_s[ahead]).max() < 0.04 * period, "the scanner looks ahead at the sweep's time"
     left = (points.xyz[:, 1] > 5) & (np.abs(points.xyz[:, 0]) < 1)
     assert (points.dt_s[left] < -0.2 * period).all()
     assert (points.intensity >= 0).all()
@@ -261,7 +260,6 @@ def test_boxes_contain_the_returns_of_their_objects(world: CityWorld) -> None:
             for dt in np.unique(sweep.points.dt_s[mine]):
                 rows = mine[sweep.points.dt_s[mine] == dt]
                 pose = track.pose_at(sweep.time_s + float(dt))
-                assert pose is not None
                 local = geometry.transform_points(geometry.invert(pose), points[rows])
                 outside += int((np.abs(local) > track.size_m / 2 + 0.12).any(1).sum())
                 total += len(rows)
@@ -278,7 +276,6 @@ def test_the_drive_starts_at_the_origin_and_curves_and_changes_speed() -> None:
         world = CityWorld(replace(CONFIG, seed=seed, n_frames=60, crossing="auto"))
         ego = world.ego_path()
         start = ego.pose_at(0.0)
-        assert start is not None
         np.testing.assert_allclose(start, np.eye(4), atol=1e-12)
         steps = np.linalg.norm(np.diff(ego.world_from_ego[:, :3, 3], axis=0), axis=1) / np.diff(ego.times_s)
         assert 0.3 < steps.min()
@@ -294,7 +291,6 @@ def test_frame_views_follow_the_vehicle(world: CityWorld) -> None:
     for name, yaw_deg in (("front", 0), ("front_left", 50), ("front_right", -50)):
         for view in world.frame_views(name):
             ego = world.ego_path().pose_at(view.time_s)
-            assert ego is not None
             ego_from_cam = geometry.invert(ego) @ view.world_from_cam
             forward = ego_from_cam[:3, 2]
             assert abs(np.rad2deg(np.arctan2(forward[1], forward[0])) - yaw_deg) < 0.01
@@ -313,7 +309,6 @@ def test_tracks_move_as_the_world_renders_them(world: CityWorld) -> None:
         if track.label != "car" or mine.sum() < 25:
             continue
         pose = track.pose_at(time_s)
-        assert pose is not None
         local = geometry.transform_points(geometry.invert(pose), points[mine])
         assert (np.abs(local) < track.size_m / 2 + [0.15, 0.3, 0.1]).all()
         checked += 1
@@ -381,24 +376,23 @@ def test_light_and_weather() -> None:
 # --- same in, same out ----------------------------------------------------------------------------
 
 
-def same(a: CityWorld, b: CityWorld) -> None:
-    view = a.frame_views("front")[4]
-    for noise in (False, True):
-        ta, tb = a.render(view, sensor_noise=noise), b.render(view, sensor_noise=noise)
-        for name in ("rgb", "depth", "semantics", "instance"):
-            np.testing.assert_array_equal(getattr(ta, name), getattr(tb, name))
-    sa, sb = a.lidar_sweep(4), b.lidar_sweep(4)
-    np.testing.assert_array_equal(sa.points.xyz, sb.points.xyz)
-    np.testing.assert_array_equal(sa.points.intensity, sb.points.intensity)
-    for x, y in zip(a.tracks(), b.tracks()):
-        assert (x.id, x.label) == (y.id, y.label)
-        np.testing.assert_array_equal(x.world_from_object, y.world_from_object)
+def assert_same_truth(one: CityTruth, other: CityTruth) -> None:
+    for name in ("rgb", "depth", "semantics", "instance"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
 def test_rebuilt_from_the_recipe_bit_for_bit(world: CityWorld) -> None:
-    source = world.source()
+    source, view = world.source(), world.frame_views("front")[4]
     stored = json.loads(json.dumps(dict(source.recipe or {})))
-    same(world, CityWorld.from_source(Source(source.dataset, source.licence, stored, source.notes)))
+    again = CityWorld.from_source(Source(source.dataset, source.licence, stored, source.notes))
+    for noise in (False, True):
+        assert_same_truth(*(one.render(view, sensor_noise=noise) for one in (world, again)))
+    one, two = (city.lidar_sweep(4).points for city in (world, again))
+    np.testing.assert_array_equal(one.xyz, two.xyz)
+    np.testing.assert_array_equal(one.intensity, two.intensity)
+    for x, y in zip(world.tracks(), again.tracks(), strict=True):
+        assert (x.id, x.label) == (y.id, y.label)
+        np.testing.assert_array_equal(x.world_from_object, y.world_from_object)
 
 
 def test_same_result_with_any_number_of_threads(world: CityWorld) -> None:
@@ -412,8 +406,7 @@ def test_same_result_with_any_number_of_threads(world: CityWorld) -> None:
         two, two_sweep = other.render(view), other.lidar_sweep(2)
     finally:
         native.set_threads(before)
-    for name in ("rgb", "depth", "semantics", "instance"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    assert_same_truth(one, two)
     np.testing.assert_array_equal(one_sweep.points.xyz, two_sweep.points.xyz)
 
 
@@ -423,8 +416,6 @@ def test_same_result_in_another_process(world: CityWorld) -> None:
         f"w = CityWorld(CityConfig(**{ {k: getattr(CONFIG, k) for k in CONFIG.__dataclass_fields__}!r}))\n"
         "print(hashlib.sha256(w.render(w.frame_views('front')[1]).rgb.tobytes()).hexdigest())"
     )
-    import hashlib
-
     mine = hashlib.sha256(world.render(world.frame_views("front")[1]).rgb.tobytes()).hexdigest()
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == mine
@@ -444,33 +435,29 @@ def test_observation_matches_the_render(world: CityWorld) -> None:
     view = world.frame_views("front")[2]
     truth, seen = world.render(view), world.observation(view)
     np.testing.assert_array_equal(seen.rgb.permute(1, 2, 0).numpy(), truth.rgb)
-    assert seen.depth is not None
-    assert seen.semantics is not None
     np.testing.assert_array_equal(seen.depth[0].numpy() == 0, truth.sky)
     np.testing.assert_array_equal(seen.semantics.numpy(), truth.semantics)
     assert bool(seen.mask.all())
 
 
-def test_times_outside_the_log_are_refused(world: CityWorld) -> None:
+def test_what_the_log_has_not_is_refused(world: CityWorld) -> None:
     view = world.frame_views("front")[0]
     first, last = world.span_s
-    for time_s in (first - 0.2, last + 0.2):
-        with pytest.raises(UsageError, match="outside the log"):
-            world.render(View(view.camera, view.world_from_cam, time_s))
-    world.render(View(view.camera, view.world_from_cam, first), supersample=1)
+    for change, said in (
+        ({"time_s": first - 0.2}, "outside the log"),
+        ({"time_s": last + 0.2}, "outside the log"),
+        ({"camera": replace(view.camera, readout_s=0.01)}, "undistorted"),
+        ({"camera": replace(view.camera, distortion=(0.1, 0.0))}, "undistorted"),
+    ):
+        with pytest.raises(UsageError, match=said):
+            world.render(replace(view, **change))
+    world.render(replace(view, time_s=first), supersample=1)
+    with pytest.raises(UsageError, match="supersample"):
+        world.render(view, supersample=0)
     with pytest.raises(UsageError, match="no such sweep"):
         world.lidar_sweep(CONFIG.n_frames)
     with pytest.raises(UsageError, match="no such camera"):
         world.frame_views("rear")
-
-
-def test_cameras_that_are_not_simulated_are_refused(world: CityWorld) -> None:
-    view = world.frame_views("front")[0]
-    for camera in (replace(view.camera, readout_s=0.01), replace(view.camera, distortion=(0.1, 0.0))):
-        with pytest.raises(UsageError, match="undistorted"):
-            world.render(View(camera, view.world_from_cam, 0.0))
-    with pytest.raises(UsageError, match="supersample"):
-        world.render(view, supersample=0)
 
 
 def test_sources_without_a_recipe_are_refused(world: CityWorld) -> None:
@@ -503,3 +490,152 @@ def test_no_traffic_and_one_camera_work() -> None:
 def test_importing_the_city_loads_no_torch() -> None:
     code = "import sys, mudg.city, mudg.city.world; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# --- a recorded city: the scene on disk is the world -----------------------------------------------
+
+RECORDED = CityConfig(
+    seed=9, n_frames=9, width=60, height=40, cameras=("front", "front_left"), lidar_azimuth_step_deg=2.0
+)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return write_city(RECORDED, tmp_path_factory.mktemp("city") / "scene")
+
+
+@pytest.fixture(scope="module")
+def recorded(scene: Scene) -> CityWorld:
+    return CityWorld.from_source(scene.source)
+
+
+def test_images_and_labels_are_the_truth(scene: Scene, recorded: CityWorld) -> None:
+    assert len(scene.frames) == 2 * RECORDED.n_frames
+    moving = {i + 1 for i, posed in enumerate(recorded.objects) if posed.moving}
+    for frame in (scene.frames_of("front")[3], scene.frames_of("front_left")[8]):
+        truth = recorded.render(frame.view, sensor_noise=True)
+        np.testing.assert_array_equal(read_image(scene, frame), truth.rgb_u8)
+        depth = read_label(scene, frame, "depth")
+        np.testing.assert_array_equal(np.isnan(depth), truth.sky)
+        np.testing.assert_array_equal(depth[~truth.sky], truth.depth[~truth.sky])
+        for name in ("semantics", "instance", "sky"):
+            np.testing.assert_array_equal(read_label(scene, frame, name), getattr(truth, name))
+        dynamic = read_label(scene, frame, "dynamic")
+        np.testing.assert_array_equal(dynamic, np.isin(truth.instance, sorted(moving)))
+
+
+def test_sweeps_tracks_and_ego_are_the_truth(scene: Scene, recorded: CityWorld) -> None:
+    assert len(scene.sweeps) == RECORDED.n_frames
+    points = read_points(scene, scene.sweeps[4])
+    np.testing.assert_array_equal(points.xyz, recorded.lidar_sweep(4).points.xyz)
+    assert [t.id for t in scene.tracks] == [t.id for t in recorded.tracks()]
+    for stored, true in zip(scene.tracks, recorded.tracks()):
+        np.testing.assert_allclose(stored.world_from_object, true.world_from_object, atol=1e-9)
+    for time_s in (frame.view.time_s for frame in scene.frames):
+        np.testing.assert_allclose(scene.ego.pose_at(time_s), recorded.ego_path().pose_at(time_s), atol=1e-9)
+
+
+def test_held_out_frames(scene: Scene, tmp_path: Path) -> None:
+    held_out = sorted(frame.id for frame in scene.frames_in("test"))
+    assert held_out == ["front/000004", "front/000008", "front_left/000004", "front_left/000008"]
+    with pytest.raises(UsageError, match="negative"):
+        write_city(RECORDED, tmp_path / "x", test_every=-1)
+    with pytest.raises(InputError, match="scene here already"):
+        write_city(RECORDED, scene.root)
+
+
+def test_the_same_call_writes_the_same_bytes(scene: Scene, tmp_path: Path) -> None:
+    again = write_city(RECORDED, tmp_path / "again")
+    manifest = (Path(scene.root) / "manifest.json").read_text()
+    assert (Path(again.root) / "manifest.json").read_text() == manifest
+
+
+# --- photographic surfaces and skies ---------------------------------------------------------------
+
+
+def hdr_bytes(rgbe: np.ndarray) -> bytes:
+    """A run-length coded Radiance file of u8[H, W, 4]; the first half of every row as runs of literals, the second as
+    runs."""
+    height, width = rgbe.shape[:2]
+    out = bytearray(f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode())
+    for row in rgbe:
+        out += bytes([2, 2, width >> 8, width & 255])
+        for channel in range(4):
+            values = row[:, channel].tolist()
+            half = width // 2
+            out += bytes([half, *values[:half]])
+            for value in values[half:]:
+                out += bytes([129, value])
+    return bytes(out)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(0)
+    (tmp_path / "textures").mkdir()
+    (tmp_path / "sky").mkdir()
+    for name in ("Asphalt1.png", "Concrete1.png", "Bricks1.png", "Plaster1.png", "Grass1.png", "unknown.png"):
+        Image.fromarray(rng.integers(40, 200, (32, 32, 3), np.uint8)).save(tmp_path / "textures" / name)
+    rgbe = np.full((64, 128, 4), 128, np.uint8)
+    rgbe[:32, :, 2] = 255  # blue above
+    rgbe[..., 3] = 129
+    (tmp_path / "sky" / "blue.hdr").write_bytes(hdr_bytes(rgbe))
+    return tmp_path
+
+
+def test_radiance_pixels_are_mantissa_times_two_to_the_exponent() -> None:
+    rgbe = np.zeros((2, 16, 4), np.uint8)
+    rgbe[0, :, :] = (128, 64, 32, 129)
+    rgbe[1, :, :] = (200, 100, 50, 131)
+    rgbe[1, 3] = (9, 9, 9, 0)
+    image = radiance(hdr_bytes(rgbe), Path("a.hdr"))
+    assert image.shape == (2, 16, 3)
+    assert np.allclose(image[0, 5], [1.0, 0.5, 0.25])
+    assert np.allclose(image[1, 12], np.array([200, 100, 50]) / 32)
+    assert (image[1, 3] == 0).all()
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [lambda b: b[:-7], lambda b: b[2:], lambda b: b.replace(b"-Y", b"+Y"), lambda b: b.replace(b"+X 16", b"+X 24")],
+)
+def test_spoiled_radiance_files_are_refused(spoil) -> None:
+    with pytest.raises(InputError):
+        radiance(spoil(hdr_bytes(np.full((2, 16, 4), 130, np.uint8))), Path("a.hdr"))
+
+
+def test_surfaces_vary_around_one_and_skies_around_their_median(folder: Path) -> None:
+    pixels = surface(folder / "textures" / "Asphalt1.png")
+    assert pixels.mean() == pytest.approx(1.0, abs=0.05)
+    sky = panorama(folder / "sky" / "blue.hdr")
+    assert float(np.median(sky.mean(-1))) == pytest.approx(1.0, abs=0.05)
+    assert (sky[..., 2] > sky[..., 0]).all()
+
+
+def test_photographs_follow_from_folder_and_seed(folder: Path) -> None:
+    first, again = draw_photos(folder, 3), draw_photos(folder, 3)
+    assert [(s, m) for s, _, m in first] == [(s, m) for s, _, m in again]
+    assert all(np.array_equal(a[1], b[1]) for a, b in zip(first, again, strict=True))
+    slots = [{s for s, _, _ in draw_photos(folder, seed)} for seed in range(30)]
+    assert 0.3 < np.mean([SKY_SLOT in s for s in slots]) < 0.8
+    assert set.union(*slots) <= {0, 1, 2, 3, 4, 5, SKY_SLOT}
+    with pytest.raises(InputError, match="no such folder"):
+        draw_photos(folder / "missing", 3)
+
+
+def test_photographs_change_colours_and_nothing_else(folder: Path) -> None:
+    plain = CityConfig(seed=4, n_frames=2, width=96, height=64, cameras=("front",))
+    many = lambda seed: SKY_SLOT in {p[0] for p in draw_photos(folder, seed)} and len(draw_photos(folder, seed)) > 5
+    plain = replace(plain, seed=next(seed for seed in range(4, 60) if many(seed)))
+    without, with_photos = CityWorld(plain), CityWorld(replace(plain, textures=str(folder)))
+    view = without.frame_views("front")[0]
+    a, b = without.render(view), with_photos.render(view)
+    assert np.array_equal(a.depth, b.depth)
+    assert np.array_equal(a.semantics, b.semantics)
+    road = a.semantics == 0
+    assert np.abs(a.rgb[road] - b.rgb[road]).mean() > 0.005
+    assert a.rgb[road].mean() == pytest.approx(b.rgb[road].mean(), rel=0.15)
+    if a.sky.any():
+        assert (b.rgb[b.sky][:, 2] >= b.rgb[b.sky][:, 0]).all()
+    again = CityWorld(replace(plain, textures=str(folder))).render(view)
+    assert np.array_equal(b.rgb, again.rgb)

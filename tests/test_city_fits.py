@@ -110,7 +110,6 @@ def test_a_city_is_fitted_and_learnt_from(tmp_path):
         )
     shifted = clips.read_clip(tmp_path / "clips", 0, 0, [0, 1])
     shown = shifted.condition.renders
-    assert shifted.fine is not None and shifted.fine.clip.condition.renders is not None
     assert float(metrics.psnr(shown.color, shifted.rgb)) > 12
     assert float(shown.alpha.mean()) > 0.2 and float(shown.certainty.max()) > 0.1
     assert bool((shown.certainty <= shown.alpha + 1 / 255).all())

@@ -34,14 +34,11 @@ def view(clear: CityWorld) -> View:
     return clear.frame_views("front")[1]
 
 
-def test_a_plain_city_asks_for_no_weather(clear: CityWorld, view: View) -> None:
+def test_surfaces_are_unit_normals_and_albedos_without_weather(clear: CityWorld, view: View) -> None:
     assert weather_numbers(CLEAR) is None
     surfaces = clear.surfaces(view)
     assert not surfaces.snow.any()
     assert not surfaces.water.any()
-
-
-def test_surfaces_are_unit_normals_and_albedos(clear: CityWorld, view: View) -> None:
     surfaces, truth = clear.surfaces(view), clear.render(view)
     solid = ~truth.sky
     np.testing.assert_allclose(np.linalg.norm(surfaces.normal[solid], axis=-1), 1, atol=2e-3)

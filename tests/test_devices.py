@@ -15,9 +15,13 @@ def said(monkeypatch):
     return lines
 
 
-def test_auto_is_the_cpu_where_there_is_no_cuda(monkeypatch, said):
+def test_an_explicit_device_is_never_replaced_and_auto_is_the_cpu_without_cuda(monkeypatch, said):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert devices.choose_device("auto", "fit") == torch.device("cpu") and said == ["fit: on the CPU"]
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for name in ("cuda", "cuda:0"):
+        with pytest.raises(ResourceError, match="--device"):
+            devices.choose_device(name, "fit")
 
 
 def test_auto_is_the_first_cuda_device_and_says_its_name_and_memory(monkeypatch, said):
@@ -31,13 +35,6 @@ def test_auto_is_the_first_cuda_device_and_says_its_name_and_memory(monkeypatch,
     assert devices.choose_device("auto", "labels", kinds=("cpu",)) == torch.device("cpu")
     with pytest.raises(ResourceError, match="cuda:0 to cuda:1"):
         devices.choose_device("cuda:2", "fit")
-
-
-def test_an_explicit_device_is_never_replaced(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    for name in ("cuda", "cuda:0"):
-        with pytest.raises(ResourceError, match="--device"):
-            devices.choose_device(name, "fit")
 
 
 @pytest.mark.parametrize("name", ["gpu", "cuda:x", "", "cuda:-1", "AUTO"])

@@ -75,7 +75,6 @@ def enlarged(condition: Condition, scale: int = 2) -> Condition:
     """The condition at a higher resolution."""
     larger = lambda x: x.repeat_interleave(scale, -1).repeat_interleave(scale, -2)
     views = tuple(v.resized(v.camera.width * scale, v.camera.height * scale) for v in condition.views)
-    assert condition.renders is not None
     own = {f.name: larger(x) for f in fields(condition) if isinstance(x := getattr(condition, f.name), torch.Tensor)}
     return replace(condition, views=views, renders=condition.renders.map(larger), **own)
 

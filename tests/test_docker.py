@@ -70,7 +70,7 @@ def test_the_image_runs_mudg_as_a_plain_user_and_asks_no_network(name: str) -> N
     assert any("HF_HUB_OFFLINE=1" in rest for word, rest in instructions(name) if word == "ENV")
 
 
-def test_the_lock_has_exact_versions_that_fit_the_package() -> None:
+def test_the_lock_has_exact_versions_that_fit_the_package_and_names_no_host_and_no_path() -> None:
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
     found = locked()
     for text in [*project["project"]["dependencies"], *project["build-system"]["requires"]]:
@@ -78,9 +78,6 @@ def test_the_lock_has_exact_versions_that_fit_the_package() -> None:
         version = found.get(canonicalize_name(requirement.name))
         assert version is not None, f"{requirement.name} is not locked"
         assert version in requirement.specifier, f"{requirement.name} {version} is not in {requirement.specifier}"
-
-
-def test_the_lock_names_no_host_and_no_path() -> None:
     text = LOCK.read_text()
     assert "://" not in text
     assert not re.search(r"^(-|.*@)", text, re.MULTILINE)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import toy_views
 
-from mudg import app
+from mudg import app, native
 from mudg.formats.exporters import video
 from mudg.steps import doctor as diagnosis
 
@@ -25,48 +25,34 @@ def test_machine_report_names_what_matters() -> None:
     json.dumps(report, default=str, allow_nan=False)
 
 
-def test_a_missing_native_library_is_a_problem_with_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    from mudg import native
-
+def test_a_missing_native_library_and_encoder_are_problems_with_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(native, "library", lambda: None)
     monkeypatch.setattr(native, "status", lambda: "native library: not in use (for the test)")
+    monkeypatch.setattr(video, "_H264_ENCODERS", ("no-such-encoder",))
+    assert video.video_encoders() == []
     report = diagnosis.report_machine()
-    assert any("C++17 compiler" in problem for problem in report["problems"])
+    for words in ("C++17 compiler", "H.264"):
+        assert any(words in problem for problem in report["problems"])
     assert not report["ready"]
 
 
-def test_a_missing_encoder_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(video, "_H264_ENCODERS", ("no-such-encoder",))
-    assert video.video_encoders() == []
-    assert any("H.264" in problem for problem in diagnosis.report_machine()["problems"])
-
-
-def test_a_good_scene_is_usable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_good_scene_is_usable_and_damaged_images_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     scene = toy_views.write_scene(tmp_path / "scene")
     assert app.main(["doctor", str(scene)]) == 0
     assert "can be used" in capsys.readouterr().out
-
-
-def test_a_truncated_image_is_found_and_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = toy_views.write_scene(tmp_path / "scene")
     image = scene / "images" / "front" / "000002.png"
     image.write_bytes(image.read_bytes()[:100])
     assert app.main(["doctor", str(scene)]) == 3
     out = capsys.readouterr().out
     assert "000002" in out
     assert "cannot be used" in out
-
-
-def test_scene_findings_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = toy_views.write_scene(tmp_path / "scene")
     (scene / "images" / "front" / "000001.png").unlink()
     assert app.main(["doctor", str(scene), "--json"]) == 3
     result = json.loads(capsys.readouterr().out)
     assert result["usable"] is False
     assert any(f["level"] == "error" and "000001" in f["where"] + f["words"] for f in result["findings"])
-
-
-def test_no_scene_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert app.main(["doctor", str(tmp_path / "nothing")]) == 3
     assert "does not exist" in capsys.readouterr().out
 

@@ -198,7 +198,6 @@ def test_a_track_takes_its_commonest_label_and_sizes_are_checked() -> None:
 def test_clip_keeps_one_key_beyond_each_end() -> None:
     track = tracks_of(*((0.5 * n, n) for n in range(9)))[0][0]
     kept = clip_track(track, 1.2, 2.0)
-    assert kept is not None
     assert kept.times_s.tolist() == [1.0, 1.5, 2.0]
     assert clip_track(track, 1.2, 2.1).times_s.tolist() == [1.0, 1.5, 2.0, 2.5]
     assert clip_track(track, 4.1, 5.0) is None

@@ -59,16 +59,12 @@ def slope(rise: float = 0.1) -> HeightMap:
 # -- paths -----------------------------------------------------------------------------------------
 
 
-def test_a_displacement_at_all_times_is_exact() -> None:
+def test_a_displacement_is_exact_and_comes_about_within_its_ramp() -> None:
     motion, by = straight(), Displacement(3.0, -1.0, 0.5, 0.3)
     made = edit.moved(motion, by)
     assert np.array_equal(made.poses, motion.poses @ geometry.yaw_matrix(0.3, (3.0, -1.0, 0.5)))
     assert made.times_s is motion.times_s
-
-
-def test_a_displacement_comes_about_within_its_ramp() -> None:
-    motion = straight(speed=0.0)
-    made = edit.moved(motion, Displacement(ahead_m=2.0, from_s=1.0, ramp_s=2.0))
+    made = edit.moved(straight(speed=0.0), Displacement(ahead_m=2.0, from_s=1.0, ramp_s=2.0))
     x = lambda t: made.pose_at(t)[0, 3]
     assert x(0.99) == pytest.approx(0.0, abs=1e-12)
     assert x(2.0) == pytest.approx(1.0)  # half of the way at half of the time
@@ -98,13 +94,6 @@ def test_a_lane_change_follows_the_ground() -> None:
     assert np.allclose(moved.poses[:, :3, :3], np.eye(3), atol=1e-6)  # the slope is the same there
     for pose in made.poses:
         assert geometry.rigid_problem(pose) is None
-
-
-def test_what_stands_cannot_change_lanes() -> None:
-    with pytest.raises(InputError, match="only what drives"):
-        edit.lane_changed(straight(speed=0.0), 3.0, 0.5, 2.0)
-    with pytest.raises(InputError, match="outside the path"):
-        edit.lane_changed(straight(), 3.0, 9.0, 2.0)
 
 
 def test_braking_takes_the_way_and_the_time_that_physics_says() -> None:
@@ -322,7 +311,7 @@ def test_a_parked_car_is_cut_out_of_the_background() -> None:
         edited.cut_out(model, empty)
 
 
-def test_a_walking_person_shows_the_moments_of_its_path() -> None:
+def test_what_deforms_shows_the_moments_of_its_path_and_as_an_asset_its_middle() -> None:
     model = toy(DeformableNode)
     node = model.dynamic_object("car-1")
     with torch.no_grad():
@@ -332,13 +321,6 @@ def test_a_walking_person_shows_the_moments_of_its_path() -> None:
     assert torch.allclose(made.displacement(at, 1.0), node.displacement(at, 0.5), atol=1e-6)
     still = carried(model, "- stop: {id: car-1, at_s: 0.3, brake_m_s2: 10}").dynamic_object("car-1")
     assert torch.equal(still.displacement(at, 1.5), still.displacement(at, 2.0))
-
-
-def test_an_asset_keeps_the_shape_of_the_middle_of_its_track() -> None:
-    model = toy(DeformableNode)
-    node = model.dynamic_object("car-1")
-    with torch.no_grad():
-        node.offsets["deform"].copy_(torch.arange(21.0).view(21, 1, 1, 1, 1).expand_as(node.offsets["deform"]) * 0.01)
     rows = model.table["means"].detach()[640:]
     asset = edited.asset_of(model, "car-1")
     middle = float(node.times_s[10])
@@ -368,7 +350,6 @@ def test_an_asset_goes_through_its_file_and_renders_as_the_object_did(tmp_path: 
     read = assets.read_asset(tmp_path / "car.safetensors")
     assert (read.label, read.size_m, len(read), read.origin) == ("car", SIZE, 50, "toy")
     assert read.seen_rad == pytest.approx((0.5, 3.0), abs=1e-3)
-    assert read.certainty is not None
     assert np.allclose(read.certainty, 0.5)
     bare = model.without_nodes(["car-1"])
     again = edited.with_asset(bare, read, "car-1", edited.motion_of(model.dynamic_object("car-1")))
@@ -547,6 +528,8 @@ def test_edits_on_another_device_are_the_same() -> None:
     [
         ("- move: {id: car-2, along_m: 1}", "did you mean 'car-1'"),
         ("- lane_change: {id: car-1, left_m: 3.5, start_s: 0.1, duration_s: 1}", "too sharp"),
+        ("- lane_change: {id: parked-1, left_m: 1, start_s: 0.5, duration_s: 2}", "only what drives"),
+        ("- lane_change: {id: car-1, left_m: 1, start_s: 9, duration_s: 2}", "outside the path"),
         ("- stop: {id: car-1, at_s: 9}", "outside its path"),
         ("- remove: {ids: [car-1]}\n- stop: {id: car-1, at_s: 1}", "line 2: stop.id"),
         ("- background: {run: other}", "belongs is not known"),
@@ -588,45 +571,33 @@ def test_the_ready_scripts_fit_the_demo(repository: Path) -> None:
         assert not [found for found in collisions(plan) if "ego" in found["ids"]]
 
 
-def test_the_city_is_drawn_again_with_an_object_elsewhere() -> None:
-    city = CityWorld(CityConfig(seed=DEMO_CITY, n_frames=4, width=64, height=40))
-    frame = city.frame_views("front")[1]
-    truth = city.render(frame)
-    seen = np.bincount(truth.instance.ravel())[1:]
-    track = city.tracks()[int(seen.argmax())]
-    number = city.instance_of(track.id)
-    assert not (city.rearranged({track.id: None}).render(frame).instance == number).any()
-    keys = city_keys(Motion.recorded(track.times_s, track.world_from_object), track.size_m[2])
-    same = city.rearranged({track.id: keys}).render(frame)
-    assert np.array_equal(same.rgb, truth.rgb)
-    away = city.rearranged({track.id: keys + np.array([0, 0.5, 0, 0])}).render(frame)
-    assert 0 < ((away.instance == number) ^ (truth.instance == number)).sum()
-    assert np.array_equal(city.render(frame).rgb, truth.rgb)  # the city itself stays
-    with pytest.raises(UsageError, match="no such object"):
-        city.rearranged({"car-999": None})
-
-
-def test_the_city_is_drawn_again_with_another_look() -> None:
+def test_the_city_is_drawn_again_with_an_object_elsewhere_or_with_another_look() -> None:
     size = {"n_frames": 4, "width": 64, "height": 40}
     city, other = (CityWorld(CityConfig(seed=DEMO_CITY + more, **size)) for more in (0, 1))
     frame = city.frame_views("front")[1]
     truth = city.render(frame)
     number = int(np.bincount(truth.instance.ravel())[1:].argmax()) + 1
-    name = city.tracks()[number - 1].id
-    assert np.array_equal(city.recast(name, city.objects[number - 1]).render(frame).rgb, truth.rgb)
+    track = city.tracks()[number - 1]
+    assert city.instance_of(track.id) == number
+    assert not (city.rearranged({track.id: None}).render(frame).instance == number).any()
+    keys = city_keys(Motion.recorded(track.times_s, track.world_from_object), track.size_m[2])
+    for same in (city.rearranged({track.id: keys}), city.recast(track.id, city.objects[number - 1])):
+        assert np.array_equal(same.render(frame).rgb, truth.rgb)
+    away = city.rearranged({track.id: keys + np.array([0, 0.5, 0, 0])}).render(frame)
+    assert 0 < ((away.instance == number) ^ (truth.instance == number)).sum()
     look = next(posed for posed in other.objects if posed.row[0] == rec.VAN)
-    drawn = city.recast(name, look)
-    mine, theirs = (world.tracks()[number - 1] for world in (drawn, city))
+    recast = city.recast(track.id, look)
+    mine = recast.tracks()[number - 1]
     assert np.allclose(mine.size_m, look.size)
-    assert np.allclose(mine.world_from_object[:, :2, 3], theirs.world_from_object[:, :2, 3])
-    seen = drawn.render(frame)
+    assert np.allclose(mine.world_from_object[:, :2, 3], track.world_from_object[:, :2, 3])
+    seen = recast.render(frame)
     assert (seen.instance == number).any() and (seen.rgb != truth.rgb).any()
+    gone = (recast.rearranged({mine.id: None}), city.rearranged({track.id: None}))
+    assert np.array_equal(*(world.render(frame).rgb for world in gone))
     assert np.array_equal(city.render(frame).rgb, truth.rgb)  # the city itself stays
-    with pytest.raises(UsageError, match="no such object"):
-        city.recast("car-999", look)
-    assert np.array_equal(
-        drawn.rearranged({mine.id: None}).render(frame).rgb, city.rearranged({name: None}).render(frame).rgb
-    )
+    for change in (lambda: city.rearranged({"car-999": None}), lambda: city.recast("car-999", look)):
+        with pytest.raises(UsageError, match="no such object"):
+            change()
 
 
 def test_another_street_lies_where_the_vehicle_drives() -> None:
@@ -661,11 +632,7 @@ def test_scripts_run_on_a_fitted_scene_alone(tmp_path: Path) -> None:
     assert len(compose(made, 1.0)) == len(toy().table)
     with pytest.raises(InputError, match="path of the vehicle is not known"):
         carry_out(parse_edits("- stop: {id: ego, at_s: 0.5}", "e"), toy())
-
-
-def test_weather_without_classes_is_refused() -> None:
-    model = toy()
-    columns = {name: value for name, value in model.table.columns.items() if name != "semantics"}
-    bare = replace(model, classes=(), table=Table(columns, model.table.labels))
+    columns = {name: value for name, value in toy().table.columns.items() if name != "semantics"}
+    bare = replace(toy(), classes=(), table=Table(columns, toy().table.labels))
     with pytest.raises(InputError, match="classes"):
         carry_out(parse_edits("- weather: {wet: 0.5}", "e"), bare)

@@ -11,6 +11,8 @@ import pytest
 from fit_settings import fit_config
 
 from mudg.base import geometry, store
+from mudg.benchmarks import run as bench
+from mudg.benchmarks.settings import BenchConfig
 from mudg.editing.settings import EditConfig
 from mudg.formats.settings import IngestConfig
 from mudg.labels.settings import AnnotateConfig
@@ -48,9 +50,7 @@ def test_the_lead_car_of_a_recorded_drive(drive: Path, tmp_path: Path, text: str
     lead = old.track(LEAD)
     for a, b in zip(old.sweeps, new.sweeps, strict=True):
         before, after = read_points(old, a), read_points(new, b)
-        pose = lead.pose_at(a.time_s)
-        assert pose is not None
-        local = geometry.transform_points(geometry.invert(pose) @ a.world_from_lidar, before.xyz)
+        local = geometry.transform_points(geometry.invert(lead.pose_at(a.time_s)) @ a.world_from_lidar, before.xyz)
         here = np.linalg.norm(local[:, :2], axis=1)
         azimuth = np.arctan2(before.xyz[:, 1], before.xyz[:, 0])
         beside = (here > 12) & (np.abs(azimuth) > 0.5)
@@ -59,3 +59,11 @@ def test_the_lead_car_of_a_recorded_drive(drive: Path, tmp_path: Path, text: str
     became = store.read_json(out / "lidar.json")
     assert became["cleared"] > 100 and became["on_ground"] > 0
     assert (became["on_objects"] > 20) == text.startswith("- move")
+
+
+def test_the_benchmark_measures_edits_of_a_recorded_drive(drive: Path, tmp_path: Path) -> None:
+    out = bench.run("edit", BenchConfig(), tmp_path / "out", sources=[drive])
+    rows = {row["edit"]: row for row in store.read_json(out / "bench.json")["rows"]}
+    assert rows["remove"]["object"] == LEAD and rows["remove"]["outside"] < 0.03
+    assert rows["fog"]["lidar"] == rows["fog"]["lidar_before"] and 0 < rows["dusk"]["structure"] < 1
+    assert all(row["warp"] < 0.2 for row in rows.values()) and rows["move 3 m ahead"]["overlap"] > 0.3

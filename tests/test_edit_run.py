@@ -19,8 +19,6 @@ from mudg.base import geometry, log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Scene
-from mudg.benchmarks import run as bench
-from mudg.benchmarks.settings import BenchConfig
 from mudg.editing import edit
 from mudg.editing.apply import EditedDrive, carry_out, left_behind
 from mudg.editing.script import parse_edits
@@ -292,16 +290,3 @@ def test_from_python(run: Path, tmp_path: Path) -> None:
     ]
     assert np.array_equal(*pictures)
     assert fitted.export_asset("car", tmp_path / "car.safetensors", scene).is_file()
-
-
-@pytest.mark.slow
-def test_the_benchmark_finds_edits_as_good_as_the_fit(tmp_path: Path) -> None:
-    config = BenchConfig(cities="development", count=1, pose_iterations=60)
-    out = bench.run("edit", config, tmp_path / "out")
-    rows = {row["edit"]: row for row in store.read_json(out / "bench.json")["rows"]}
-    assert rows["remove"]["vehicle"] is None
-    for row in rows.values():
-        assert row["outside"] < 0.03
-        if row["overlap"] is not None:
-            assert row["overlap"] > row["overlap_before"] - 0.05
-            assert row["vehicle"] > row["vehicle_before"] - 3

@@ -1,8 +1,9 @@
-"""The street where an object is gone: what nobody saw goes, hidden ground is closed, shadows are brightened, nothing
-else changes."""
+"""Where an object is gone or shown from elsewhere: what nobody saw goes, hidden ground is closed, shadows are
+brightened, flanks are closed, nothing else changes."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +16,18 @@ from mudg.base.types import Camera, View
 from mudg.core.edit import Motion
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
-from mudg.editing.apply import hidden_by
-from mudg.editing.model import SHOWN, Hidden, continued, noted, shaded_cells, shown_by, without_traces
-from mudg.editing.plan import Actor, EditSources, EditWorld, plan_edits
+from mudg.editing.apply import complete_asset, hidden_by
+from mudg.editing.model import (
+    SHOWN,
+    Hidden,
+    continued,
+    noted,
+    shaded_cells,
+    shown_by,
+    with_closed_sides,
+    without_traces,
+)
+from mudg.editing.plan import Actor, EditSources, EditWorld, plan_edits, shown_anew
 from mudg.editing.script import parse_edits
 from mudg.gaussians.model import CERTAINTY, SceneModel
 from mudg.gaussians.nodes import RigidNode, SkyNode, StaticNode
@@ -29,6 +39,7 @@ FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 RASTER = RasterConfig(near_m=0.2)
 LIT, SHADED, CAR = 0.55, 0.3, 0.1
 CLASSES = (ID["road"], ID["building"], ID["car"])
+NO_SOURCES = EditSources(lambda s: None, lambda n: None)
 
 
 def lead(step_m: float = 1.5) -> tuple[Actor, list[View]]:
@@ -49,6 +60,25 @@ def level(xy: np.ndarray) -> np.ndarray:
 
 
 ROAD = level(grid((2, 30, 0.3), (-7, 7, 0.3)))
+BEHIND = grid((14, 14.5, 0.3), (-0.6, 0.7, 0.3), (0.2, 1.0, 0.3))
+
+
+def fitted(
+    means: np.ndarray, colors: np.ndarray, kind: np.ndarray, owner: np.ndarray, node: RigidNode, size_m: np.ndarray
+) -> SceneModel:
+    """A street and an object of opaque Gaussians; ``kind``: indices of `CLASSES`, ``owner``: 1 for the object's."""
+    classes = torch.full((len(means), 3), -5.0)
+    classes[torch.arange(len(means)), torch.from_numpy(kind)] = 5.0
+    columns = {
+        "means": torch.from_numpy(means.astype(np.float32)),
+        "quats": torch.tensor([1.0, 0, 0, 0]).repeat(len(means), 1),
+        "log_scales": torch.from_numpy(np.log(size_m)).float().repeat(len(means), 1),
+        "logits": torch.full((len(means),), 4.0),
+        "sh_dc": torch.from_numpy((colors - 0.5) / SH_C0).float()[:, None],
+        "semantics": classes,
+    }
+    labels = {"node": torch.from_numpy(owner.astype(np.int32)), CERTAINTY: torch.ones(len(means), dtype=torch.float16)}
+    return SceneModel(Table(columns, labels), (StaticNode(), node), None, CLASSES, 0)
 
 
 def street(
@@ -62,19 +92,8 @@ def street(
     owner = np.repeat([0, 0, 0, 1], [len(road), len(buildings), len(spots), len(rear)])
     kind = np.repeat([0, 1, 2, 2], [len(road), len(buildings), len(spots), len(rear)])
     greys = np.concatenate([grey, np.ones(len(buildings)), np.zeros(len(spots)), np.full(len(rear), CAR)])
-    classes = torch.full((len(means), 3), -5.0)
-    classes[torch.arange(len(means)), torch.from_numpy(kind)] = 5.0
-    columns = {
-        "means": torch.from_numpy(means.astype(np.float32)),
-        "quats": torch.tensor([1.0, 0, 0, 0]).repeat(len(means), 1),
-        "log_scales": torch.full((len(means), 3), -2.0),
-        "logits": torch.full((len(means),), 4.0),
-        "sh_dc": torch.from_numpy((greys - 0.5) / SH_C0).float()[:, None, None].repeat(1, 1, 3),
-        "semantics": classes,
-    }
-    labels = {"node": torch.from_numpy(owner.astype(np.int32)), CERTAINTY: torch.ones(len(means), dtype=torch.float16)}
     car = RigidNode("car", "car", list(SIZE), actor.motion.times_s, actor.motion.poses)
-    return SceneModel(Table(columns, labels), (StaticNode(), car), None, CLASSES, 0)
+    return fitted(means, greys[:, None].repeat(3, 1), kind, owner, car, np.full(3, np.exp(-2.0)))
 
 
 def cleared(model: SceneModel, actor: Actor, views: list[View]) -> SceneModel:
@@ -110,29 +129,24 @@ def test_what_views_show_of_a_gaussian() -> None:
     first, last, both = (
         noted(model, seen, RASTER).table.labels[SHOWN] for seen in (views[:1], views[-1:], [views[0], views[-1]])
     )
-    assert (
-        torch.equal(first, with_car) and torch.equal(both, torch.maximum(first, last)) and not torch.equal(first, last)
-    )
+    assert torch.equal(first, with_car) and not torch.equal(first, last)
+    assert torch.equal(both, torch.maximum(first, last))
 
 
 def test_what_no_view_saw_goes_and_hidden_ground_is_closed() -> None:
     actor, views = lead()
     unseen = np.abs(ROAD[:, 1]) < 0.12 * ROAD[:, 0] - 0.3
     dark = np.where(unseen & (ROAD[:, 0] > 9), 0.0, LIT)  # what a fit left behind the car
-    behind, beside = (
-        grid((14, 14.5, 0.3), (-0.6, 0.7, 0.3), (0.2, 1.0, 0.3)),
-        np.array([[20.0, 6.0, 2.0], [12.0, 4.0, 1.0]]),
-    )
+    beside = np.array([[20.0, 6.0, 2.0], [12.0, 4.0, 1.0]])
     in_path, around = np.array([[9.0, 0.2, 0.9]]), np.array([[10.0, 1.25, 0.6], [10.0, -3.0, 0.6]])
-    model = street(actor, ROAD, dark, np.concatenate([behind, beside, in_path]), around)
+    model = street(actor, ROAD, dark, np.concatenate([BEHIND, beside, in_path]), around)
     before = grey_of(model)
     made = cleared(model, actor, views)
     assert same_places(means_of(made, "building"), beside)
     assert same_places(means_of(made, "car"), around[1:])  # the first is a part of the car that the box leaves out
     new, means = made_up(made), made.table["means"].detach().numpy()
-    assert (
-        new.sum() > 50 and np.allclose(means[new, 2], 0, atol=0.05) and np.allclose(grey_of(made)[new], LIT, atol=0.02)
-    )
+    assert new.sum() > 50 and np.allclose(means[new, 2], 0, atol=0.05)
+    assert np.allclose(grey_of(made)[new], LIT, atol=0.02)
     assert ((means[new, 0] > 13) & (np.abs(means[new, 1]) < 0.5)).any()  # the middle of what was hidden
     assert np.allclose(grey_of(made)[~new & (np.abs(means[:, 1]) < 4) & (means[:, 2] < 0.1)], LIT, atol=1e-5)
     assert SHOWN not in made.table.labels and np.array_equal(grey_of(model), before)  # the original stays
@@ -140,17 +154,11 @@ def test_what_no_view_saw_goes_and_hidden_ground_is_closed() -> None:
 
 def test_what_a_view_saw_stays() -> None:
     actor, views = lead()
-    behind = grid((14, 14.5, 0.3), (-0.6, 0.7, 0.3), (0.2, 1.0, 0.3))
-    model = street(actor, ROAD, np.full(len(ROAD), LIT), behind)
+    model = street(actor, ROAD, np.full(len(ROAD), LIT), BEHIND)
     aside = View(CAMERA, geometry.from_rotation_translation(FORWARD, (6.0, -4.0, 3.0)), 0.0)
-    turned = replace(
-        aside,
-        world_from_cam=aside.world_from_cam
-        @ geometry.from_rotation_translation(geometry.yaw_matrix(0.0)[:3, :3], (0.0, 0, 0)),
-    )
-    made = cleared(model, actor, [*views, turned])
+    made = cleared(model, actor, [*views, aside])
     only = cleared(model, actor, views)
-    assert same_places(means_of(made, "building"), behind) and not len(means_of(only, "building"))
+    assert same_places(means_of(made, "building"), BEHIND) and not len(means_of(only, "building"))
     assert made_up(made).sum() < made_up(only).sum()
 
 
@@ -239,18 +247,15 @@ def test_a_script_says_whose_traces_go(usual: bool) -> None:
 
 def test_sky_that_the_car_always_hid_continues_the_sky_that_was_seen() -> None:
     actor, views = lead()
-    views = [
-        View(CAMERA, geometry.from_rotation_translation(FORWARD, (v.center_world[0], 0, 0.5)), v.time_s) for v in views
-    ]
-    model = replace(
-        street(actor, ROAD, np.full(len(ROAD), LIT), np.zeros((0, 3))), sky=SkyNode.uniform(64, (0.5, 0.6, 0.9))
-    )
-    assert model.sky is not None
+    low = lambda v: geometry.from_rotation_translation(FORWARD, (v.center_world[0], 0, 0.5))
+    views = [View(CAMERA, low(v), v.time_s) for v in views]
+    plain = street(actor, ROAD, np.full(len(ROAD), LIT), np.zeros((0, 3)))
+    model = replace(plain, sky=SkyNode.uniform(64, (0.5, 0.6, 0.9)))
     with torch.no_grad():
         model.sky.table["panorama"][:, :, 30:32, 62:66] = 0.0  # ahead, up to 6 degrees above the horizon
         model.sky.table["panorama"][:, :, :20] = 0.2
     made = cleared(model, actor, views)
-    assert made.sky is not None and not made.sky.table.labels
+    assert not made.sky.table.labels
     found, before = made.sky.table["panorama"].detach(), model.sky.table["panorama"].detach()
     assert torch.allclose(found[0, :, 30:32, 62:66], torch.tensor([0.5, 0.6, 0.9])[:, None, None].expand(3, 2, 4))
     assert torch.equal(found[:, :, :29], before[:, :, :29])
@@ -264,3 +269,98 @@ def test_a_scene_without_ground_or_views_stays() -> None:
         made = without_traces(model, hidden, seen, RASTER)
         assert len(made.table) == len(model.table) and torch.equal(made.table["sh_dc"], model.table["sh_dc"])
     assert isinstance(hidden_by(actor, []), Hidden)
+
+
+# -- flanks -----------------------------------------------------------------------------------------
+
+NARROW = (4.0, 1.8, 1.5)
+TIMES = np.arange(4) / 3
+POSES = np.stack([geometry.yaw_matrix(0.0, (8 + t, 0, 0.75)) for t in TIMES])
+ACTOR = Actor("car", NARROW, Motion.recorded(TIMES, POSES))
+VIEWS = [View(CAMERA, geometry.from_rotation_translation(FORWARD, (t, 0, 1.2)), float(t)) for t in TIMES]
+
+
+def behind(label: str = "car", flank: float | None = None) -> SceneModel:
+    """The rear of a vehicle, red below and blue above; with its left flank (y = ``flank``) where that is given."""
+    axis = lambda a, b: np.arange(a, b, 0.08)
+    y, z = (part.ravel() for part in np.meshgrid(axis(-0.88, 0.9), axis(-0.7, 0.75)))
+    places = [np.column_stack([np.full(len(y), -1.95), y, z])]
+    if flank is not None:
+        x, z = (part.ravel() for part in np.meshgrid(axis(-1.95, 2), axis(-0.7, 0.75)))
+        places.append(np.column_stack([x, np.full(len(x), flank), z]))
+    means = np.concatenate(places)
+    colors = np.where(means[:, 2:] < 0, [0.8, 0.1, 0.1], [0.1, 0.1, 0.8])
+    every = np.ones(len(means), int)
+    node = RigidNode("car", label, list(NARROW), ACTOR.motion.times_s, ACTOR.motion.poses)
+    return fitted(means, colors, 2 * every, every, node, np.array([0.02, 0.05, 0.05]))
+
+
+def made_sides(before: SceneModel, after: SceneModel) -> tuple[np.ndarray, np.ndarray]:
+    """Places and colours of the new rows, which are those of certainty 0."""
+    new = (after.certainty == 0).numpy()
+    assert new.sum() == len(after.table) - len(before.table)
+    for name, value in before.table.columns.items():
+        assert torch.equal(after.table[name][~torch.from_numpy(new)], value)
+    return after.table["means"].detach().numpy()[new], 0.5 + SH_C0 * after.table["sh_dc"].detach().numpy()[new, 0]
+
+
+def test_flanks_continue_the_colours_of_the_rear() -> None:
+    model = behind()
+    places, colors = made_sides(model, with_closed_sides(model, ["car"], VIEWS, RASTER))
+    assert set(np.sign(places[:, 1])) == {-1.0, 1.0} and np.abs(places[:, 1]).max() <= NARROW[1] / 2
+    assert places[:, 0].min() < -1.6 and places[:, 0].max() > 1.8
+    low, high = places[:, 2] < -0.2, places[:, 2] > 0.2
+    assert low.any() and high.any()
+    for part, color in ((low, [0.8, 0.1, 0.1]), (high, [0.1, 0.1, 0.8])):
+        assert np.allclose(colors[part], color, atol=1e-3)
+    assert np.abs(places[high, 0]).max() < places[low, 0].max()  # a car is shorter above
+
+
+def test_only_gaps_of_vehicles_are_closed() -> None:
+    model = behind(flank=0.84)
+    places, _ = made_sides(model, with_closed_sides(model, ["car"], VIEWS, RASTER))
+    assert len(places) and (places[:, 1] < 0).all()  # the left flank is there
+    person = behind("pedestrian")
+    assert with_closed_sides(person, ["car"], VIEWS, RASTER) is person
+
+
+def test_what_views_show_is_not_made_up() -> None:
+    turn, model = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), behind()
+    poses = [geometry.from_rotation_translation(turn, (8 + t, -5, 0.8)) for t in TIMES]
+    beside = [View(CAMERA, pose, float(t)) for pose, t in zip(poses, TIMES, strict=True)]
+
+    def right(views: Sequence[View]) -> int:
+        return int((made_sides(model, with_closed_sides(model, ["car"], views, RASTER))[0][:, 1] < 0).sum())
+
+    assert right([*VIEWS, *beside]) < 0.2 * right(VIEWS)  # the right flank was seen to be empty; measured: 0
+
+
+AWAY = [View(CAMERA, geometry.yaw_matrix(0.0, (0, 2.0, 0)) @ view.world_from_cam, view.time_s) for view in VIEWS]
+
+
+@pytest.mark.parametrize(
+    ("text", "views", "closed"),
+    [
+        *(("- move: {id: car, left_m: 2}", VIEWS, True), ("- move: {id: car, yaw_deg: 10}", VIEWS, True)),
+        ("- move: {id: car, along_m: 3}", VIEWS, False),
+        ("- move: {id: car, left_m: 2, close_sides: false}", VIEWS, False),
+        *(("- move: {id: ego, left_m: 2}", AWAY, True), ("- move: {id: ego, left_m: 2}", VIEWS, False)),
+        ("- move: {id: ego, left_m: 2, close_sides: false}", AWAY, False),
+        ("- move: {id: ego, left_m: 2}\n- remove: {ids: [car]}", AWAY, False),
+        ("- remove: {ids: [car]}", AWAY, False),
+    ],
+)
+def test_only_what_is_seen_from_another_side_is_closed(text: str, views: list[View], closed: bool) -> None:
+    """Of a vehicle that moves, and of one that another path shows."""
+    ego = Motion.recorded(np.array(TIMES, float), np.stack([geometry.yaw_matrix(0.0)] * len(TIMES)))
+    plan = plan_edits(parse_edits(text, "sides"), EditWorld({"car": ACTOR}, ego), NO_SOURCES)
+    assert plan.sides & shown_anew(plan, VIEWS, views) == ({"car"} if closed else set())
+
+
+def test_an_asset_has_all_its_sides() -> None:
+    model = behind()
+    asset = complete_asset(model, "car", VIEWS)
+    assert len(asset) > len(model.table) and asset.certainty is not None and (asset.certainty == 0).any()
+    assert len(asset.seen_rad) == len(VIEWS)
+    bare = complete_asset(replace(model, table=model.table), "car", [])
+    assert len(bare) >= len(asset) and bare.seen_rad == ()

@@ -52,7 +52,6 @@ def turning(kind: type[RigidNode] = RigidNode) -> SceneModel:
     """The toy scene of the edits with a car that turns."""
     model = toy(kind)
     node = model.nodes[1]
-    assert isinstance(node, RigidNode)
     keys = np.stack(
         [pose @ geometry.yaw_matrix(0.5 * t) for t, pose in zip(node.times_s, node.world_from_object, strict=True)]
     )
@@ -111,7 +110,6 @@ def test_nodes_of_every_kind_stand_where_the_model_puts_them(kind: type[RigidNod
     if kind is DeformableNode:
         with torch.no_grad():
             node = model.nodes[1]
-            assert isinstance(node, DeformableNode)
             node.offsets["deform"].normal_(0, 0.2, generator=torch.Generator().manual_seed(1))
     if kind is BezierNode:
         columns = {key: value.detach() for key, value in model.table.columns.items()}
@@ -143,7 +141,6 @@ def test_a_background_that_changes_with_time_is_taken_at_the_moment() -> None:
 
 def test_the_sky_as_gaussians_looks_as_the_sky() -> None:
     model = toy()
-    assert model.sky is not None
     rows = model.sky.rows
     ramp = torch.linspace(0.2, 0.9, 2 * rows).expand(rows, -1)
     down = torch.linspace(0, 1, rows)[:, None].expand(-1, 2 * rows)
@@ -362,7 +359,6 @@ def test_colmap_binaries_hold_the_poses_and_one_rig(tmp_path: Path) -> None:
     for index, frame in enumerate(scene.frames):
         late = 0.01 if index == 2 else 0.0
         pose = scene.ego.pose_at(frame.view.time_s)
-        assert pose is not None
         cam = pose @ aside @ geometry.invert(pose) @ frame.view.world_from_cam
         view = View(replace(frame.view.camera, name="left"), cam, frame.view.time_s + late)
         frames.append(replace(frame, id=frame.id.replace("front", "left"), view=view))

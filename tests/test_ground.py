@@ -71,7 +71,6 @@ def test_a_vehicle_that_stood_has_the_direction_of_its_heading() -> None:
 def test_the_road_is_joined_to_the_path_and_the_sidewalk_is_not(slope: tuple[float, float]) -> None:
     xyz, path = street(np.random.default_rng(5), slope=slope)
     ground = map_ground(xyz, path, path[0])
-    assert ground is not None
     places = np.random.default_rng(6).uniform((-25, -8.5), (25, 8.5), (4000, 2))
     places = np.c_[places, places @ slope + np.where(np.abs(places[:, 1]) > KERB_AT_M, 0.12, 0)]
     reachable, _, raised = ground.under(places)
@@ -95,7 +94,6 @@ def test_a_vehicle_that_stood_and_sees_no_ground_around_it_is_joined_to_what_it_
     here = path[:1]
     seen = xyz[np.linalg.norm(xyz[:, :2] - here[:, :2], axis=1) > 3.5]
     ground = map_ground(seen, here, here[0])
-    assert ground is not None
     reachable, _, _ = ground.under(np.array([[here[0, 0] + 8, 0.5, 0], [here[0, 0] + 8, 6.5, 0.12]]))
     assert reachable.tolist() == [True, False]
 
@@ -105,7 +103,6 @@ def test_a_lowered_kerb_joins_a_sidewalk_but_not_directly() -> None:
     lowered = (np.abs(xyz[:, 0] - 10) < 1.5) & (xyz[:, 1] > 0) & (xyz[:, 2] < 0.5)
     xyz[lowered, 2] = np.clip(xyz[lowered, 1] - KERB_AT_M, 0, 2).astype(np.float32) * 0.06
     ground = map_ground(xyz, path, path[0])
-    assert ground is not None
     far, at_it, other_side, road = np.array([[-12, 6, 0.12], [10, 4.6, 0.04], [-12, -6, 0.12], [-12, 3, 0]], float)
     reachable, direct, _ = ground.under(np.stack([far, at_it, other_side, road]))
     assert reachable.tolist() == [True, True, False, True] and direct.tolist() == [False, True, False, True]

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from test_learn_parallel import environment
 from toy_clips import losses_of, training_words, write_clips
 
 from mudg.base import checkpoint
@@ -32,8 +33,8 @@ def clips(tmp_path_factory):
 
 def start(processes, clips, out, fault="", restarts=0, **changes):
     nodes = ("--nnodes", "1", "--rdzv-endpoint", "127.0.0.1:0", "--max-restarts", str(restarts))
-    command, environment = torchrun(nodes, processes, clips, out, fault, **changes)
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
+    command, variables = torchrun(nodes, processes, clips, out, fault, **changes)
+    return subprocess.run(command, env=variables, capture_output=True, text=True, timeout=500)
 
 
 def torchrun(nodes, processes, clips, out, fault="", **changes):
@@ -54,14 +55,7 @@ def torchrun(nodes, processes, clips, out, fault="", **changes):
     here = Path(__file__).parent
     command = [sys.executable, *"-m torch.distributed.run --rdzv-backend c10d".split(), *nodes]
     command += ["--nproc-per-node", str(processes), str(here / "learn_on_nodes.py"), "learn", *words]
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join([str(here), *sys.path]),
-        "GLOO_SOCKET_IFNAME": "lo",
-        "OMP_NUM_THREADS": "1",
-        "FAULT": fault,
-        "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1",
-    }
-    return command, environment
+    return command, environment() | {"FAULT": fault, "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}
 
 
 def test_two_processes_then_one_then_four(clips, tmp_path):
@@ -111,8 +105,8 @@ def test_a_node_that_vanishes_leaves_the_training_to_the_other(clips, tmp_path):
     said = [(tmp_path / f"node{number}").open("w+") for number in range(2)]
     running = []
     for number, end in enumerate(("is_host=true", "is_host=false")):
-        command, environment = torchrun((*nodes, f"{patience},{end}"), 1, clips, out, steps=steps)
-        running.append(subprocess.Popen(command, env=environment, stdout=said[number], stderr=subprocess.STDOUT))
+        command, variables = torchrun((*nodes, f"{patience},{end}"), 1, clips, out, steps=steps)
+        running.append(subprocess.Popen(command, env=variables, stdout=said[number], stderr=subprocess.STDOUT))
     try:
         began = time.monotonic()
         while not (out / "log.jsonl").is_file() or len(losses_of(out)) < 4:
@@ -149,18 +143,12 @@ def max_difference(one, other, steps=STEPS):
 
 def test_checkpoints_are_cut_anew_bit_equal(tmp_path):
     """Saved by 1, 2 and 4 processes, sharded and in replicas, read by each other number: the same bytes."""
-    here, sums = Path(__file__).parent, {}
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join([str(here), *sys.path]),
-        "GLOO_SOCKET_IFNAME": "lo",
-        "OMP_NUM_THREADS": "1",
-    }
-    before = ""
+    here, sums, before = Path(__file__).parent, {}, ""
     for processes, layout in ((1, "fsdp"), (2, "fsdp"), (4, "fsdp"), (4, "hsdp"), (2, "fsdp"), (1, "fsdp")):
         into = tmp_path / f"{len(sums)}"
         words = f"-m torch.distributed.run --standalone --nproc-per-node {processes}".split()
         command = [sys.executable, *words, str(here / "reshard_together.py"), layout, before, str(into)]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+        done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, done.stderr
         sums[into] = done.stdout.split()[-1]
         before = str(into)

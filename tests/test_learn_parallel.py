@@ -35,7 +35,8 @@ def clips(tmp_path_factory):
 
 def environment():
     here = Path(__file__).parent
-    return os.environ | {"PYTHONPATH": os.pathsep.join([str(here), *sys.path]), "GLOO_SOCKET_IFNAME": "lo"}
+    paths = os.pathsep.join([str(here), *sys.path])
+    return os.environ | {"PYTHONPATH": paths, "GLOO_SOCKET_IFNAME": "lo", "OMP_NUM_THREADS": "1"}
 
 
 @pytest.mark.slow
@@ -57,16 +58,7 @@ def test_a_run_may_go_on_under_another_layout(clips, tmp_path):
             Learn(out=tmp_path / "parts", settings=tiny(clips, **common)).run()
     finally:
         TrainingState.blend = stop
-    arguments = [str(tmp_path / "store"), str(clips), str(tmp_path)]
-    script = str(Path(__file__).with_name("learn_together.py"))
-    both = [
-        subprocess.Popen(
-            [sys.executable, script, str(rank), *arguments], env=environment(), stderr=subprocess.PIPE, text=True
-        )
-        for rank in (0, 1)
-    ]
-    errors = [process.communicate(timeout=540)[1] for process in both]
-    assert [process.returncode for process in both] == [0, 0], "\n".join(errors)
+    both_run("learn_together.py", tmp_path / "store", clips, tmp_path)
     said = [json.loads((tmp_path / f"said_{rank}.json").read_text()) for rank in (0, 1)]
     for words in said:  # one process was asked to stop, both did; one had numbers that are not finite, both say so
         assert words["stopped under ddp"] and words["stopped under fsdp"]
@@ -77,12 +69,26 @@ def test_a_run_may_go_on_under_another_layout(clips, tmp_path):
     assert len(list(saved.path.glob("net.*.safetensors"))) == 2
     parts = Learn(out=tmp_path / "parts", settings=tiny(clips, **common)).run()
 
-    one, other = losses_of(tmp_path / "whole"), losses_of(tmp_path / "parts")
-    off = {step: abs(one[step] - other[step]) / one[step] for step in (3, 4, 5, 6)}
+    assert_same_training(tmp_path / "whole", parts.parent, (3, 4, 5, 6), model_files.load)
+
+
+def both_run(script, *arguments):
+    """Runs a script of this folder in two processes, given their ranks."""
+    words = [sys.executable, str(Path(__file__).with_name(script))]
+    how = {"env": environment(), "stderr": subprocess.PIPE, "text": True}
+    both = [subprocess.Popen([*words, str(rank), *map(str, arguments)], **how) for rank in (0, 1)]
+    errors = [process.communicate(timeout=540)[1] for process in both]
+    assert [process.returncode for process in both] == [0, 0], "\n".join(errors)
+
+
+def assert_same_training(one, other, steps, load):
+    """Losses of two trainings, and their weights, which are stored in half precision."""
+    losses, others = losses_of(one), losses_of(other)
+    off = {step: abs(losses[step] - others[step]) / losses[step] for step in steps}
     print(f"largest relative difference of a step's loss: {max(off.values()):.1e}")
     assert max(off.values()) < SAME, off
-    first, second = (model_files.load(folder).state_dict() for folder in (tmp_path / "whole" / "model", parts))
-    for name in first:  # stored in half precision
+    first, second = (load(folder / "model").state_dict() for folder in (one, other))
+    for name in first:
         torch.testing.assert_close(first[name], second[name], rtol=2e-3, atol=2e-5)
 
 

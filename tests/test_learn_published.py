@@ -1,15 +1,12 @@
 """Training the published-type network with `learn`: two stages, any layout, clips of points alone."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from test_learn_parallel import SAME, environment
+from test_learn_parallel import SAME, assert_same_training, both_run
 from toy_clips import losses_of, with_settings, write_clips
 from toy_published import published_settings, write_tiny
 from toy_scene import ToyStreet
@@ -149,23 +146,8 @@ def test_two_processes_give_the_losses_of_one(converted, clips, tmp_path):
     """ddp, then fsdp from the checkpoint that ddp wrote, with frozen layers."""
     common = {"frozen": "temporal_transformers", "steps": 3}
     Learn(out=tmp_path / "one", settings=published_settings(converted, clips, **common)).run()
-    script = str(Path(__file__).with_name("learn_published_together.py"))
-    arguments = [str(tmp_path / "store"), str(converted), str(clips), str(tmp_path / "both")]
-    both = [
-        subprocess.Popen(
-            [sys.executable, script, str(rank), *arguments], env=environment(), stderr=subprocess.PIPE, text=True
-        )
-        for rank in (0, 1)
-    ]
-    errors = [process.communicate(timeout=540)[1] for process in both]
-    assert [process.returncode for process in both] == [0, 0], "\n".join(errors)
-    one, other = losses_of(tmp_path / "one"), losses_of(tmp_path / "both")
-    off = {step: abs(one[step] - other[step]) / one[step] for step in (1, 2, 3)}
-    print(f"largest relative difference of a step's loss: {max(off.values()):.1e}")
-    assert max(off.values()) < SAME, off
-    first, second = (published.load(tmp_path / name / "model").state_dict() for name in ("one", "both"))
-    for name in first:
-        torch.testing.assert_close(first[name], second[name], rtol=2e-3, atol=2e-5)
+    both_run("learn_published_together.py", tmp_path / "store", converted, clips, tmp_path / "both")
+    assert_same_training(tmp_path / "one", tmp_path / "both", (1, 2, 3), published.load)
 
 
 def test_the_reference_is_left_out_once(converted, clips, tmp_path, monkeypatch):
@@ -211,37 +193,28 @@ def test_the_scope_of_dropout_changes_no_clip_that_keeps_its_reference(converted
     settings = published_settings(converted, clips)
     model, _ = models.starting_model(settings)
     (clip,) = corners(settings, clips, 0, 1, 4, "batch")
-    with torch.no_grad():
-        losses = {
-            (share, frame): float(
-                model([clip], BatchPart(0, 0, 0, 1), LossSettings(None, 1.0, share, frame_dropout=frame)).total
-            )
-            for share in (0.0, 1.0)
-            for frame in (False, True)
-        }
-    assert losses[0.0, False] == losses[0.0, True] and losses[1.0, False] != losses[1.0, True]
-
-
-def test_the_scope_of_reference_dropout_reaches_the_loss():
-    rules = [
-        learn.loss_settings(with_settings(LearnConfig(), **given), torch.ones(19))
-        for given in ({}, {"reference_dropout_scope": "tokens_and_frame"})
-    ]
+    scopes = ({}, {"reference_dropout_scope": "tokens_and_frame"})
+    rules = [learn.loss_settings(with_settings(LearnConfig(), **scope), torch.ones(19)) for scope in scopes]
     assert [rule.frame_dropout for rule in rules] == [False, True]
+
+    @torch.no_grad()
+    def loss(share, frame):
+        return float(model([clip], BatchPart(0, 0, 0, 1), LossSettings(None, 1.0, share, frame_dropout=frame)).total)
+
+    assert loss(0.0, False) == loss(0.0, True) and loss(1.0, False) != loss(1.0, True)
 
 
 def test_what_does_not_fit_is_refused_in_words(converted, clips, tmp_path):
-    for wrong in ({"window": 8}, {"full_window_share": 0.5}):
-        with pytest.raises(
-            UsageError, match=r"exactly the length(.|\n)*--data.window 4 --optimizer.full-window-share 1"
-        ):
-            Learn(out=tmp_path / "run", settings=published_settings(converted, clips, **wrong)).run()
-    with pytest.raises(UsageError, match="multiples of 4"):
-        Learn(out=tmp_path / "run", settings=published_settings(converted, clips, width=50)).run()
-    with pytest.raises(UsageError, match="cannot be changed"):
-        Learn(out=tmp_path / "run", settings=published_settings(converted, clips, widths=(16, 32, 64))).run()
-    with pytest.raises(UsageError, match="without a refiner"):
-        Learn(out=tmp_path / "refiner", settings=published_settings(converted, clips, frozen="denoiser")).run()
+    length = r"exactly the length(.|\n)*--data.window 4 --optimizer.full-window-share 1"
+    for wrong, said in (
+        ({"window": 8}, length),
+        ({"full_window_share": 0.5}, length),
+        ({"width": 50}, "multiples of 4"),
+        ({"widths": (16, 32, 64)}, "cannot be changed"),
+        ({"frozen": "denoiser"}, "without a refiner"),
+    ):
+        with pytest.raises(UsageError, match=said):
+            Learn(out=tmp_path / said[:8], settings=published_settings(converted, clips, **wrong)).run()
     warped = write_clips(tmp_path / "warped", 32, 32)
     with pytest.raises(InputError, match="warped images"):
         Learn(out=tmp_path / "other", settings=published_settings(converted, warped)).run()
