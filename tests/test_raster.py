@@ -375,8 +375,7 @@ def test_backward_twice_adds_up_and_editing_an_input_is_refused(config: RasterCo
         return  # torch keeps copies, so an edit does no harm there
     with torch.no_grad():
         p["quats"].add_(1.0)
-    with pytest.raises(RuntimeError, match="inplace"):
-        loss.backward()
+    refused("inplace", loss.backward, raises=RuntimeError)
 
 
 def test_no_gradient_is_recorded_where_none_is_wanted(config: RasterConfig) -> None:
@@ -596,8 +595,7 @@ def test_without_the_library_auto_takes_torch_and_cpu_is_refused(monkeypatch: py
     monkeypatch.setitem(BACKENDS, "torch", lambda request: used.append("torch") or torch_twin.render(request))
     rasterize(_gaussians(_parameters(5)), _view())
     assert used == ["torch"]
-    with pytest.raises(ResourceError, match="not available"):
-        rasterize(_gaussians(_parameters(5)), _view(), CPU)
+    refused("not available", rasterize, _gaussians(_parameters(5)), _view(), CPU, raises=ResourceError)
 
 
 def test_gsplat_is_refused_where_it_is_missing() -> None:

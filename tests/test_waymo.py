@@ -121,8 +121,7 @@ def test_chosen_frames_and_cameras_far_from_the_origin(
         assert np.abs(sweep.world_from_lidar - shift @ original.world_from_lidar).max() < 1e-6
         assert len(read_points(scene, sweep).xyz) == len(read_points(truth, original).xyz)
     assert any(f"({far[0, 3]:.0f}" in note.replace(".", "")[:60] or "-25" in note for note in scene.source.notes)
-    with pytest.raises(UsageError, match="no such camera"):
-        ingest(source, tmp_path / "c", cameras=("rear",))
+    refused("no such camera", ingest, source, tmp_path / "c", cameras=("rear",), raises=UsageError)
 
 
 def test_images_are_rectified_and_other_lidars_read(bare: made.Log, tmp_path: Path) -> None:
