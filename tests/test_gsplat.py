@@ -142,7 +142,8 @@ def test_it_draws_what_the_other_backends_draw(gsplat: ModuleType, antialias: bo
 def test_several_views_are_drawn_in_one_call(gsplat: ModuleType, monkeypatch: pytest.MonkeyPatch, packed: bool) -> None:
     calls, draw = [], gsplat.rasterization
     monkeypatch.setattr(gsplat, "rasterization", lambda **a: (calls.append(a), draw(**a))[1])
-    _hold(_compare(_parameters(60), _views(), RasterConfig(packed=packed), "torch"))
+    config = RasterConfig(packed=packed, near_m=2.0, far_m=20.0, blur_px2=0.1)
+    _hold(_compare(_parameters(60), _views(), config, "torch"))
     assert len(calls) == 1
 
 

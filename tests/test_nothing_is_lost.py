@@ -339,8 +339,7 @@ def test_an_interrupted_replacement_keeps_the_old_result_and_continues(
     assert set(listed(out)) == made, "a file is missing among the names that the verb declares"
     (out / "mine.md").write_text("mine")
     before = tree(out)
-    with pytest.raises(UsageError, match="another configuration"):
-        made_by(out, 2, False)
+    refused("another configuration", made_by, out, 2, False, raises=UsageError)
     with counted_writes(monkeypatch, stop_at=max(4, total // 2)), pytest.raises(KeyboardInterrupt):
         made_by(out, 2, True)
     assert tree(out) == before

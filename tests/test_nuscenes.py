@@ -19,7 +19,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, transform_points, yaw_matrix
 from mudg.base.types import Scene
 from mudg.formats.importers import RECOGNISERS
-from mudg.formats.importers.nuscenes import camera_from_intrinsics, find_records, iter_records, point_times, read_scan
+from mudg.formats.importers.nuscenes import find_records, iter_records, point_times, read_scan
 from mudg.scene.read import read_points
 
 pytestmark = roundtrip.needs_native
@@ -298,11 +298,6 @@ def test_point_times_follow_columns_or_azimuth(tmp_path: Path) -> None:
     points = read_scan(path)
     assert len(points.xyz) == len(flat) - 1
     assert np.allclose(points.intensity, 0.2)
-
-
-def test_intrinsics_get_half_a_pixel() -> None:
-    camera = camera_from_intrinsics("front", (1600, 900), [[1266.4, 0, 816.3], [0, 1266.5, 491.5], [0, 0, 1]], "here")
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (1266.4, 1266.5, 816.8, 492.0)
 
 
 # --- real data ------------------------------------------------------------------------------------

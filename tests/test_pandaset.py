@@ -16,10 +16,10 @@ import pytest
 import roundtrip
 from pandas_pickles import write_frame
 from refusals import refused
-from write_pandaset import CAMERA_OF, EPOCH_S, SOURCE_FROM_WORLD, cuboids, pose_entry, write_pandaset
+from write_pandaset import CAMERA_OF, EPOCH_S, cuboids, write_pandaset
 
 from mudg.base.errors import UsageError
-from mudg.base.geometry import invert, transform_points, yaw_matrix, yaw_of
+from mudg.base.geometry import invert, transform_points
 from mudg.base.palette import CLASSES, ID, UNLABELLED
 from mudg.base.types import Photo, Scene, Track
 from mudg.core.fusion import SweepShots, fuse_sweeps
@@ -236,24 +236,6 @@ def test_classes_of_points_become_train_ids(source: Path, tmp_path: Path) -> Non
     assert set(CLASS_OF.values()) <= {"", *CLASSES}
 
 
-@pytest.mark.parametrize(
-    ("spoil", "words"),
-    [
-        (lambda s: (s / "classes.json").unlink(), "class names is missing"),
-        (lambda s: (s / "classes.json").write_text("[1]"), "malformed"),
-        (lambda s: (s / "02.pkl.gz").unlink(), "no classes of points"),
-        (lambda s: write_frame(s / "02.pkl.gz", {"class": np.full(9, 7)}), "do not fit the points"),
-        (lambda s: write_frame(s / "02.pkl.gz", {"kind": np.full(9, 7)}), "lacks columns"),
-    ],
-)
-def test_spoilt_classes_are_refused_in_words(
-    source: Path, tmp_path: Path, spoil: Callable[[Path], object], words: str
-) -> None:
-    write_classes(source, {"7": "Road"})
-    spoil(source / "annotations" / "semseg")
-    roundtrip.assert_refused(ingest, source, tmp_path / "out", words)
-
-
 def test_boxes_and_path_reach_the_images_taken_before_the_end_of_the_first_turn(truth: Scene, tmp_path: Path) -> None:
     source = write_pandaset(truth, tmp_path / "001")
     for path in (source / "camera").glob("*/timestamps.json"):
@@ -308,6 +290,14 @@ def json_entry(name: str, change: Callable[[list], object]) -> Callable[[Path], 
     return spoil
 
 
+def classes_of_points(change: Callable[[Path], object]) -> Callable[[Path], None]:
+    def spoil(source: Path) -> None:
+        write_classes(source, {"7": "Road"})
+        change(source / "annotations" / "semseg")
+
+    return spoil
+
+
 FRONT_TIMES = "camera/front_camera/timestamps.json"
 
 
@@ -343,6 +333,11 @@ def times_scaled(factor: float) -> Callable[[Path], None]:
         (json_entry("camera/front_camera/poses.json", lambda v: v[2]["heading"].update(w=None)), "pose"),
         (json_entry("camera/front_camera/intrinsics.json", lambda v: v.pop("fy")), "intrinsics are incomplete"),
         (lambda s: (s / "camera/front_camera/poses.json").write_text("[{"), "not valid JSON"),
+        (classes_of_points(lambda s: (s / "classes.json").unlink()), "class names is missing"),
+        (classes_of_points(lambda s: (s / "classes.json").write_text("[1]")), "malformed"),
+        (classes_of_points(lambda s: (s / "02.pkl.gz").unlink()), "no classes of points"),
+        (classes_of_points(lambda s: write_frame(s / "02.pkl.gz", {"class": np.full(9, 7)})), "do not fit the points"),
+        (classes_of_points(lambda s: write_frame(s / "02.pkl.gz", {"kind": np.full(9, 7)})), "lacks columns"),
     ],
 )
 def test_spoilt_logs_are_refused_in_words(
@@ -379,16 +374,6 @@ def test_a_log_without_boxes_or_front_camera_is_still_one(source: Path, tmp_path
     assert scene.tracks == ()
     assert set(scene.cameras) == {"front_left"}
     assert any("no boxes" in note for note in scene.source.notes)
-
-
-def test_the_writer_of_these_tests_turns_yaw_as_documented() -> None:
-    """Yaw 0 looks along y, and a quarter turn left of it along -x."""
-    track = Track("a", "car", [4, 2, 1.5], [0.0], invert(SOURCE_FROM_WORLD)[None] @ yaw_matrix(np.pi / 2))
-    scene = type("Log", (), {"tracks": (track,)})()
-    assert cuboids(scene, 0.0)["yaw"] == pytest.approx([0.0])
-    assert yaw_of(yaw_matrix(np.pi)) == pytest.approx(np.pi)
-    heading = pose_entry(yaw_matrix(np.pi / 2))["heading"]
-    assert (heading["w"], heading["z"]) == pytest.approx((np.sqrt(0.5), np.sqrt(0.5)))
 
 
 # --- real data ------------------------------------------------------------------------------------

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 from toy_fitted import write_toy_run
 
 import mudg
 from mudg.base import geometry
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import UsageError
 from mudg.formats.paths import read_path
 
 
@@ -103,8 +104,7 @@ def test_files_that_hold_no_path_are_refused_with_the_line(
 ) -> None:
     (tmp_path / "bad.txt").write_text(text)
     scene = mudg.read_scene(run[0])
-    with pytest.raises(InputError, match=told):
-        read_path(tmp_path / "bad.txt", scene, scene.cameras["front"])
+    refused(told, read_path, tmp_path / "bad.txt", scene, scene.cameras["front"])
 
 
 @pytest.mark.parametrize(
@@ -113,8 +113,7 @@ def test_files_that_hold_no_path_are_refused_with_the_line(
 def test_other_json_is_refused(run: tuple[Path, Path], tmp_path: Path, content: str) -> None:
     (tmp_path / "bad.json").write_text(content)
     scene = mudg.read_scene(run[0])
-    with pytest.raises(InputError, match="bad.json"):
-        read_path(tmp_path / "bad.json", scene, scene.cameras["front"])
+    refused("bad.json", read_path, tmp_path / "bad.json", scene, scene.cameras["front"])
 
 
 def test_a_far_path_is_drawn_with_a_warning_and_nothing_is_half_written(
@@ -128,8 +127,7 @@ def test_a_far_path_is_drawn_with_a_warning_and_nothing_is_half_written(
     mudg.render(scene, fit, out=tmp_path / "far", path=tmp_path / "far.txt", width_px=40, video=False)
     assert "1 of 1 views are more than 5 m" in capsys.readouterr().err
     (tmp_path / "bad.txt").write_text("1 2 3\n")
-    with pytest.raises(InputError, match="not a pose"):
-        mudg.render(scene, fit, out=tmp_path / "bad", path=tmp_path / "bad.txt")
+    refused("not a pose", mudg.render, scene, fit, out=tmp_path / "bad", path=tmp_path / "bad.txt")
     assert not (tmp_path / "bad").exists()
     with pytest.raises(UsageError, match="without repairs and sweeps"):
         mudg.render(scene, fit, out=tmp_path / "x", path=tmp_path / "far.txt", lidar="scene")

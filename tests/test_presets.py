@@ -51,10 +51,8 @@ def test_fast_is_a_name_for_a_preset_and_default_is_the_default() -> None:
     assert words() == words("--preset", "default") == run_preset()
     assert app.parse(["demo", "--preset", "quality"])[0].settings == run_preset("quality")
     for other in set(NAMES) - {"fast"}:
-        with pytest.raises(UsageError, match="another name of --preset fast"):
-            words("--fast", "--preset", other)
-    with pytest.raises(UsageError, match="no such preset"):
-        run_preset("best")
+        refused("another name of --preset fast", words, "--fast", "--preset", other, raises=UsageError)
+    refused("no such preset", run_preset, "best", raises=UsageError)
 
 
 def test_defaults_then_preset_then_file_then_flags(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+from refusals import refused
 
 from mudg.base.errors import NumericsError
 from mudg.base.processes import (
@@ -239,8 +240,7 @@ def fail_beside(given: list[Path]) -> None:
 
 def test_a_call_beside_that_fails_is_told_and_the_rest_are_dropped(tmp_path: Path) -> None:
     given = folders(tmp_path, "fails", *"abcdef")
-    with pytest.raises(NumericsError, match="it failed"):
-        fail_beside(given)
+    refused("it failed", fail_beside, given, raises=NumericsError)
     assert not (given[-1] / "started").exists()
 
 
@@ -252,8 +252,7 @@ def fail_in_block(folder: Path) -> None:
 
 def test_an_error_in_the_block_stops_the_calls_beside_it(tmp_path: Path) -> None:
     (folder,) = folders(tmp_path, "a")
-    with pytest.raises(ValueError, match="in the block"):
-        fail_in_block(folder)
+    refused("in the block", fail_in_block, folder, raises=ValueError)
     end = time.monotonic() + PATIENCE_S
     while process_alive(int((folder / "started").read_text())):
         assert time.monotonic() < end

@@ -327,8 +327,7 @@ def test_other_numbers_of_frames_are_refused(model):
     for frames in (1, 3, 5):
         with pytest.raises(UsageError, match="fixed number of frames"):
             model.sample(some_condition(frames=frames), SampleRequest(1))
-    with pytest.raises(UsageError, match="multiples of 4"):
-        model.sample(some_condition(height=10), SampleRequest(1))
+    refused("multiples of 4", model.sample, some_condition(height=10), SampleRequest(1), raises=UsageError)
 
 
 # training -----------------------------------------------------------------------------------------

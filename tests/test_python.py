@@ -92,8 +92,7 @@ def test_what_a_notebook_gets_wrong_is_refused_in_words(notebook: dict[str, Any]
         (r"loss: \{ssim_weight: \.\.\.\}", lambda: mudg.fit(scene, scene, out=tmp_path / "a", **weight)),
         (r"not a mudg\.Camera", lambda: notebook["fitted"].render("front", view.world_from_cam, view.time_s)),
     ):
-        with pytest.raises(UsageError, match=said):
-            wrong()
+        refused(said, wrong, raises=UsageError)
     assert not (tmp_path / "a").exists()
 
 
@@ -120,7 +119,6 @@ def test_a_fit_knows_its_scene_until_that_changes(notebook: dict[str, Any], tmp_
         with pytest.raises(UsageError, match="is not known, is gone or has changed"):
             mudg.page(folder / "fit", out=tmp_path / "other.html")
         shutil.copytree(folder / "fused", folder / "scene")  # something else at its place
-        with pytest.raises(InputError, match="not a scene"):
-            mudg.read_scene(folder / "fit")
+        refused("not a scene", mudg.read_scene, folder / "fit")
     finally:
         (notebook["folder"] / "hidden").rename(notebook["folder"] / "scene")

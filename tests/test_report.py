@@ -19,11 +19,11 @@ import pytest
 import torch
 import toy_views
 from jinja2 import UndefinedError
+from refusals import refused
 
 from mudg import app
 from mudg.base import html as report_html
 from mudg.base import store
-from mudg.base.errors import InputError
 from mudg.base.types import Observation
 from mudg.editing.script import read_edits
 from mudg.editing.settings import ScoreConfig
@@ -185,8 +185,7 @@ def test_names_from_a_scene_cannot_become_tags(tmp_path: Path) -> None:
 
 
 def test_a_value_that_a_template_lacks_is_an_error() -> None:
-    with pytest.raises(UndefinedError, match="title"):
-        report_html.render("labels.html.j2")
+    refused("title", report_html.render, "labels.html.j2", raises=UndefinedError)
 
 
 def test_videos_hold_all_panels_and_play(page: str) -> None:
@@ -284,8 +283,7 @@ def test_without_an_encoder_pictures_stand_in(tmp_path: Path, monkeypatch: pytes
 
 
 def test_an_unscored_run_is_said(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="file not found"):
-        written(tmp_path)
+    refused("file not found", written, tmp_path)
 
 
 def test_the_budget_makes_videos_smaller(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

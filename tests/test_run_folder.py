@@ -12,7 +12,7 @@ import pytest
 from refusals import refused
 
 from mudg.base import store
-from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
+from mudg.base.errors import IntegrityError, ResourceError, UsageError
 from mudg.base.run_folder import Replacement, RunDir, VerbOutput, is_temporary, refuse_overlap, run_state
 
 OUTPUT = VerbOutput("fit", 1, ("out.txt", "rows/*.txt", "steps/"))
@@ -48,8 +48,7 @@ def test_run_folder_is_reused_only_when_it_verifies(tmp_path: Path) -> None:
     again = run(tmp_path / "r")
     assert again.complete and store.read_json(again.path / "run.json")["summary"] == {"psnr": 30.0}
     (made.path / "out.txt").write_text("altered")
-    with pytest.raises(IntegrityError, match="--overwrite"):
-        run(tmp_path / "r")
+    refused("--overwrite", run, tmp_path / "r", raises=IntegrityError)
     assert not run(tmp_path / "r", overwrite=True).complete and (made.path / "out.txt").read_text() == "altered"
 
 
@@ -64,8 +63,7 @@ def test_a_run_that_failed_before_it_made_anything_is_in_nobodys_way(tmp_path: P
     corrected = run(tmp_path / "r", value=2)
     assert not corrected.complete
     store.write_text(corrected.path / "out.txt", "half")
-    with pytest.raises(UsageError, match="value: 2 there, 1 asked"):
-        run(tmp_path / "r")
+    refused("value: 2 there, 1 asked", run, tmp_path / "r", raises=UsageError)
 
 
 def test_interrupted_run_continues_and_a_crash_before_the_state_is_not_complete(tmp_path: Path) -> None:
@@ -82,12 +80,10 @@ def test_interrupted_run_continues_and_a_crash_before_the_state_is_not_complete(
 def test_lock_of_a_live_process_is_respected_and_of_a_dead_one_taken_over(tmp_path: Path) -> None:
     made = run(tmp_path / "r")
     store.write_json(made.path / "lock", {"pid": os.getppid(), "host": socket.gethostname()})
-    with pytest.raises(ResourceError, match=str(os.getppid())):
-        run(tmp_path / "r")
+    refused(str(os.getppid()), run, tmp_path / "r", raises=ResourceError)
     store.write_text(made.path / "out.txt", "half")
     for value in (1, 2):
-        with pytest.raises(ResourceError, match="another process"):
-            run(tmp_path / "r", value, overwrite=True)
+        refused("another process", run, tmp_path / "r", value, overwrite=True, raises=ResourceError)
     assert (made.path / "out.txt").is_file()
     store.write_json(made.path / "lock", {"pid": 2**22 + 1, "host": socket.gethostname()})
     assert not run(tmp_path / "r").complete
@@ -115,11 +111,9 @@ def test_a_folder_of_somebody_elses_files_is_refused(tmp_path: Path, state: str 
     if state is not None:
         (folder / "run.json").write_text(state)
     before = sorted(p.name for p in tmp_path.rglob("*"))
-    with pytest.raises(UsageError, match="something else"):
-        run(folder, overwrite=overwrite)
+    refused("something else", run, folder, overwrite=overwrite, raises=UsageError)
     assert sorted(p.name for p in tmp_path.rglob("*")) == before
-    with pytest.raises(UsageError, match="no folder"):
-        run(folder / "thesis.tex", overwrite=overwrite)
+    refused("no folder", run, folder / "thesis.tex", overwrite=overwrite, raises=UsageError)
 
 
 def test_a_run_killed_before_its_first_record_is_in_nobodys_way(tmp_path: Path) -> None:
@@ -130,8 +124,7 @@ def test_a_run_killed_before_its_first_record_is_in_nobodys_way(tmp_path: Path) 
     assert run(folder).complete
     (folder / "lock").write_text("a key, and not ours")
     (folder / "run.json").unlink()
-    with pytest.raises(UsageError, match="something else"):
-        run(folder)
+    refused("something else", run, folder, raises=UsageError)
 
 
 @pytest.mark.parametrize("done", [True, False])
@@ -223,8 +216,7 @@ def test_the_old_result_stands_until_the_new_one_is_finished(tmp_path: Path) -> 
     new.log(step=1)
     assert contents(folder) == before
     assert run(folder).complete  # the old result is reused as ever
-    with pytest.raises(UsageError, match="another configuration"):
-        run(folder, 2)
+    refused("another configuration", run, folder, 2, raises=UsageError)
     again = run(folder, 2, overwrite=True)
     assert (again.path / "out.txt").read_text() == "half"
     other = run(folder, 3, overwrite=True)
@@ -273,12 +265,10 @@ def test_a_folder_that_cannot_be_renamed_is_refused_before_the_work(
 ) -> None:
     folder = finished(tmp_path / "r").path
     monkeypatch.setattr(os.path, "ismount", lambda path: Path(path) == folder)
-    with pytest.raises(ResourceError, match="mount point"):
-        run(folder, 2, overwrite=True)
+    refused("mount point", run, folder, 2, overwrite=True, raises=ResourceError)
     monkeypatch.undo()
     monkeypatch.setattr(Path, "mkdir", _refuse)
-    with pytest.raises(ResourceError, match="beside the old one"):
-        run(folder, 2, overwrite=True)
+    refused("beside the old one", run, folder, 2, overwrite=True, raises=ResourceError)
     assert contents(folder)["out.txt"] == "result 1"
 
 
@@ -333,8 +323,7 @@ def test_a_crash_at_any_point_of_the_exchange_loses_nothing(
     assert "mine" in "".join(p.read_text() for p in tmp_path.rglob("mine.md*"))
     before_exchange = stop == ("rename", 1)
     if value == 1 and not before_exchange:  # the command for the old settings meets the new result
-        with pytest.raises(UsageError, match="value: 2 there, 1 asked"):
-            run(folder, value, overwrite=overwrite)
+        refused("value: 2 there, 1 asked", run, folder, value, overwrite=overwrite, raises=UsageError)
     else:
         assert run(folder, value, overwrite=overwrite).complete
     assert (folder / "mine.md").read_text() == "mine"
@@ -348,8 +337,7 @@ def test_a_reader_between_the_renames_is_told_what_happened(tmp_path: Path, monk
     folder = finished(tmp_path / "r").path
     crashed(folder, monkeypatch, ("rename", 2))
     assert not folder.exists()
-    with pytest.raises(InputError, match="repeat the command that wrote it"):
-        store.digest(folder)
+    refused("repeat the command that wrote it", store.digest, folder)
 
 
 def test_the_old_result_comes_back_where_the_new_one_does_not_verify(
@@ -387,8 +375,7 @@ def test_a_failed_second_rename_is_undone(tmp_path: Path, monkeypatch: pytest.Mo
         return real(self, target)
 
     monkeypatch.setattr(Path, "rename", refuse)
-    with pytest.raises(ResourceError, match="it is finished and lies in"):
-        new.finish()
+    refused("it is finished and lies in", new.finish, raises=ResourceError)
     monkeypatch.undo()
     assert run(folder).complete and run(folder, 2, overwrite=True).complete
     assert contents(folder)["out.txt"] == "result 2"

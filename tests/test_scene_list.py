@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from toy_clips import interrupted_at, losses_of, tiny, write_clips
 
 from mudg import app
@@ -89,11 +90,9 @@ def test_lists_are_read_in_three_formats(tmp_path):
         ('[{"path": "a", "weight": 0}]', "no scene"),
     ):
         (tmp_path / "bad.json").write_text(content)
-        with pytest.raises(InputError, match=words):
-            read_list(str(tmp_path / "bad.json"))
+        refused(words, read_list, str(tmp_path / "bad.json"))
     (tmp_path / "bad.txt").write_text("a\tb\tmuch\n")
-    with pytest.raises(InputError, match="line 1"):
-        read_list(str(tmp_path / "bad.txt"))
+    refused("line 1", read_list, str(tmp_path / "bad.txt"))
 
 
 def listed_folder(clips, tmp_path, count=6, bad=()):
@@ -132,8 +131,7 @@ def test_bad_scenes_are_left_out_up_to_a_limit(clips, tmp_path, capsys):
     assert all(map(torch.equal, first, colors(knowing)))  # what was known before changes nothing
     parts = [opened().draw(5, 4, 2, "batch", slice(n, n + 1))[0].rgb for n in range(4)]
     assert all(map(torch.equal, parts, [c.rgb for c in one.draw(5, 4, 2, "batch")]))
-    with pytest.raises(UsageError, match="too many scenes"):
-        colors(opened(0.2), 40)
+    refused("too many scenes", colors, opened(0.2), 40, raises=UsageError)
 
 
 def test_a_training_on_a_list_resumes_bit_equal(clips, tmp_path):

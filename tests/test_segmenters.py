@@ -20,7 +20,7 @@ from refusals import refused
 from tiny_networks import NAMES as TINY_NAMES
 from tiny_networks import eomt, mask2former, segformer
 
-from mudg.base.errors import InputError, ResourceError
+from mudg.base.errors import ResourceError
 from mudg.base.palette import CLASSES, ID, UNLABELLED
 from mudg.labels import segmenters
 from mudg.labels.segmenters import KINDS, Segmenter, match_classes, tile_starts
@@ -153,8 +153,7 @@ def test_a_network_without_its_head_is_refused(tmp_path: Path) -> None:
     segformer(tmp_path).segformer.save_pretrained(str(tmp_path))
     settings = json.loads((tmp_path / "config.json").read_text())
     (tmp_path / "config.json").write_text(json.dumps({**settings, "id2label": NAMES}))
-    with pytest.raises(InputError, match="decode_head"):
-        Segmenter.load(tmp_path)
+    refused("decode_head", Segmenter.load, tmp_path)
 
 
 def test_squares_are_scaled_to_the_network(package: list, tmp_path: Path) -> None:
@@ -179,8 +178,7 @@ def test_tiles_cover_everything_and_overlap() -> None:
 
 def test_classes_without_a_name_of_ours_are_left_out() -> None:
     assert match_classes(NAMES, "here").tolist() == [ID["road"], ID["traffic light"], ID["sky"], UNLABELLED]
-    with pytest.raises(InputError, match="Cityscapes"):
-        match_classes({"0": "cat", "1": "dog"}, "here")
+    refused("Cityscapes", match_classes, {"0": "cat", "1": "dog"}, "here")
 
 
 def test_what_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -188,8 +186,7 @@ def test_what_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     refused("another kind", Segmenter.load, folder_of(tmp_path, "bert"))
     folder_of(tmp_path, "eomt")
     monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(ResourceError, match="models"):
-        Segmenter.load(tmp_path)
+    refused("models", Segmenter.load, tmp_path, raises=ResourceError)
 
 
 def test_a_network_is_found_in_the_cache_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -218,5 +215,4 @@ def test_a_folder_goes_before_the_cache_and_paths_are_left_alone(
     assert folders.find(tmp_path / "nowhere/at/all") == tmp_path / "nowhere/at/all"
     assert folders.title("weights/net") == "net"
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(ResourceError, match="no such folder, nor the package"):
-        folders.find("weights/other")
+    refused("no such folder, nor the package", folders.find, "weights/other", raises=ResourceError)

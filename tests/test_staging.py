@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from refusals import refused
 
 from mudg import app
 from mudg.base import staging, store
@@ -176,8 +177,7 @@ def test_two_commands_do_not_share_a_scratch_folder(scratch: Path, scene: Path) 
     def write(inner: Any) -> dict[str, Any]:
         (folder,) = scratch.iterdir()
         store.write_json(folder / "lock", {"pid": 1, "host": __import__("socket").gethostname()})
-        with pytest.raises(ResourceError, match="another process"):
-            staging.run_staged("report", args, write, scratch)
+        refused("another process", staging.run_staged, "report", args, write, scratch, raises=ResourceError)
         inner.out.write_text("page")
         return {}
 
@@ -185,5 +185,4 @@ def test_two_commands_do_not_share_a_scratch_folder(scratch: Path, scene: Path) 
     (scratch / "elsewhere").mkdir()
     name = staging._Staging.of("report", args, scratch).folder
     name.symlink_to(scratch / "elsewhere")
-    with pytest.raises(ResourceError, match="somebody else"):
-        staging.run_staged("report", args, write, scratch)
+    refused("somebody else", staging.run_staged, "report", args, write, scratch, raises=ResourceError)

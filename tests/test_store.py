@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 
 from mudg.base import checkpoint, errors, store
 from mudg.base.errors import InputError, IntegrityError, ResourceError
@@ -38,20 +39,17 @@ def test_written_files_follow_the_umask(tmp_path: Path) -> None:
 
 def test_unwritable_folder_is_a_resource_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
-    with pytest.raises(ResourceError, match="--out"):
-        store.write_text(tmp_path / "file" / "b.txt", "x")
+    refused("--out", store.write_text, tmp_path / "file" / "b.txt", "x", raises=ResourceError)
 
 
 @pytest.mark.parametrize("text", ['{"a": NaN}', '{"a": 1, "a": 2}', "{", "[" * 100_000])
 def test_json_is_strict(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.json").write_text(text)
-    with pytest.raises(InputError, match=r"a\.json"):
-        store.read_json(tmp_path / "a.json")
+    refused(r"a\.json", store.read_json, tmp_path / "a.json")
 
 
 def test_json_refuses_to_write_nan_and_names_the_field(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"x\.y\[1\]"):
-        store.write_json(tmp_path / "a.json", {"x": {"y": [1.0, float("nan")]}})
+    refused(r"x\.y\[1\]", store.write_json, tmp_path / "a.json", {"x": {"y": [1.0, float("nan")]}})
     assert not (tmp_path / "a.json").exists()
 
 
@@ -63,8 +61,7 @@ def test_safetensors_round_trip_and_truncation(tmp_path: Path) -> None:
     content = path.read_bytes()
     for keep in (0, 4, 12, len(content) - 1):
         path.write_bytes(content[:keep])
-        with pytest.raises(InputError, match=r"a\.safetensors"):
-            store.read_safetensors(path)
+        refused(r"a\.safetensors", store.read_safetensors, path)
 
 
 def test_manifest_detects_every_single_bit_flip(tmp_path: Path) -> None:
@@ -75,13 +72,11 @@ def test_manifest_detects_every_single_bit_flip(tmp_path: Path) -> None:
         flipped = bytearray(content)
         flipped[position] ^= 1 << (position % 8)
         (tmp_path / "a.safetensors").write_bytes(bytes(flipped))
-        with pytest.raises(IntegrityError, match=r"a\.safetensors"):
-            store.verify_manifest(tmp_path)
+        refused(r"a\.safetensors", store.verify_manifest, tmp_path, raises=IntegrityError)
     (tmp_path / "a.safetensors").write_bytes(content)
     store.verify_manifest(tmp_path)
     (tmp_path / "a.safetensors").unlink()
-    with pytest.raises(IntegrityError, match="missing"):
-        store.verify_manifest(tmp_path)
+    refused("missing", store.verify_manifest, tmp_path, raises=IntegrityError)
 
 
 def test_checkpoints_keep_two_and_fall_back_past_a_damaged_one(tmp_path: Path) -> None:
@@ -98,8 +93,7 @@ def test_checkpoints_keep_two_and_fall_back_past_a_damaged_one(tmp_path: Path) -
     older = checkpoint.latest(tmp_path)
     assert older is not None and older.step == 20
     (tmp_path / "step_00000020" / store.MANIFEST).unlink()
-    with pytest.raises(IntegrityError, match="no checkpoint verifies"):
-        checkpoint.latest(tmp_path)
+    refused("no checkpoint verifies", checkpoint.latest, tmp_path, raises=IntegrityError)
     assert damaged.exists()
 
 
@@ -194,5 +188,4 @@ def test_half_a_line_of_a_log_does_not_stay(tmp_path: Path, monkeypatch: pytest.
     (tmp_path / "half").write_bytes(b"no line at all")
     store.append_line(tmp_path / "half", "1")
     assert (tmp_path / "half").read_text() == "1\n"
-    with pytest.raises(ResourceError, match="writing failed"):
-        store.append_line(Path("/dev/full"), "x")
+    refused("writing failed", store.append_line, Path("/dev/full"), "x", raises=ResourceError)

@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from test_annotate import STREET, given_at, overlap
 from toy_scene import ToyStreet
 
 from mudg.base import checkpoint, geometry
-from mudg.base.errors import InputError, IntegrityError, ResourceError
+from mudg.base.errors import IntegrityError, ResourceError
 from mudg.base.palette import CLASSES, ID
 from mudg.core.depth import ray_elevation
 from mudg.core.project import RULES as HIDING_RULES
@@ -268,8 +269,7 @@ def test_a_network_is_read_as_it_was_written(tmp_path: Path) -> None:
 
 def test_damaged_folders_end_in_words(tmp_path: Path) -> None:
     street_net.save(StreetNet(TINY), tmp_path / "good", "card", {})
-    with pytest.raises(ResourceError, match="weights are missing"):
-        street_net.load(tmp_path)
+    refused("weights are missing", street_net.load, tmp_path, raises=ResourceError)
     for field, value, words in (
         ("widths", [8, 8, 8, 8, 9], r"widths\[4\]\n.*multiple of 8"),
         ("widths", "8", r"widths\n.*array"),
@@ -285,8 +285,7 @@ def test_damaged_folders_end_in_words(tmp_path: Path) -> None:
         content = json.loads((tmp_path / "bad/model.json").read_text())
         content["config"][field] = value
         (tmp_path / "bad/model.json").write_text(json.dumps(content))
-        with pytest.raises(InputError, match=words):
-            street_net.load(tmp_path / "bad")
+        refused(words, street_net.load, tmp_path / "bad")
     weights = tmp_path / "good" / street_net.WEIGHTS_FILE
     spoilt = bytearray(weights.read_bytes())
     spoilt[-1] ^= 1

@@ -318,6 +318,5 @@ def test_a_fitted_scene_is_part_of_the_condition(world, fitted, tmp_path, monkey
 def test_what_takes_no_fitted_scene(world, fitted, tmp_path, condition, words):
     """A model without renders, and a condition with parts switched off."""
     changes = {} if condition == "full" else {"model": str(fitted[1]), "condition": condition}
-    with pytest.raises(UsageError, match=words):
-        made(world, tmp_path / "out", fitted[0], **changes)
+    refused(words, made, world, tmp_path / "out", fitted[0], raises=UsageError, **changes)
     assert not (tmp_path / "out").exists()

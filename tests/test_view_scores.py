@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 import toy_world
+from refusals import refused
 
 from mudg.base import store
-from mudg.base.errors import InputError
 from mudg.base.types import Camera, Observation, Scene, Track, View
 from mudg.city.config import CityConfig
 from mudg.city.logs import write_city
@@ -189,16 +189,14 @@ def test_boxes_of_images_of_another_size_are_scaled(tmp_path: Path) -> None:
 )
 def test_malformed_boxes_are_refused(tmp_path: Path, content: object, said: str) -> None:
     store.write_json(tmp_path / "boxes.json", content)
-    with pytest.raises(InputError, match=said):
-        detections.read_detections(tmp_path / "boxes.json")
+    refused(said, detections.read_detections, tmp_path / "boxes.json")
 
 
 def test_detected_lanes_of_a_log_are_refused(tmp_path: Path, log_scene: Path) -> None:
     views = written(read_scene(log_scene), tmp_path / "right", toy_world.truth)
     (tmp_path / "lanes").mkdir()
     config = dataclasses.replace(QUICK, lanes=str(tmp_path / "lanes"))
-    with pytest.raises(InputError, match="no lane lines"):
-        scored(log_scene, {"right": views}, tmp_path / "score", config)
+    refused("no lane lines", scored, log_scene, {"right": views}, tmp_path / "score", config)
 
 
 def test_boxes_with_few_points_do_not_count(tmp_path: Path, log_scene: Path) -> None:
@@ -274,8 +272,7 @@ def test_a_missing_mask_is_named(city: Path, city_run: tuple[Path, dict]) -> Non
     lanes = detections.LaneDetections(scene, city_run[0].parent / "lanes")
     views = trajectory.shifted(scene, "front", 2.0).views
     images = detections.ViewImages("right/front_shift+2.0", (0, 9), views[:2])
-    with pytest.raises(InputError, match="000009"):
-        lanes.of(images)
+    refused("000009", lanes.of, images)
     assert lanes.of(dataclasses.replace(images, key="nobody")) == score_tables.NO_DETECTIONS
 
 

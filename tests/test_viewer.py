@@ -26,7 +26,7 @@ from toy_fitted import STREET, toy_fitted, write_toy_run
 from view_server import ask, serving
 
 from mudg import FittedScene
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera
 from mudg.core.trajectory import at_shift
@@ -173,8 +173,7 @@ def test_a_chunk_says_where_it_is_and_what_it_holds() -> None:
 
 
 def test_more_than_a_page_holds_is_refused() -> None:
-    with pytest.raises(UsageError, match="--budget"):
-        pack_scene(toy_fitted(degree=0), 0.0, chunk_rows=2)
+    refused("--budget", pack_scene, toy_fitted(degree=0), 0.0, chunk_rows=2, raises=UsageError)
 
 
 def test_neighbours_on_the_curve_are_neighbours_in_space() -> None:
@@ -271,8 +270,7 @@ def test_a_folder_is_made_alike_twice(toy: Toy, tmp_path: Path, monkeypatch: pyt
 def test_a_folder_of_something_else_is_not_replaced(toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "page_page").mkdir()
     (tmp_path / "page_page" / "notes.txt").write_text("mine")
-    with pytest.raises(UsageError, match="not a page"):
-        folder_page(toy, tmp_path, monkeypatch)
+    refused("not a page", folder_page, toy, tmp_path, monkeypatch, raises=UsageError)
 
 
 def test_what_a_page_takes_is_said_before_it_is_written(toy: Toy) -> None:
@@ -634,8 +632,7 @@ def test_a_folder_opened_from_the_disk_says_what_to_do(
     toy: Toy, tmp_path: Path, fresh: Browser, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, _ = folder_page(toy, tmp_path, monkeypatch)
-    with pytest.raises(BrowserError, match="python -m http.server"):
-        fresh.open(f"file://{folder / 'index.html'}")
+    refused("python -m http.server", fresh.open, f"file://{folder / 'index.html'}", raises=BrowserError)
     assert "mudg view RUN" in fresh.run("document.getElementById('problem').textContent")
 
 
@@ -712,5 +709,4 @@ def test_fits_of_different_logs_are_not_compared(toy: Toy, tmp_path: Path) -> No
     from mudg.gaussians.storage import save_model
 
     save_model(replace(toy[2], facts={**toy[2].facts, "scene": "another"}), tmp_path / "fit")
-    with pytest.raises(InputError, match="another"):
-        view.find_shown(PageConfig(), toy[1], toy[0] / "scene", tmp_path / "fit")
+    refused("another", view.find_shown, PageConfig(), toy[1], toy[0] / "scene", tmp_path / "fit")

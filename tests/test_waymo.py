@@ -1,32 +1,39 @@
-"""Waymo importer: round trips of both formats, and the real frame."""
+"""Waymo importer: round trips of both formats, the real frame, its parts against slow twins, damaged logs."""
 
 from __future__ import annotations
 
 import io
+import struct
+import sys
+import zlib
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import roundtrip
 import waymo_logs
 import write_waymo as made
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
 from refusals import refused
 from waymo_logs import COLUMNS, ingest, write
 
 from mudg.base import geometry
-from mudg.base.errors import UsageError
-from mudg.base.geometry import invert, transform_points, yaw_matrix
+from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.geometry import from_rotation_translation, invert, matrix_from_quaternion, transform_points, yaw_matrix
 from mudg.base.types import Scene, Track
 from mudg.city import sensors as rig
+from mudg.formats.importers import RECOGNISERS
 from mudg.formats.importers.waymo import importer as sensors
 from mudg.formats.importers.waymo import logs as tfrecord
 from mudg.formats.importers.waymo import records
-from mudg.formats.importers.waymo import records as messages
 from mudg.formats.importers.waymo.logs import ParquetTable, TfrecordLog
-from mudg.formats.importers.waymo.records import WaymoBox
+from mudg.formats.importers.waymo.records import CameraShot, LaserCalibration, LaserScan, WaymoBox
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points
 
@@ -89,25 +96,6 @@ def test_the_moment_of_the_boxes_is_found(
     roundtrip.assert_same_log(scene, city[0], labels=made.LABELS, box_pose=0.04, cloud_m=2e-4)
 
 
-def test_points_count_for_the_moment_that_puts_them_inside() -> None:
-    box = WaymoBox("a", "vehicle", (10.0, 4.0, 1.0), (4.0, 2.0, 1.5), 0.3)
-    forward = yaw_matrix(0.3)[:3, 0]
-    along, across = np.meshgrid(np.linspace(-1.99, 1.99, 20), np.linspace(-0.99, 0.99, 9))
-    grid = np.stack([along.ravel(), across.ravel(), np.full(along.size, 0.1)], 1)
-    on_box = transform_points(yaw_matrix(0.3, box.centre), grid)
-    seen = np.linspace(0.03, 0.04, len(grid))
-    for index, held in enumerate((0.035, 0.0, 0.05)):
-        points = on_box + (seen - held)[:, None] * 20.0 * forward
-        counts = records.points_inside(box, 20.0 * forward, points, seen, 0.035, 0.05)
-        assert counts[index] == len(grid)
-        assert counts.argmax() == index
-        assert np.delete(counts, index).max() < 0.95 * len(grid)
-        assert records.choose_moment(counts) == records.MOMENTS[index]
-    low = on_box - [0, 0, 0.75]
-    assert records.points_inside(box, np.zeros(3), low, seen, 0.0, 0.0).tolist() == [0, 0, 0]  # the road
-    assert records.choose_moment(np.array([100, 104, 90])) == "seen"
-
-
 def test_both_formats_and_any_number_of_workers_give_the_same_scene(bare: made.Log, tmp_path: Path) -> None:
     one = ingest(write(bare, "v1", tmp_path / "one"), tmp_path / "a", workers=3)
     two = ingest(write(bare, "v2", tmp_path / "two"), tmp_path / "b", workers=1)
@@ -133,8 +121,7 @@ def test_chosen_frames_and_cameras_far_from_the_origin(
         assert np.abs(sweep.world_from_lidar - shift @ original.world_from_lidar).max() < 1e-6
         assert len(read_points(scene, sweep).xyz) == len(read_points(truth, original).xyz)
     assert any(f"({far[0, 3]:.0f}" in note.replace(".", "")[:60] or "-25" in note for note in scene.source.notes)
-    with pytest.raises(UsageError, match="no such camera"):
-        ingest(source, tmp_path / "c", cameras=("rear",))
+    refused("no such camera", ingest, source, tmp_path / "c", cameras=("rear",), raises=UsageError)
 
 
 def test_images_are_rectified_and_other_lidars_read(bare: made.Log, tmp_path: Path) -> None:
@@ -221,13 +208,13 @@ def test_the_real_frame(shared_data: Callable[[str], Path], tmp_path: Path) -> N
 
 def test_boxes_of_the_real_frame_project_onto_the_recorded_rectangles(shared_data: Callable[[str], Path]) -> None:
     path = shared_data("waymo_frame") / "pvps_data_one_frame.tfrecord"
-    label = messages.Message("Label", {**messages.FRAME.fields[6].message.fields})
-    fields = {1: messages.Field("name", "int"), 2: messages.Field("labels", "messages", label)}
-    per_camera = messages.Message("CameraLabels", fields)
-    message = messages.Message("Frame", {9: messages.Field("projected", "messages", per_camera)})
+    label = records.Message("Label", {**records.FRAME.fields[6].message.fields})
+    fields = {1: records.Field("name", "int"), 2: records.Field("labels", "messages", label)}
+    per_camera = records.Message("CameraLabels", fields)
+    message = records.Message("Frame", {9: records.Field("projected", "messages", per_camera)})
     (place,) = tfrecord.record_places(path)
     with path.open("rb") as file:
-        projected = messages.parse_message(tfrecord.read_record(file, path, place), message, "real")["projected"]
+        projected = records.parse_message(tfrecord.read_record(file, path, place), message, "real")["projected"]
     log = TfrecordLog(path)
     frame = log.frames[0]
     boxes = {box.id: box for box in frame.boxes}
@@ -275,3 +262,387 @@ def test_the_real_table_of_poses(shared_data: Callable[[str], Path]) -> None:
     assert ((steps > 90_000) & (steps < 110_000)).all()
     assert np.allclose(table.value(57, column), found[column][57])
     assert np.allclose(table.value(3, column), found[column][3])
+
+
+def random_pose(generator: np.random.Generator, reach_m: float = 3.0) -> np.ndarray:
+    return from_rotation_translation(
+        matrix_from_quaternion(generator.normal(size=4)), generator.uniform(-reach_m, reach_m, 3)
+    )
+
+
+# --- parts against slow twins ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "data, crc", [(b"123456789", 0xE3069283), (bytes(32), 0x8A9136AA), (b"\xff" * 32, 0x62A8AB43), (b"", 0)]
+)
+def test_crc32c_has_the_published_values(data: bytes, crc: int) -> None:
+    assert tfrecord.crc32c(data) == crc
+
+
+@pytest.mark.parametrize("length", [1, 63, 64, 65, 2319, 2320, 2321, 2328, 3571, 45479, 45480, 45488, 80064, 123457])
+def test_crc32c_folded_equals_byte_by_byte(length: int) -> None:
+    data = np.random.default_rng(length).bytes(length)
+    assert tfrecord.crc32c(data) == made.crc32c_bitwise(data)
+
+
+def test_varints_at_once_equal_varints_one_by_one() -> None:
+    values = np.concatenate(
+        [np.random.default_rng().integers(-(2**40), 2**40, 200), [0, -1, 127, 128, 2**62, -(2**63)], np.arange(300)]
+    )
+    data = b"".join(made.varint(int(value)) for value in values)
+    assert (records.unpack_varints(data, "x") == values).all()
+    refused("cut off", records.unpack_varints, data + b"\x80", "x")
+    refused("ten bytes", records.unpack_varints, b"\x80" * 10 + b"\x01", "x")
+
+
+INNER = records.Message("Inner", {1: records.Field("values", "doubles"), 3: records.Field("counts", "ints")})
+OUTER = records.Message(
+    "Outer",
+    {1: records.Field("name", "text"), 2: records.Field("number", "int"), 4: records.Field("inner", "messages", INNER)},
+)
+
+
+def test_messages_keep_wanted_fields_skip_others_and_take_both_forms_of_lists() -> None:
+    packed = made.text(1, struct.pack("<2d", 1.5, -2)) + made.text(3, made.varint(7) + made.varint(-7))
+    plain = made.doubles(1, [1.5, -2]) + made.number(3, 7) + made.number(3, -7)
+    skipped = made.double(9, 1.0) + made.single(10, 1.0) + made.number(11, 300) + made.text(12, b"?")
+    data = made.text(1, "Straße".encode()) + skipped + made.number(2, -5) + made.text(4, packed) + made.text(4, plain)
+    found = records.parse_message(data, OUTER, "x")
+    assert (found["name"], found["number"], len(found["inner"])) == ("Straße", -5, 2)
+    for inner in found["inner"]:
+        assert inner["values"].tolist() == [1.5, -2]
+        assert inner["counts"].tolist() == [7, -7]
+
+
+@pytest.mark.parametrize(
+    "data, word",
+    [
+        (b"\x0a\x05ab", "5 bytes where 2 are left"),
+        (b"\x0a", "inside a number"),
+        (b"\x0a\xff\xff\xff\xff\xff\xff\xff\x7f", "are left"),
+        (b"\x80" * 11, "ten bytes"),
+        (b"\x0b", "wire type 3"),
+        (b"\x00\x00", "field number 0"),
+        (b"\x10\x80", "inside a number"),
+        (b"\x08\x01", "wire type 0, not 2"),
+        (b"\x0a\x01\xff", "no text"),
+        (b"\x22\x03\x0a\x01\x00", "no multiple of 8"),
+    ],
+)
+def test_broken_messages_are_named(data: bytes, word: str) -> None:
+    caught = refused("message cannot be decoded", records.parse_message, data, OUTER, "file: record 3")
+    assert word in caught.got
+    assert "record 3" in caught.where
+
+
+@given(st.binary(max_size=200))
+def test_no_bytes_raise_anything_but_an_input_error(data: bytes) -> None:
+    for message in (records.FRAME, records.CONTEXT, records.MATRIX_INT):
+        try:
+            records.parse_message(data, message, "x")
+        except InputError:
+            continue
+
+
+@pytest.mark.parametrize("uneven", [True, False])
+@pytest.mark.parametrize("posed", [True, False])
+def test_points_equal_the_conversion_pixel_by_pixel(uneven: bool, posed: bool) -> None:
+    generator = np.random.default_rng(4)
+    rows, columns = 5, 12
+    beams = np.sort(generator.uniform(-0.4, 0.1, rows)) if uneven else ()
+    laser = LaserCalibration("top", tuple(beams), -0.4, 0.1, random_pose(generator))
+    image = generator.uniform(-2, 60, (rows, columns, 4)).astype(np.float32)
+    poses = generator.uniform(-1, 1, (rows, columns, 6)).astype(np.float32) if posed else None
+    frame_pose = random_pose(generator)
+    points = sensors.points_of_scan(LaserScan([image], poses), laser, frame_pose, "x")
+    expected = []
+    heading = np.arctan2(laser.vehicle_from_lidar[1, 0], laser.vehicle_from_lidar[0, 0])
+    for row in range(rows):
+        for column in range(columns):
+            reach = float(image[row, column, 0])
+            if reach <= 0:
+                continue
+            pitch = beams[rows - 1 - row] if uneven else -0.4 + (rows - 1 - row + 0.5) / rows * 0.5
+            azimuth = np.pi * (1 - 2 * (column + 0.5) / columns) - heading
+            local = reach * np.array([np.cos(azimuth) * np.cos(pitch), np.sin(azimuth) * np.cos(pitch), np.sin(pitch)])
+            vehicle = laser.vehicle_from_lidar @ np.r_[local, 1]
+            if poses is not None:
+                roll, tilt, yaw, *place = (float(v) for v in poses[row, column])
+                about_x = np.array([[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]])
+                about_y = np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
+                rotation = yaw_matrix(yaw)[:3, :3] @ about_y @ about_x
+                vehicle = invert(frame_pose) @ from_rotation_translation(rotation, place) @ vehicle
+            expected.append((invert(laser.vehicle_from_lidar) @ vehicle)[:3])
+    assert np.abs(points.xyz - np.array(expected)).max() < 1e-9
+    assert points.without_pose == 0
+
+
+def test_points_without_a_pose_are_left_out_and_counted() -> None:
+    image = np.ones((2, 8, 4), np.float32)
+    poses = np.full((2, 8, 6), 0.1, np.float32)
+    poses[1, 3:] = 0
+    laser = LaserCalibration("top", (), -0.2, 0.1, np.eye(4))
+    points = sensors.points_of_scan(LaserScan([image, image], poses), laser, np.eye(4), "x")
+    assert (points.without_pose, len(points.xyz)) == (10, 22)
+
+
+@pytest.mark.parametrize("start, duration", [(0.0, 0.1), (-0.004, 0.098), (0.1, -0.1)])
+def test_the_turn_is_measured_from_pixel_poses(start: float, duration: float) -> None:
+    def place(time: np.ndarray) -> np.ndarray:
+        return np.stack([100 + 12 * time, 0.3 * time, np.full_like(time, 4.0)], -1)
+
+    poses = np.zeros((4, 100, 6), np.float32)
+    poses[..., 3:] = place(start + (np.arange(100) + 0.5) / 100 * duration)
+    poses[2:, 40:] = 0
+    times = np.arange(-0.1, 0.25, 0.0125)
+    found = sensors.measure_turn(poses, 5.0, times + 5.0, place(times))
+    assert found is not None
+    assert np.abs(np.array(found) - [start, duration]).max() < 1e-5
+    assert sensors.measure_turn(poses, 5.0, times + 5.0, place(times * 1e-3)) is None
+    nominal = sensors.TurnClock()
+    assert (sensors.median_clock([found]) == nominal) == (start == 0.0)
+
+
+def test_a_view_is_that_of_the_middle_of_the_exposure() -> None:
+    pose = yaw_matrix(0.4, (5.0, 6.0, 1.0))
+    velocity = np.array([10.0, -2.0, 0.5, 0, 0, 0.8])
+    shot = CameraShot(pose, 100.0, velocity, 0.002, 99.985, 100.027)
+    moved, time = sensors.middle_of_exposure(shot)
+    late = time - 100.0
+    assert late == pytest.approx(0.006, abs=1e-9)
+    assert np.abs(moved - yaw_matrix(0.4 + 0.8 * late, pose[:3, 3] + velocity[:3] * late)).max() < 1e-12
+    assert sensors.readout_s(shot) == pytest.approx(0.04)
+    unknown = CameraShot(pose, 100.0, None, 0.002, 99.985, 100.027)
+    assert sensors.middle_of_exposure(unknown) == (pose, 100.0)
+
+
+def timed(times: np.ndarray, late: np.ndarray, velocity: np.ndarray, **changes: Any) -> list[records.TimedBoxes]:
+    """An object that drives straight, boxed where it is when it is seen."""
+    frames = []
+    for time, delay in zip(times, late, strict=True):
+        vehicle = yaw_matrix(0.1 * time, (3.0 * time, 0, 0))
+        world = yaw_matrix(0.5, velocity * (time + delay) + [20, 5, 1])
+        local = invert(vehicle) @ world
+        values = {"id": "-a_b", "label": "vehicle", "size_m": (4.0, 2.0, 1.5)} | changes
+        box = WaymoBox(centre=tuple(local[:3, 3]), heading=geometry.yaw_of(local), **values)
+        frames.append(records.TimedBoxes(float(time), vehicle, [box], np.array([delay]), f"frame at {time}"))
+    return frames
+
+
+@pytest.mark.parametrize("late", [np.full(6, 0.03), np.array([0.049, 0.0495, -0.0495, -0.049, -0.04, -0.03])])
+def test_boxes_are_carried_to_the_moment_of_the_points(late: np.ndarray) -> None:
+    times, velocity = np.arange(6) * 0.1, np.array([12.0, -3.0, 0.0])
+    (track,), notes = records.build_tracks(timed(times, late, velocity))
+    assert np.abs(track.world_from_object[:, :3, 3] - (times[:, None] * velocity + [20, 5, 1])).max() < 1e-9
+    assert (track.id, track.label, track.size_m.tolist(), notes) == ("t-a_b", "vehicle", [4.0, 2.0, 1.5], [])
+
+
+def test_tracks_cover_the_images_of_their_frames() -> None:
+    velocity = np.array([12.0, -3.0, 0.0])
+    frames = timed(np.arange(4) * 0.1, np.zeros(4), velocity)
+    frames = [replace(frame, images_s=(frame.time_s - 0.03, frame.time_s + 0.02)) for frame in frames]
+    (track,), _ = records.build_tracks(frames)
+    assert track.times_s == pytest.approx([-0.03, 0, 0.1, 0.2, 0.3, 0.32])
+    assert np.abs(track.world_from_object[:, :3, 3] - (track.times_s[:, None] * velocity + [20, 5, 1])).max() < 1e-9
+    (alone,), _ = records.build_tracks(frames[:1])
+    assert alone.times_s == pytest.approx([-0.03, 0, 0.02])
+    assert np.ptp(alone.world_from_object, axis=0).max() == 0
+
+
+def test_tracks_are_split_at_gaps_and_odd_ones_named() -> None:
+    times = np.array([0, 0.1, 0.2, 1.0, 1.1])
+    tracks, notes = records.build_tracks(timed(times, np.zeros(5), np.zeros(3), label="unknown", id="a"))
+    assert [(track.id, len(track.times_s)) for track in tracks] == [("a", 3), ("a.1", 2)]
+    assert "split" in notes[0]
+    assert "2 boxes have a class that is not known" in notes[1]
+    frames = timed(times, np.zeros(5), np.zeros(3))
+    doubled = records.TimedBoxes(0.0, np.eye(4), [frames[0].boxes[0]] * 2, np.zeros(2), "frame 7")
+    refused("two boxes of one object", records.build_tracks, [doubled])
+
+
+# --- damaged, contradictory and incomplete logs ---------------------------------------------------
+
+
+def milliseconds(log: made.Log) -> None:
+    for frame in log.frames:
+        frame["timestamp_us"] //= 1000
+
+
+def change(item: dict[str, Any], **values: Callable[[Any], Any]) -> None:
+    item.update({name: value(item[name]) for name, value in values.items()})
+
+
+def infinite(log: made.Log) -> None:
+    log.frames[3]["lasers"][0]["returns"][0][0, 0, 0] = np.inf
+
+
+def lacks_an_image(log: made.Log) -> None:
+    log.frames[2]["images"].pop(1)
+
+
+MIRROR, DOUBLE = np.diag([1, -1, 1, 1.0]), np.array([[2.0], [2], [2], [1]])
+BOTH: dict[str, tuple[Callable[[made.Log], object], str]] = {
+    "scale": (lambda log: change(log.cameras[0], extrinsic=lambda pose: pose * DOUBLE), "pose is scaled"),
+    "hand": (lambda log: change(log.lasers[0], extrinsic=lambda pose: pose @ MIRROR), "left-handed"),
+    "unit": (milliseconds, "not of one time"),
+    "image clock": (lambda log: change(log.frames[2]["images"][1], pose_time=lambda t: t * 1e3), "not of one time"),
+    "box": (lambda log: log.frames[1]["boxes"][0].update(size=(4.0, -2.0, 1.5)), "box makes no sense"),
+    "rows": (lambda log: change(log.lasers[0], inclinations=lambda beams: beams[:-1]), "row for every beam"),
+    "numbers": (infinite, "not finite"),
+    "image": (lambda log: change(log.frames[1]["images"][0], image=lambda c: c[:300]), "cannot be decoded"),
+    "camera": (lacks_an_image, "frame lacks images or scans"),
+    "laser": (lambda log: log.frames[2]["lasers"].pop(0), "frame lacks images or scans"),
+    "calibration": (lambda log: log.cameras.pop(1), "no calibration"),
+    "laser calibration": (lambda log: log.lasers[0].update(number=9), "no calibration"),
+    "pixel poses": (lambda log: change(log.frames[2]["lasers"][0], poses=lambda p: p[:, ::2]), "differ in size"),
+    "exposure": (lambda log: log.frames[0]["images"][0].update(shutter=0.5), "exposure times contradict"),
+    "intrinsics": (lambda log: log.cameras[0]["intrinsic"].__setitem__(2, np.nan), "intrinsics"),
+    "two scans": (lambda log: change(log.frames[1], lasers=lambda lasers: lasers[:1] * 2), "two scans of one LiDAR"),
+    "two images": (lambda log: log.frames[1]["images"][1].update(number=1), "two images of one camera"),
+}
+
+
+@pytest.mark.parametrize("form", ["v1", "v2"])
+@pytest.mark.parametrize("case", BOTH)
+def test_what_makes_no_sense_is_refused(case: str, form: str, bare: made.Log, tmp_path: Path) -> None:
+    spoil, words = BOTH[case]
+    spoil(bare)
+    log = write(bare, form, tmp_path / "log")
+    assert str(tmp_path) in refused(words, ingest, log, tmp_path / "scene").where
+    assert list(tmp_path.iterdir()) == [tmp_path / "log"]
+
+
+def test_frames_out_of_order_are_refused_in_one_file_and_sorted_in_tables(bare: made.Log, tmp_path: Path) -> None:
+    bare.frames[1], bare.frames[2] = bare.frames[2], bare.frames[1]
+    refused("timestamps do not increase", ingest, write(bare, "v1", tmp_path / "one"), tmp_path / "a")
+    scene = ingest(write(bare, "v2", tmp_path / "two"), tmp_path / "b")
+    assert [sweep.time_s for sweep in scene.sweeps] == pytest.approx(0.05 + np.arange(5) * 0.1, abs=1e-6)
+    bare.frames[3]["timestamp_us"] = bare.frames[2]["timestamp_us"]
+    refused("a frame twice", ingest, write(bare, "v2", tmp_path / "three"), tmp_path / "c")
+
+
+@pytest.mark.parametrize("form", ["v1", "v2"])
+def test_incomplete_frames_are_left_out_when_asked(form: str, bare: made.Log, tmp_path: Path) -> None:
+    lacks_an_image(bare)
+    bare.frames[4]["lasers"] = []
+    scene = ingest(write(bare, form, tmp_path / "log"), tmp_path / "scene", skip_missing=True)
+    assert len(scene.sweeps) == 3
+    assert any("frames 2, 4 lack" in note for note in scene.source.notes)
+    only = ingest(write(bare, form, tmp_path / "log"), tmp_path / "other", cameras=("front",), frames=(0, 4))
+    assert len(only.frames) == 4  # the missing image is of a camera that was not asked for
+
+
+@pytest.mark.parametrize("form", ["v1", "v2"])
+def test_empty_scans_unknown_sensors_and_classes_are_taken_as_they_are(
+    form: str, bare: made.Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for image in bare.frames[1]["lasers"][0]["returns"]:
+        image[..., 0] = -1
+    bare.frames[0]["boxes"][0]["id"] = "_odd"
+    bare.frames[0]["boxes"][0]["type"] = 9
+    odd = dict(bare.frames[0]["images"][0], number=7)
+    bare.frames[0]["images"].append(odd)
+    bare.frames[0]["lasers"].append({"number": 8, "returns": bare.frames[0]["lasers"][0]["returns"], "poses": None})
+    scene = ingest(write(bare, form, tmp_path / "log"), tmp_path / "scene")
+    assert len(read_points(scene, scene.sweeps[1]).xyz) == 0
+    assert "has no points" in capsys.readouterr().err
+    assert scene.track("t_odd").label == "unknown"
+    assert len(scene.frames) == 10
+    assert len(scene.sweeps) == 5
+
+
+def test_damaged_files_are_named_with_record_and_byte(bare: made.Log, tmp_path: Path) -> None:
+    path = write(bare, "v1", tmp_path / "log")
+    content = path.read_bytes()
+    third = list(tfrecord.record_places(path))[2].offset
+
+    def flipped(at: int) -> bytes:
+        return content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :]
+
+    huge = struct.pack("<Q", 1 << 50)
+    cases = (
+        (content[: third + 500], "cut off"),
+        (content[: third + 5], "cut off"),
+        (flipped(third + 100), "do not fit their checksum"),
+        (flipped(third), "header is damaged"),
+        (content[:third] + huge + struct.pack("<I", made.masked(huge)) + content[third + 12 :], "no frame has"),
+    )
+    for spoilt, word in cases:
+        path.write_bytes(spoilt)
+        assert f"record 2 at byte {third}" in refused(word, ingest, path, tmp_path / "scene").where
+    path.write_bytes(cases[2][0])
+    assert len(ingest(path, tmp_path / "scene", frames=(0, 2)).sweeps) == 2  # what is not asked for need not be whole
+
+
+def test_files_of_another_kind_are_refused(bare: made.Log, tmp_path: Path) -> None:
+    path = tmp_path / "a.tfrecord"
+    for content, word in (
+        (b"<html>not here</html>", "not a TFRecord"),
+        (b"\x1f\x8b" + bytes(40), "compressed"),
+        (b"", "no frames"),
+        (made.record(b"\x0a\x05ab"), "cannot be decoded"),
+        (made.record(b""), "transform is incomplete"),
+    ):
+        path.write_bytes(content)
+        refused(word, ingest, path, tmp_path / "scene")
+    path.write_bytes(b"".join(made.record(made.frame_message(bare, bare.frames[n])) for n in (0, 1)))
+    bare.name = "another"
+    path.write_bytes(path.read_bytes() + made.record(made.frame_message(bare, bare.frames[2])))
+    refused("mixes two logs", ingest, path, tmp_path / "scene")
+    refused("no frames", ingest, path, tmp_path / "scene", frames=(7, 9))
+
+
+def test_range_images_are_unpacked_within_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    float_image = records.float_image
+    whole = made.matrix_float(np.ones((2, 3, 4), np.float32))
+    assert float_image(whole, 4, "x").shape == (2, 3, 4)
+    refused("wrong shape", float_image, whole, 6, "x")
+    refused("cut off", float_image, whole[:-6], 4, "x")
+    refused("cannot be unpacked", float_image, b"nonsense", 4, "x")
+    monkeypatch.setattr(records, "MAX_UNPACKED_BYTES", 1 << 20)
+    bomb = zlib.compress(bytes(2 << 20), 1)
+    refused("unpacks to more", float_image, bomb, 4, "x")
+    lying = made.text(1, bytes(16)) + made.text(2, b"".join(made.number(1, n) for n in (1 << 20, 1 << 20, 4)))
+    refused("wrong shape", float_image, zlib.compress(lying), 4, "x")
+
+
+def test_tables_that_are_missing_or_damaged(bare: made.Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = write(bare, "v2", tmp_path / "log")
+    table = root / "lidar" / f"{bare.name}.parquet"
+    whole = table.read_bytes()
+    table.write_bytes(whole[: len(whole) // 2])
+    refused("table cannot be read", ingest, root, tmp_path / "scene")
+    (root / "lidar_box" / f"{bare.name}.parquet").rename(table)
+    refused("lacks columns", ingest, root, tmp_path / "scene")
+    table.write_bytes(whole)
+    pose = root / "lidar_pose" / f"{bare.name}.parquet"
+    pose.rename(root / "away")
+    refused("pixel poses are missing", ingest, root, tmp_path / "scene")
+    (root / "away").rename(pose)
+    (root / "camera_calibration" / f"{bare.name}.parquet").unlink()
+    refused("a component of the log is missing", ingest, root, tmp_path / "scene")
+    pyarrow = pytest.importorskip("pyarrow")
+    holes = pyarrow.table({"a": [1, None, 3]})
+    pytest.importorskip("pyarrow.parquet").write_table(holes, tmp_path / "holes.parquet")
+    assert refused("empty value", ParquetTable(tmp_path / "holes.parquet").columns, ("a",)).where.endswith("row 1")
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    assert "mudg[data]" in refused("pyarrow", ParquetTable, pose, raises=ResourceError).remedy
+
+
+def test_one_log_of_a_folder_is_chosen_by_name(bare: made.Log, tmp_path: Path) -> None:
+    folder = tmp_path / "logs"
+    names = [f"segment-{n}_with_camera_labels" for n in ("111_2", "222_3")]
+    for name in names:
+        made.write_tfrecord(bare, folder / f"{name}.tfrecord")
+    caught = refused("several logs", ingest, folder, tmp_path / "scene", raises=UsageError)
+    assert all(name in caught.expected for name in names)
+    refused("there is no such log", ingest, folder, tmp_path / "scene", sequence="333", raises=UsageError)
+    assert len(ingest(folder, tmp_path / "scene", sequence="222", frames=(0, 1)).frames) == 2
+    assert RECOGNISERS["waymo"](folder)
+    assert RECOGNISERS["waymo"](folder / f"{names[0]}.tfrecord")
+    assert not RECOGNISERS["waymo"](tmp_path)
+    for options in ({"poses": tmp_path}, {"boxes": tmp_path}, {"untwist": "no"}):
+        with pytest.raises(UsageError):
+            ingest(folder, tmp_path / "other", **options)
+    refused("no Waymo log found", ingest, tmp_path / "scene", tmp_path / "other")

@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from mudg.base import geometry
 from mudg.base.config import build
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, View
 from mudg.base.weather_settings import (
@@ -190,8 +191,7 @@ def test_the_mirror_view_sees_mirrored_points_upside_down() -> None:
 
 def test_planes_of_different_sizes_are_refused() -> None:
     scene = street(forward_view())
-    with pytest.raises(InputError, match="openness"):
-        replace(scene, openness=np.zeros((3, 3), np.float32))
+    refused("openness", replace, scene, openness=np.zeros((3, 3), np.float32))
 
 
 # --- noise ----------------------------------------------------------------------------------------
@@ -439,8 +439,7 @@ def test_a_drive_is_edited_image_by_image() -> None:
     wall = shown[0].classes == ID["building"]
     air = tone.SRGB.encode(drive.surroundings.airlight[None])[0]
     assert np.abs(foggy - air)[wall].mean() < 0.5 * np.abs(shown[0].rgb - air)[wall].mean()
-    with pytest.raises(InputError, match="estimated from views"):
-        weather.drive_facts([], tone.SRGB)
+    refused("estimated from views", weather.drive_facts, [], tone.SRGB)
 
 
 def test_ripples_of_the_ground_are_smoothed_farther_than_those_of_walls() -> None:

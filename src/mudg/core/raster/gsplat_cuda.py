@@ -150,12 +150,12 @@ class _Splats:
     channels: Tensor
 
 
-def render(request: Request, module: ModuleType | None = None) -> Render:
-    """Draw all views. ``module`` stands in for the gsplat package in tests. See ``core.raster.rasterize``."""
+def render(request: Request) -> Render:
+    """Draw all views. See ``core.raster.rasterize``."""
     _refuse(request)
     if not len(request.gaussians):  # gsplat divides by their number
         return torch_twin.render(replace(request, poses=(None,) * len(request.views)))
-    gsplat, g, cameras = module or load(), request.gaussians, _cameras(request)
+    gsplat, g, cameras = load(), request.gaussians, _cameras(request)
     if request.config.alpha_max != ALPHA_MAX:
         log.info_once(f"rasterizer: gsplat caps alpha at {ALPHA_MAX}, not at {request.config.alpha_max}")
     g, colorless = _finite(g)
