@@ -171,7 +171,7 @@ def _address(value: Any) -> Location | None:
     if isinstance(value, Path) and not value.exists():
         found = _IN_A_PATH.match(value.as_posix())
         if found:
-            return Location.of(f"{found[1]}://{'/' if found[1] == 'file' else ''}{value.as_posix()[found.end() :]}")
+            return Location.of(f"{found[1]}://{value.as_posix()[found.end() :]}")
     return None
 
 
