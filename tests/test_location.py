@@ -388,7 +388,7 @@ def test_a_fetch_goes_on_with_the_files_that_are_here(
                 raise KeyboardInterrupt
 
     before(stop)
-    monkeypatch.setattr(location, "_grouped", lambda names: ([name] for name in names))
+    monkeypatch.setattr(location, "_GROUP", 1)
     with pytest.raises(KeyboardInterrupt):
         run.fetch(tmp_path / "back")
     assert not (tmp_path / "back/manifest.json").exists()
