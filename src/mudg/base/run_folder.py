@@ -635,9 +635,8 @@ def refuse_while_others_work(lock: Path, what: Path | None = None) -> None:
 # result file --------------------------------------------------------------------------------------
 #
 # Beside the file OUT (or a second form of it, such as the folder of a large page) lies OUT.json, its description: verb,
-# key of settings and inputs, SHA-256, and what else the verb says. Whoever finds a file finds the description of just
-# this file: an older file leaves before the new description gets its name, and the new file gets its name last. What a
-# stop leaves in between is completed, or undone, by the next command that writes there.
+# key of settings and inputs, SHA-256, and what else the verb says. The description gets its name first and the file its
+# last, so that the same command completes what a stop leaves in between.
 
 
 def description_path(out: Path) -> Path:
@@ -655,8 +654,6 @@ class ResultFile:
         self.out, self.verb, self.key = out, verb, key
         self.complete = False
         self._forms = tuple(forms) or (out,)
-        self._unknown = False
-        """Whether a file without a description is there: it may be this very result, and is compared with it."""
 
     @classmethod
     @contextlib.contextmanager
@@ -678,14 +675,12 @@ class ResultFile:
 
         Raises:
             UsageError: another result, or somebody else's file, is there. IntegrityError: the finished result was
-                altered.
-            ResourceError: it cannot be written, or another live process is writing it.
+                altered. ResourceError: it cannot be written, or another live process is writing it.
         """
         key = hashlib.sha256(store.json_text([verb, dict(settings), dict(inputs)], indent=None).encode()).hexdigest()
         result = cls(Path(out), verb, key, forms)
         with locked(_lock_path(out), out):
             try:
-                result._recover()
                 result._examine(overwrite)
                 yield result
             finally:
@@ -702,26 +697,18 @@ class ResultFile:
         return form.with_name(f".{form.name}.new.part{form.suffix}")
 
     def finish(self, about: Mapping[str, Any], form: Path | None = None) -> Path:
-        """Give what was made its name, and its description; returns where it lies.
-
-        Raises:
-            UsageError: a file that nothing describes is there, and it is another.
-        """
+        """Give what was made its description, and its name; returns where it lies."""
         form = form or self.out
-        old = [one for one in self._forms if os.path.lexists(one)]
         values = {"schema": 1, "verb": self.verb, "key": self.key, "file": form.name}
         values |= {"sha256": store.digest(self.staged(form)), **about}
-        if self._unknown and (old != [form] or store.digest(form) != values["sha256"]):
-            raise UsageError("the file exists", where=str(old[0]), remedy="choose another --out, or add --overwrite")
         with store.disk_errors("the result cannot get its name", form):
-            if self._unknown:
-                store.write_json(description_path(self.out), values)
-                log.info(f"{self.verb}: {form} was there, and is the same")
-                return form
-            for one in old:
-                one.rename(self._retired(one))
             store.write_json(description_path(self.out), values)
-            self.staged(form).rename(form)
+            for one in self._forms:
+                if one.is_dir():
+                    shutil.rmtree(one)
+                elif one != form:
+                    one.unlink(missing_ok=True)
+            self.staged(form).replace(form)
             store.fsync_directory(form.parent)
         return form
 
@@ -730,9 +717,6 @@ class ResultFile:
         form = next(filter(os.path.lexists, self._forms))
         log.info(f"{self.verb}: reused {form} (verified)")
         return form
-
-    def _retired(self, form: Path) -> Path:
-        return form.with_name(f".{form.name}.old.part{form.suffix}")
 
     def description(self) -> dict[str, Any]:
         """What ``OUT.json`` says; empty where it is missing or somebody else's."""
@@ -751,34 +735,16 @@ class ResultFile:
                 what = "a file was altered after it was written"
                 remedy = "add --overwrite to make it again, or choose another --out"
                 raise IntegrityError(what, where=str(there[0]), expected=f"sha256 {about['sha256']}", remedy=remedy)
-        elif not overwrite:
-            self._unknown = bool(there) and not os.path.lexists(file)
-            blocked = (not there and not about and os.path.lexists(file)) or (there and not self._unknown)
-            if blocked:
-                got = "a result of other settings or inputs" if about else "a file of something else"
-                remedy = "choose another --out, or add --overwrite"
-                raise UsageError("the file exists", where=str(there[0] if there else file), got=got, remedy=remedy)
-
-    def _recover(self) -> None:
-        """Complete a ``finish`` that was cut off after its description was written, undo one that was before."""
-        if any(os.path.lexists(one) for one in self._forms):
-            return
-        wanted = self.description().get("sha256")
-        for one in self._forms:
-            if self.staged(one).exists() and store.digest(self.staged(one)) == wanted:
-                self.staged(one).rename(one)
-                return
-        for one in self._forms:
-            if os.path.lexists(self._retired(one)):
-                self._retired(one).rename(one)
+        elif not overwrite and (there or (os.path.lexists(file) and not about)):
+            got = "a result of other settings or inputs" if about else "a file of something else"
+            remedy = "choose another --out, or add --overwrite"
+            raise UsageError("the file exists", where=str([*there, file][0]), got=got, remedy=remedy)
 
     def _tidy(self) -> None:
         """Remove what this and earlier, killed commands left: no other is at work here."""
         targets = (*self._forms, description_path(self.out), _lock_path(self.out))
         names = [re.escape(f".{one.stem}.") + r"[a-z0-9_]{8}\.part" + re.escape(one.suffix) for one in targets]
-        for one in self._forms:
-            staged = re.escape(self.staged(one).name.removesuffix(one.suffix))
-            names += [re.escape(self._retired(one).name), rf"\.?{staged}.*"]
+        names += [rf"\.?{re.escape(self.staged(one).name.removesuffix(one.suffix))}.*" for one in self._forms]
         left = re.compile("|".join(names))
         with contextlib.suppress(OSError):  # an error may have brought us here, and that one is to be told
             for one in [one for one in self.out.parent.iterdir() if left.fullmatch(one.name)]:
