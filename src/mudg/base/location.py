@@ -49,11 +49,8 @@ def scheme_of(text: str) -> str:
 
 
 def checked_address(text: str) -> str:
-    """An address in its one spelling: no slash at the end, none doubled.
-
-    Raises:
-        UsageError: an unknown scheme, no bucket, credentials or a query in it (which are not shown), or ``..``.
-    """
+    """An address in its one spelling: no slash at the end, none doubled. UsageError: an unknown scheme, no bucket,
+    credentials or a query in it (which are not shown), or ``..``."""
     scheme = scheme_of(text)
     rest = text[len(scheme) + 3 :]
     if scheme not in PACKAGES:
@@ -218,21 +215,16 @@ def _files_below(folder: Path) -> list[str]:
 
 @dataclass(frozen=True)
 class Location:
-    """A file or folder on this machine, or in an object store. Made by ``Location.of``.
-
-    Every method raises ResourceError where the store or the disk fails.
-    """
+    """A file or folder on this machine, or in an object store. Made by ``Location.of``. Every method raises
+    ResourceError where the store or the disk fails."""
 
     text: str
     """The path, or the address in its one spelling. It never holds credentials."""
 
     @classmethod
     def of(cls, given: str | Path | Location) -> Location:
-        """A location from what a user gave.
-
-        Raises:
-            UsageError: an address of an unknown kind, or one with credentials in it.
-        """
+        """A location from what a user gave. UsageError: an address of an unknown kind, or one with credentials in
+        it."""
         if isinstance(given, Location):
             return given
         text = given.as_posix() if isinstance(given, Path) else str(given)
@@ -310,15 +302,8 @@ class Location:
         return {paths[path.lstrip("/")]: content for path, content in answers.items() if isinstance(content, bytes)}
 
     def save(self, data: bytes, *, only_if_absent: bool = False) -> bool:
-        """Write a file completely or not at all.
-
-        Args:
-            only_if_absent: write only where nothing is. Of several that do so at once one gets True, if the store
-                honours conditional writes (S3: ``If-None-Match``).
-
-        Returns:
-            False if ``only_if_absent`` and somebody else made the file.
-        """
+        """Write a file completely or not at all; False if ``only_if_absent`` and something is there. Of several that do
+        so at once one gets True, if the store honours conditional writes (S3: ``If-None-Match``)."""
         if self.local is not None:
             if only_if_absent:
                 return store.create_once(self.local, data)
@@ -387,15 +372,9 @@ class Location:
         return Upload(complete, {_plain(name, str(record)): one for name, one in files.items()})
 
     def fetch(self, to: Path, *, mirror: bool = False) -> None:
-        """Stage a file or folder in. Files that an earlier, interrupted fetch brought are used again.
-
-        Args:
-            mirror: remove files below ``to`` that are not part of the folder: those of an earlier version.
-
-        Raises:
-            InputError: nothing is there, or its upload was not finished. IntegrityError: what came is not what was
-                uploaded.
-        """
+        """Stage a file or folder in. Files that an earlier, interrupted fetch brought are used again. mirror: remove
+        files below ``to`` that are not part of the folder. InputError: nothing is there, or its upload was not
+        finished. IntegrityError: what came is not what was uploaded."""
         to, (kind, bytes_there) = Path(to), self._facts()
         if not kind:
             remedy = "check it, and whether its upload was finished"
@@ -463,16 +442,10 @@ class Location:
         return wanted
 
     def push(self, frm: Path) -> None:
-        """Upload a folder: all files, several at a time, the manifest last. Files that are there already are not sent
-        again.
-
-        Until the manifest is there, what is at this place is no result. Files of an earlier push that are no longer
-        part of the folder are removed; files of others stay.
-
-        Raises:
-            InputError: no folder. UsageError: files of others have the same names. IntegrityError: a file did not
-                arrive.
-        """
+        """Upload a folder: all files, several at a time, the manifest last; until it is there, what is at this place is
+        no result. Files that are there already are not sent again; those of an earlier push that are no longer part of
+        the folder are removed; files of others stay. InputError: no folder. UsageError: files of others have the same
+        names. IntegrityError: a file did not arrive."""
         frm = Path(frm)
         if not frm.is_dir():
             raise InputError("no folder to upload", where=str(frm))

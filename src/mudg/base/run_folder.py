@@ -60,11 +60,8 @@ class Replacement:
         return store.retired_path(self.folder)
 
     def begin(self) -> Path:
-        """Make the staging folder, or take up the one that is there; returns it.
-
-        Raises:
-            ResourceError: the folder is a mount point, or its parent cannot be written.
-        """
+        """Make the staging folder, or take up the one that is there; returns it. ResourceError: the folder is a mount
+        point, or its parent cannot be written."""
         if os.path.ismount(self.folder):
             remedy = "choose an --out inside it"
             raise ResourceError("a mount point cannot be replaced", where=str(self.folder), remedy=remedy)
@@ -73,11 +70,8 @@ class Replacement:
         return self.staging
 
     def swap(self, own_names: OwnNames) -> None:
-        """Put the finished staging folder in the place of the folder, and remove the old result.
-
-        Raises:
-            ResourceError: a folder cannot be renamed; old and new content are both still there.
-        """
+        """Put the finished staging folder in the place of the folder, and remove the old result. ResourceError: a
+        folder cannot be renamed; old and new content are both still there."""
         try:
             if self.folder.exists():
                 self.folder.rename(self.retired)
@@ -92,14 +86,8 @@ class Replacement:
         self._remove_retired(own_names)
 
     def recover(self, is_finished: Callable[[Path], bool], own_names: OwnNames) -> None:
-        """Complete, or undo, a ``swap`` that was cut off by a crash; without one nothing happens.
-
-        Args:
-            is_finished: whether a folder holds a finished, unaltered result.
-
-        Raises:
-            UsageError: old and new content lie side by side in a way that no crash leaves.
-        """
+        """Complete, or undo, a ``swap`` that was cut off by a crash. is_finished: whether a folder holds a finished,
+        unaltered result. UsageError: old and new content lie side by side in a way that no crash leaves."""
         if not self.retired.is_dir():
             return
         if self.folder.is_dir() and not any(self.folder.iterdir()):
@@ -173,17 +161,9 @@ _LONGEST_NAME, _LONGEST_PATH = 230, 3800
 
 
 def refuse_overlap(out: Path | str | Sequence[Path], inputs: Mapping[str, Path | str | None]) -> None:
-    """Refuse an output that is, holds or lies in an input. To be called before anything is written.
-
-    Links, ``..`` and, where the file system does not tell them apart, upper and lower case make no difference.
-
-    Args:
-        out: folder to write, or several; it need not exist.
-        inputs: name for messages -> file or folder that is read (None or empty: not given).
-
-    Raises:
-        UsageError: they overlap, or an output cannot be.
-    """
+    """UsageError for an output that is, holds or lies in an input, or that cannot be. To be called before anything is
+    written. Links, ``..`` and, where the file system does not tell them apart, upper and lower case make no difference.
+    inputs: name for messages -> file or folder that is read (None or empty: not given)."""
     outs = [out] if isinstance(out, Path | str) else out
     for one in outs:
         _refuse_impossible(one)
@@ -283,11 +263,8 @@ def is_temporary(name: str) -> bool:
 
 
 def run_state(folder: Path) -> dict[str, Any]:
-    """What ``run.json`` says; empty if the folder is missing or holds nothing.
-
-    Raises:
-        UsageError: the folder holds something else than a run.
-    """
+    """What ``run.json`` says; empty if the folder is missing or holds nothing. UsageError: it holds something else than
+    a run."""
     what, empty = "the output folder holds files of something else", "choose an empty --out"
     refused = UsageError(what, where=str(folder), remedy=empty)
     if not folder.is_dir():
@@ -337,11 +314,7 @@ def _owner(lock: Path) -> tuple[int, str] | None:
 
 def own_names(output: VerbOutput, folder: Path) -> list[str]:
     """Names of the files in a run folder that the run made, the bookkeeping last: those that its manifest lists, of an
-    unfinished one those that its verb may write.
-
-    Args:
-        output: speaks for an unfinished run of its verb that did not note what it may write.
-    """
+    unfinished one those that its verb may write. output: speaks for an unfinished run of its verb."""
     try:
         state = run_state(folder)
     except UsageError:
@@ -604,11 +577,7 @@ def locked(lock: Path, what: Path | None = None) -> Iterator[None]:
 
 def take_lock(lock: Path, what: Path | None = None) -> None:
     """Write this process into a lock: that of a file ``what``, else of the folder in which the lock lies. Of several
-    that try at the same moment one succeeds.
-
-    Raises:
-        ResourceError: another live process of this machine holds it.
-    """
+    that try at the same moment one succeeds. ResourceError: another live process of this machine holds it."""
     store.make_folder(lock.parent)
     folder = os.open(lock.parent, os.O_RDONLY) if fcntl is not None else -1
     try:
@@ -646,9 +615,7 @@ def description_path(out: Path) -> Path:
 
 class ResultFile:
     """The output file of one verb, for this process alone. Make it at ``staged(form)``, then call ``finish``.
-
-    ``complete`` is True where the same command has finished before and the file is as it was written.
-    """
+    ``complete``: the same command has finished before and the file is as it was written."""
 
     def __init__(self, out: Path, verb: str, key: str, forms: Sequence[Path]) -> None:
         self.out, self.verb, self.key = out, verb, key
