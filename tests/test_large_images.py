@@ -8,7 +8,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mudg.base.crop import cropped
 from mudg.base.errors import ResourceError
 from mudg.base.types import Camera, Condition, Trajectory, View
 from mudg.core import metrics
@@ -136,7 +135,7 @@ def test_tiles_of_a_condition_are_those_of_the_whole() -> None:
     one = lambda *shape: torch.rand(*shape, generator=noise)
     planes = (one(2, 3, 36, 44), one(2, 1, 36, 44), one(2, 1, 36, 44) > 0.5, one(3, 36, 44))
     whole = Condition(views, *planes, backdrop=one(2, 3, 36, 44))
-    part = cropped(whole, slice(4, 20), slice(8, 40))
+    part = whole.cropped(slice(4, 20), slice(8, 40))
     for name in ("color", "backdrop"):
         assert torch.equal(getattr(part, name), getattr(whole, name)[..., 4:20, 8:40])
     assert part.warped is None and {(v.camera.width, v.camera.height) for v in part.views} == {(32, 16)}

@@ -11,7 +11,7 @@ from toy_clips import losses_of, with_settings, write_clips
 from toy_published import published_settings, write_tiny
 from toy_scene import ToyStreet
 
-from mudg.base import crop, palette
+from mudg.base import palette
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Condition, SparseDepth
 from mudg.diffusion import city_clips, convert, learn, log_clips, models, published
@@ -248,7 +248,7 @@ def test_clips_of_logs_show_points_alone(street, tmp_path):
     assert torch.isin(filled, points.depth[points.valid].half().float()).all()
     assert torch.equal(given.measured.valid, points.valid)
     assert torch.allclose(given.measured.depth[points.valid], points.depth[points.valid], rtol=1e-3)
-    cut = crop.cropped(given, slice(3, 9), slice(1, 8)).measured
+    cut = given.cropped(slice(3, 9), slice(1, 8)).measured
     assert torch.equal(cut.depth, given.measured.depth[..., 3:9, 1:8])
     varied = (clip_shards.vary(read, np.random.default_rng(n)) for n in range(20))
     seen = next(one for one in varied if not torch.equal(one.depth, read.depth))

@@ -78,11 +78,6 @@ class CameraColors:
         found = self.to_common.get(camera)
         return rgb if found is None else found.of_bytes(rgb)
 
-    def bytes_of(self, camera: str, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Common colours u8[..., 3] as a camera shows them."""
-        found = self.to_common.get(camera)
-        return rgb if found is None else found.inverse().of_bytes(rgb)
-
     def record(self) -> dict[str, Any]:
         """As JSON values; inverse of ``of_record``."""
         values = lambda m: {"gain": list(m.gain), "offset": list(m.offset), "pairs": m.pairs}

@@ -28,15 +28,9 @@ if TYPE_CHECKING:
 def write_shards(
     folder: Path, tensors: Mapping[str, Tensor], shard_bytes: int, dtype: torch.dtype | None = None
 ) -> dict[str, str]:
-    """Write tensors, on any device, as `weights_NN.safetensors` of at most about `shard_bytes` each; returns file name
-    -> sha256.
-
-    Args:
-        folder: a tree under a temporary name (`store.atomic_directory`).
-        dtype: number format of floating-point tensors (None: as they are).
-
-    Memory: one shard twice over.
-    """
+    """Write tensors, on any device, as `weights_NN.safetensors` of at most about `shard_bytes` each to a tree under a
+    temporary name; returns file name -> sha256. dtype: of floating-point tensors (None: as they are). Memory: one shard
+    twice over."""
     from safetensors.torch import save as safetensors_bytes
 
     files: dict[str, str] = {}
@@ -76,15 +70,9 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def read_shards(folder: Path, files: object, *, remedy: str = "make the model again") -> dict[str, Tensor]:
-    """The tensors of files written by `write_shards`, checked against their sha256.
-
-    Args:
-        files: what a description says: names of files -> sha256.
-
-    Raises:
-        InputError: `files` are no such names. IntegrityError: a file is missing or altered; `remedy` says what to do
-            then.
-    """
+    """The tensors of files written by `write_shards`, checked against their sha256. files: what a description says:
+    names -> sha256. InputError: it says no such thing. IntegrityError: a file is missing or altered; `remedy` says what
+    to do."""
     tensors: dict[str, Tensor] = {}
     if not isinstance(files, Mapping) or not all(isinstance(digest, str) for digest in files.values()):
         what = "the description of a model does not name its weight files"
@@ -126,14 +114,8 @@ class Checkpoint:
 def save(
     folder: Path, step: int, tensors: Mapping[str, Mapping[str, Tensor]], state: Mapping[str, Any], keep: int = 2
 ) -> Path:
-    """Write checkpoint ``step`` under ``folder`` and remove the oldest beyond ``keep`` (never fewer than two).
-
-    Args:
-        folder: holds one directory per step.
-        step: number of finished steps.
-        tensors: group name -> (tensor name -> tensor); one safetensors file per group.
-        state: JSON-serialisable facts.
-    """
+    """Write checkpoint ``step`` (finished steps) under ``folder`` and remove the oldest beyond ``keep`` (never fewer
+    than two). tensors: group -> name -> tensor, one file per group. state: JSON-serialisable facts."""
     with writing(folder, step, state, keep) as partial:
         for name, group in tensors.items():
             store.write_safetensors(partial / f"{name}.safetensors", dict(group))
@@ -188,11 +170,8 @@ def _path(folder: Path, step: int) -> Path:
 
 
 def latest(folder: Path) -> Checkpoint | None:
-    """The newest checkpoint that verifies; None if there is none at all.
-
-    Raises:
-        IntegrityError: checkpoints exist but not one verifies (nothing is deleted).
-    """
+    """The newest checkpoint that verifies; None if there is none at all. IntegrityError: checkpoints exist but not one
+    verifies (nothing is deleted)."""
     steps = (path for path in folder.glob(f"{_PREFIX}*") if path.is_dir())
     candidates = sorted((path for path in steps if path.name[len(_PREFIX) :].isdigit()), reverse=True)
     problems = []

@@ -43,10 +43,7 @@ class Limits:
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(setting,))
 def settings(cls: type[Config]) -> type[Config]:
     """Make a class a frozen dataclass whose values pydantic checks, all but those of ``Class()`` and of ``changed``.
-
-    pydantic is imported at the first check: help, which shows defaults and presets, does without. A default that is
-    itself a configuration is a ``default_factory``.
-    """
+    pydantic is imported at the first check. A default that is itself a configuration is a ``default_factory``."""
     config_type: Any = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
     with_defaults: Callable[[Any], None] = config_type.__init__
 
@@ -114,11 +111,8 @@ def load(
     overrides: Mapping[str, Any] | None = None,
 ) -> Config:
     """Build a configuration from a preset (default: the type's defaults), then a YAML file, then nested overrides.
-
-    Raises:
-        UsageError: unknown key (the nearest name is suggested), wrong type or value out of range.
-        InputError: the YAML file is missing or malformed.
-    """
+    UsageError: unknown key (the nearest is suggested), wrong type or range. InputError: the file is missing or
+    malformed."""
     usual = config_type() if preset is None else preset
     if yaml_path is None and not overrides:
         return usual

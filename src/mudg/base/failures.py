@@ -39,10 +39,7 @@ _DISK: Final = {
 
 def in_words(error: BaseException, smaller: str = "") -> MudgError | None:
     """What a user can make of an error that this program did not raise; None for one that is a mistake in the program.
-
-    Args:
-        smaller: the settings that make the work need less memory.
-    """
+    smaller: the settings that make the work need less memory."""
     from concurrent.futures.process import BrokenProcessPool  # late: --help needs no processes
 
     if isinstance(error, MudgError):

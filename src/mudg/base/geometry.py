@@ -167,13 +167,9 @@ def yaw_of(world_from_object: Matrix) -> float:
 
 
 def pinhole(intrinsics: Iterable[Any], x: Any, y: Any, z: Any) -> tuple[Any, Any]:
-    """Pixels (u, v) of camera coordinates: ``(fx x / z + cx, fy y / z + cy)``. The one pinhole formula of the package;
-    its twins are the native library's and ``core.zbuffer``'s, which repeats that one in float32.
-
-    Args:
-        intrinsics: fx, fy, cx, cy (``Camera.intrinsics``).
-        x, y, z: arrays or tensors that broadcast, metres; z must not be 0.
-    """
+    """Pixels (u, v) of camera coordinates (arrays or tensors that broadcast, metres, z not 0): ``(fx x / z + cx, fy y /
+    z + cy)``. intrinsics: ``Camera.intrinsics``. The one pinhole formula of the package; its twins are the native
+    library's and ``core.zbuffer``'s, which repeats that one in float32."""
     fx, fy, cx, cy = intrinsics
     return fx * x / z + cx, fy * y / z + cy
 
@@ -190,15 +186,11 @@ def pixel_rays(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]
 
 
 def project(view: View, xyz_world: NDArray[np.floating]) -> tuple[Matrix, Matrix]:
-    """Pinhole projection of world points.
+    """Pinhole projection of world points ``[N, 3]`` in metres, without lens distortion (images are rectified on
+    import).
 
-    Args:
-        view: camera and pose; lens distortion is not applied (images are rectified on import).
-        xyz_world: ``[N, 3]`` metres.
-
-    Returns:
-        ``uv`` f64[N, 2] pixels (the top-left pixel spans [0, 1) x [0, 1)) and depth ``z`` f64[N] metres. Points with
-        z <= 0 lie behind the camera; their uv is not meaningful and set to NaN.
+    Returns ``uv`` f64[N, 2] pixels (the top-left pixel spans [0, 1) x [0, 1); NaN for points behind the camera) and
+    depth ``z`` f64[N] metres.
     """
     camera = view.camera
     xyz_cam = transform_points(view.cam_from_world, np.asarray(xyz_world, np.float64))
@@ -226,12 +218,8 @@ def box_corners(size_m: ArrayLike) -> Matrix:
 
 
 def box_hull(view: View, world_from_box: Matrix, size_m: ArrayLike, near_m: float = 0.3) -> ConvexHull | None:
-    """Convex outline, in pixels, of what a view shows of a box: that part of it which is at least ``near_m`` ahead.
-
-    Returns:
-        The hull of the projected corners (of a cut box also of the points where its edges cross the near plane), or
-        None if it lies outside the image.
-    """
+    """Convex outline, in pixels, of what a view shows of a box: of its projected corners, or, of a box cut ``near_m``
+    ahead of the camera, also of the points where its edges are cut. None if it lies outside the image."""
     from scipy.spatial import ConvexHull, QhullError  # late: most of what imports this module needs no scipy
 
     camera = view.camera

@@ -82,11 +82,8 @@ def csv_text(heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def best_of(better: str, numbers: Mapping[str, float]) -> list[str]:
-    """Names of the best of the numbers as they are shown; none where there are fewer than two.
-
-    Args:
-        better: ``higher``, ``lower``, or ``one``: those near 1.
-    """
+    """Names of the best of the numbers as they are shown; none where there are fewer than two. better: ``higher``,
+    ``lower``, or ``one``: those near 1."""
     apart = {name: {"higher": -number, "one": abs(number - 1)}.get(better, number) for name, number in numbers.items()}
     return [name for name, number in apart.items() if number == min(apart.values())] if len(apart) > 1 else []
 
@@ -98,11 +95,8 @@ TONES: Final = ("truth", "nearest_fill", "street_gaussians", "mudg_r", "mudg_s")
 
 
 def render(template: str, **values: Any) -> str:
-    """The text of a page.
-
-    Args:
-        template: file name in ``assets/templates``. values: what the template names; one that is missing is an error.
-    """
+    """The text of a page from a file in ``assets/templates`` and the values that it names; one that is missing is an
+    error."""
     return _environment().get_template(template).render(**values)
 
 

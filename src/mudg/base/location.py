@@ -19,7 +19,7 @@ import os
 import re
 import shutil
 import ssl
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
@@ -36,11 +36,10 @@ PACKAGES: Final[Mapping[str, tuple[str, str]]] = {
 }
 """Scheme of an address -> the package that reads it, and the extra of this program that installs it."""
 CONTENTS: Final = "_contents.json"
-_FILES_AT_ONCE: Final = 8
-_CHUNK: Final = 8 << 20
-"""Bytes of one part of a large upload; S3 takes 10,000 parts."""
+_FILES_AT_ONCE, _GROUP, _CHUNK = 8, 32, 8 << 20
+"""Files that are under way at once, files of one request to fsspec, and bytes of a part of a large upload."""
 _LEFT_FREE: Final = 64 << 20
-_FLATTENED = re.compile(rf"({'|'.join(PACKAGES)}|file):/(?!/)")
+_FLATTENED = re.compile(rf"({'|'.join(PACKAGES)}):/(?!/)")
 
 
 def scheme_of(text: str) -> str:
@@ -50,11 +49,8 @@ def scheme_of(text: str) -> str:
 
 
 def checked_address(text: str) -> str:
-    """An address in its one spelling: no slash at the end, none doubled.
-
-    Raises:
-        UsageError: an unknown scheme, no bucket, credentials or a query in it (which are not shown), or ``..``.
-    """
+    """An address in its one spelling: no slash at the end, none doubled. UsageError: an unknown scheme, no bucket,
+    credentials or a query in it (which are not shown), or ``..``."""
     scheme = scheme_of(text)
     rest = text[len(scheme) + 3 :]
     if scheme not in PACKAGES:
@@ -180,6 +176,11 @@ class Expected:
     size: int
     sha256: str = ""
 
+    def is_at(self, path: Path) -> bool:
+        """Whether a file is known to be this one."""
+        known = bool(self.sha256) and path.is_file() and path.stat().st_size == self.size
+        return known and store.sha256_file(path) == self.sha256
+
 
 @dataclass(frozen=True)
 class Upload:
@@ -214,37 +215,24 @@ def _files_below(folder: Path) -> list[str]:
 
 @dataclass(frozen=True)
 class Location:
-    """A file or folder on this machine, or in an object store. Made by ``Location.of``.
-
-    Every method raises ResourceError where the store or the disk fails.
-    """
+    """A file or folder on this machine, or in an object store. Made by ``Location.of``. Every method raises
+    ResourceError where the store or the disk fails."""
 
     text: str
     """The path, or the address in its one spelling. It never holds credentials."""
 
     @classmethod
     def of(cls, given: str | Path | Location) -> Location:
-        """A location from what a user gave.
-
-        Raises:
-            UsageError: an address of an unknown kind, or one with credentials in it.
-        """
+        """A location from what a user gave. UsageError: an address of an unknown kind, or one with credentials in
+        it."""
         if isinstance(given, Location):
             return given
         text = given.as_posix() if isinstance(given, Path) else str(given)
         if isinstance(given, Path) and _FLATTENED.match(text):  # what Path makes of s3://bucket
-            text = text.replace(":/", ":///" if text.startswith("file:") else "://", 1)
-        scheme = scheme_of(text)
+            text = text.replace(":/", "://", 1)
         if not text:
             raise UsageError("no path or address was given")
-        if scheme == "file":
-            from urllib.parse import unquote
-
-            host, _, path = text[len("file://") :].partition("/")
-            if host not in ("", "localhost"):
-                raise UsageError("a file address names another machine", where=text[:200], expected="file:///folder")
-            text, scheme = unquote(f"/{path}"), ""
-        return cls(checked_address(text) if scheme else os.path.normpath(text))
+        return cls(checked_address(text) if scheme_of(text) else os.path.normpath(text))
 
     def __truediv__(self, name: str) -> Location:
         """What lies below, by a relative name."""
@@ -314,15 +302,8 @@ class Location:
         return {paths[path.lstrip("/")]: content for path, content in answers.items() if isinstance(content, bytes)}
 
     def save(self, data: bytes, *, only_if_absent: bool = False) -> bool:
-        """Write a file completely or not at all.
-
-        Args:
-            only_if_absent: write only where nothing is. Of several that do so at once one gets True, if the store
-                honours conditional writes (S3: ``If-None-Match``).
-
-        Returns:
-            False if ``only_if_absent`` and somebody else made the file.
-        """
+        """Write a file completely or not at all; False if ``only_if_absent`` and something is there. Of several that do
+        so at once one gets True, if the store honours conditional writes (S3: ``If-None-Match``)."""
         if self.local is not None:
             if only_if_absent:
                 return store.create_once(self.local, data)
@@ -391,21 +372,15 @@ class Location:
         return Upload(complete, {_plain(name, str(record)): one for name, one in files.items()})
 
     def fetch(self, to: Path, *, mirror: bool = False) -> None:
-        """Stage a file or folder in. Files that an earlier, interrupted fetch brought are used again.
-
-        Args:
-            mirror: remove files below ``to`` that are not part of the folder: those of an earlier version.
-
-        Raises:
-            InputError: nothing is there, or its upload was not finished. IntegrityError: what came is not what was
-                uploaded.
-        """
+        """Stage a file or folder in. Files that an earlier, interrupted fetch brought are used again. mirror: remove
+        files below ``to`` that are not part of the folder. InputError: nothing is there, or its upload was not
+        finished. IntegrityError: what came is not what was uploaded."""
         to, (kind, bytes_there) = Path(to), self._facts()
         if not kind:
             remedy = "check it, and whether its upload was finished"
             raise InputError("nothing is at this address", where=self.text, remedy=remedy)
         wanted = self._wanted() if kind == "directory" else {"": Expected(bytes_there)}
-        missing = [name for name, one in wanted.items() if not (one.sha256 and _is(to / name if name else to, one))]
+        missing = [name for name, one in wanted.items() if not one.is_at(to / name if name else to)]
         missing.sort(key=lambda name: (PurePosixPath(name).name in (store.MANIFEST, store.RUN_STATE), name))
         size = sum(wanted[name].size for name in missing)
         free = shutil.disk_usage(next(one for one in (to.absolute(), *to.absolute().parents) if one.exists())).free
@@ -416,10 +391,18 @@ class Location:
             raise ResourceError(what, where=str(to), expected=expected, got=got, remedy=remedy)
         store.make_folder(to if kind == "directory" else to.parent)
         with log.task(f"fetching {self}", len(missing)) as bar:
-            for names in _grouped(missing):
-                places = {name: to / name if name else to for name in names}
+            for first in range(0, len(missing), _GROUP):
+                places = {name: to / name if name else to for name in missing[first : first + _GROUP]}
                 parts = {name: at.with_name(f".{at.name}.fetching.part") for name, at in places.items()}
-                self._get(parts)
+                if self.local is not None:
+                    for name, part in parts.items():
+                        store.copy_in_tree(self.local / name, part)
+                else:
+                    for part in parts.values():
+                        store.make_folder(part.parent)
+                    sources = [f"{self._path}/{name}" if name else self._path for name in parts]
+                    with _in_words("fetching", self.text, "a file was removed while it was fetched"):
+                        self._files.get(sources, [str(part) for part in parts.values()], batch_size=_FILES_AT_ONCE)
                 for name, part in parts.items():
                     size, sha256 = part.stat().st_size, store.sha256_file(part) if wanted[name].sha256 else ""
                     if wanted[name] != Expected(size, sha256):
@@ -458,28 +441,11 @@ class Location:
                     wanted[full] = Expected(sizes[full], str(entry["sha256"]))
         return wanted
 
-    def _get(self, parts: Mapping[str, Path]) -> None:
-        if self.local is not None:
-            for name, part in parts.items():
-                store.copy_in_tree(self.local / name if name else self.local, part)
-            return
-        for part in parts.values():
-            store.make_folder(part.parent)
-        sources = [f"{self._path}/{name}" if name else self._path for name in parts]
-        with _in_words("fetching", self.text, "a file was removed while it was fetched"):
-            self._files.get(sources, [str(part) for part in parts.values()], batch_size=_FILES_AT_ONCE)
-
     def push(self, frm: Path) -> None:
-        """Upload a folder: all files, several at a time, the manifest last. Files that are there already are not sent
-        again.
-
-        Until the manifest is there, what is at this place is no result. Files of an earlier push that are no longer
-        part of the folder are removed; files of others stay.
-
-        Raises:
-            InputError: no folder. UsageError: files of others have the same names. IntegrityError: a file did not
-                arrive.
-        """
+        """Upload a folder: all files, several at a time, the manifest last; until it is there, what is at this place is
+        no result. Files that are there already are not sent again; those of an earlier push that are no longer part of
+        the folder are removed; files of others stay. InputError: no folder. UsageError: files of others have the same
+        names. IntegrityError: a file did not arrive."""
         frm = Path(frm)
         if not frm.is_dir():
             raise InputError("no folder to upload", where=str(frm))
@@ -504,8 +470,20 @@ class Location:
             (self / name).remove()
         record.save(Upload(False, files).content())
         with log.task(f"uploading {self}", len(files)) as bar:
-            for names in _grouped(sorted(set(files) - there - manifest)):
-                self._put(frm, names)
+            sent = sorted(set(files) - there - manifest)
+            for names in (sent[first : first + _GROUP] for first in range(0, len(sent), _GROUP)):
+                if self.local is not None:
+                    for name in names:
+                        store.copy_in_tree(frm / name, self.local / name)
+                    store.sync_tree(self.local)
+                else:
+                    # S3 takes 10,000 parts of a file
+                    part = {"chunksize": max(_CHUNK, *(files[name].size // 9000 for name in names))}
+                    options = part if PACKAGES[scheme_of(self.text)][0] == "s3fs" else {}
+                    targets = [f"{self._path}/{name}" for name in names]
+                    with _in_words("uploading", self.text, _NO_BUCKET):
+                        sources = [str(frm / name) for name in names]
+                        self._files.put(sources, targets, batch_size=_FILES_AT_ONCE, **options)
                 bar.advance(len(names))
         sizes = self.tree()
         for name in sorted(set(files) - manifest):
@@ -517,19 +495,6 @@ class Location:
         if manifest:
             (self / store.MANIFEST).save(store.read_bytes(frm / store.MANIFEST))
 
-    def _put(self, frm: Path, names: Sequence[str]) -> None:
-        if self.local is not None:
-            for name in names:
-                store.copy_in_tree(frm / name, self.local / name)
-            store.sync_tree(self.local)
-            return
-        options: dict[str, Any] = {}
-        if PACKAGES[scheme_of(self.text)][0] == "s3fs":
-            options = {"chunksize": max(_CHUNK, *((frm / name).stat().st_size // 9000 for name in names))}
-        with _in_words("uploading", self.text, _NO_BUCKET):
-            sources, targets = [str(frm / name) for name in names], [f"{self._path}/{name}" for name in names]
-            self._files.put(sources, targets, batch_size=_FILES_AT_ONCE, **options)
-
     def put_file(self, file: Path) -> None:
         """Upload one file to this place."""
         if self.local is not None:
@@ -538,12 +503,3 @@ class Location:
             return
         with _in_words("uploading", self.text, _NO_BUCKET):
             self._files.put_file(str(file), self._path)
-
-
-def _grouped(names: Sequence[str]) -> Iterable[Sequence[str]]:
-    count = 4 * _FILES_AT_ONCE
-    return (names[begin : begin + count] for begin in range(0, len(names), count))
-
-
-def _is(path: Path, wanted: Expected) -> bool:
-    return path.is_file() and path.stat().st_size == wanted.size and store.sha256_file(path) == wanted.sha256

@@ -42,11 +42,8 @@ def require_address_space(command: str) -> None:
 
 
 def require(count: int, asked: str, remedy: str) -> None:
-    """ResourceError before an allocation that cannot succeed.
-
-    Args:
-        count: bytes. asked: what for, with its sizes. remedy: the settings that make it smaller.
-    """
+    """ResourceError before an allocation of ``count`` bytes that cannot succeed. asked: what for, with its sizes.
+    remedy: the settings that make it smaller."""
     free = free_bytes()
     if free and count > free:
         what = f"{asked} needs more memory than there is"

@@ -49,16 +49,8 @@ def encode(ids: NDArray[np.integer], colors: NDArray[np.uint8] = COLORS) -> NDAr
 def decode(
     rgb: NDArray[np.number], colors: NDArray[np.uint8] = COLORS
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Nearest palette colour (Euclidean).
-
-    Args:
-        rgb: ``[..., 3]`` colours in 0..255, any numeric dtype.
-        colors: the palette.
-
-    Returns:
-        ids ``u8[...]`` and margin ``f32[...]`` = distance to the second nearest minus distance to the nearest colour
-        (0 = ambiguous).
-    """
+    """Nearest palette colour (Euclidean) of colours ``[..., 3]`` in 0..255: ids ``u8[...]`` and margin ``f32[...]``,
+    the distance to the second nearest minus that to the nearest colour (0 = ambiguous)."""
     flat = np.asarray(rgb, np.float32).reshape(-1, 3)
     distance = np.linalg.norm(flat[:, None, :] - colors[None].astype(np.float32), axis=-1)
     nearest_two = np.partition(distance, 1, axis=1)[:, :2]

@@ -30,11 +30,8 @@ def origin(point: EntryPoint) -> str:
 
 
 def load_plugin(kind: Literal["importer"], name: str) -> Any:
-    """The object behind a name of ``plugins``.
-
-    Raises:
-        KeyError: no installed package offers the name. UsageError: its code cannot be imported.
-    """
+    """The object behind a name of ``plugins``. KeyError: no installed package offers it. UsageError: its code cannot be
+    imported."""
     point = plugins(kind)[name]
     try:
         return point.load()

@@ -101,16 +101,11 @@ _NOTICES = (signal.SIGUSR1,) if hasattr(signal, "SIGUSR1") else ()
 
 
 class Interruption:
-    """Ctrl-C, SIGTERM and SIGUSR1 wait for the end of the step, so that a checkpoint can be written; a second one does
-    not wait.
+    """Ctrl-C, SIGTERM and SIGUSR1 (with which batch systems announce the end of a job) wait for the end of the step, so
+    that a checkpoint can be written; a second one does not wait. Outside the main thread signals are left as they are.
 
-    SIGUSR1 is what batch systems send some time before they end a job; it then stops the program as SIGTERM does.
-
-    Outside the main thread signals are left as they are.
-
-    Args:
-        repeated_within_s: a signal that comes again within this time is taken for the same one. Launchers such as
-            torchrun pass on a signal that the terminal has sent already; so does the parent of a worker process (10 s).
+    repeated_within_s: a signal that comes again within this time is taken for the same one. Launchers such as torchrun
+    pass on a signal that the terminal has sent already; so does the parent of a worker process (10 s).
     """
 
     def __init__(self, repeated_within_s: float = 0.0) -> None:
@@ -172,18 +167,12 @@ def error_from_record(record: Mapping[str, Any]) -> MudgError:
 def run_in_processes(
     function: Callable[..., Result], arguments: Sequence[tuple[Any, ...]], processes: int
 ) -> Iterator[tuple[int, Result]]:
-    """Call a module's ``function`` with each of ``arguments`` in processes of one thread each; ``processes`` = 1 is
-    this one.
+    """Call a module's ``function`` with each of ``arguments`` in processes of one thread each (``processes`` = 1: in
+    this one); yields index and result as they come. Where this process is stopped (Ctrl-C, SIGTERM), or the caller
+    wants no more results, calls that run are stopped, too.
 
-    Where this process is stopped (Ctrl-C, SIGTERM), or the caller wants no more results, calls that run are stopped,
-    too.
-
-    Yields:
-        Index of the arguments and the result, as they come.
-
-    Raises:
-        ResourceError: a process ended from outside. Whatever the function raises; calls that have not begun are
-            dropped.
+    Raises what the function raises, and ResourceError where a process ended from outside; calls that have not begun are
+    dropped.
     """
     if processes == 1:
         with one_torch_thread():
@@ -223,13 +212,9 @@ def calls_beside(
     function: Callable[..., object], arguments: Sequence[tuple[Any, ...]], processes: int
 ) -> Iterator[None]:
     """Call a module's ``function`` with each of ``arguments`` in processes of one thread each while the block runs.
-
     Once a call fails, none begins any more. At the end of the block calls that have not begun are dropped, and those
-    that run are waited for; where the block ends with an error or is stopped (Ctrl-C, SIGTERM), they are stopped, too.
-
-    Raises:
-        ResourceError: a process ended from outside. Whatever the function raises, at the end of the block.
-    """
+    that run are waited for; where it ends with an error or is stopped (Ctrl-C, SIGTERM), they are stopped. Errors as in
+    ``run_in_processes``, at the end of the block."""
     with _working(processes) as pool:
         with child_environment():
             futures = [pool.submit(_stoppable, function, items) for items in arguments]
@@ -422,18 +407,9 @@ def computed_ahead(compute: Callable[[int], Result], count: int, threads: int) -
 
 
 def run_limited(work: Callable[[], None], limit_bytes: int, where: Path) -> int:
-    """Do the work in a fresh process that may take ``limit_bytes`` of address space beyond the program's own (on
-    Linux).
-
-    Args:
-        work: a call that can be sent to another process. where: the file it reads, for messages.
-
-    Returns:
-        Peak of resident memory in bytes, 0 where the system has no such limit.
-
-    Raises:
-        ResourceError: the limit was reached, or the process was ended from outside. And what the work itself raises.
-    """
+    """Do the work, a call on the file ``where``, in a fresh process that may take ``limit_bytes`` of address space
+    beyond the program's own (on Linux). Returns its peak of resident memory in bytes (0: no such limit). ResourceError:
+    the limit was reached, or the process was ended from outside. And what the work itself raises."""
     if sys.platform != "linux":
         log.warn("this system has no limit of address space; a hostile file may take all memory")
     with Pool(1) as pool:

@@ -108,14 +108,8 @@ def after(check: Callable[[Any], Any]) -> AfterValidator:
 
 
 def parse_record(record: type[RecordType], value: object, where: str) -> RecordType:
-    """Check a JSON value.
-
-    Args:
-        where: place of the value, e.g. ``scene.json: frames[3]``; of a file's top-level object, its path and ``": "``.
-
-    Raises:
-        InputError: the value is no such record; the first problem is described, further ones are counted.
-    """
+    """Check a JSON value. where: its place, e.g. ``scene.json: frames[3]``; of a file's top-level object, its path and
+    ``": "``. InputError: it is no such record; the first problem is described, further ones are counted."""
     try:
         return record.model_validate(value)
     except ValidationError as error:
@@ -123,16 +117,9 @@ def parse_record(record: type[RecordType], value: object, where: str) -> RecordT
 
 
 def parse_dataclass(kind: type[Value], values: object, where: str) -> Value:
-    """Check the JSON values of a dataclass and of those nested in it; the file must state every field, and no other.
-
-    Args:
-        kind: the dataclass; lists become its tuples, no other types are converted.
-        where: as in ``parse_record``.
-
-    Raises:
-        InputError: the first field that is missing, unknown, or of a wrong type or range; sizes end at 65,536, since
-            what they shape is built before it is compared with the weights.
-    """
+    """Check the JSON values of a dataclass and of those nested in it: lists become tuples, no other types are
+    converted, and every field must be stated, and no other. InputError: the first wrong field (``where`` as in
+    ``parse_record``); sizes end at 65,536, since what they shape is built before it is compared with the weights."""
     _refuse_sizes(values, where)
     try:
         made = TypeAdapter(kind).validate_json(json.dumps(values), strict=True)
@@ -197,11 +184,7 @@ def place(where: str, *steps: str | int) -> str:
 @contextlib.contextmanager
 def understood(what: str, where: str) -> Iterator[None]:
     """InputError where a block that takes the content of files apart misses parts, or where they are of other types or
-    do not fit.
-
-    Args:
-        what: what the files should hold, as in "a fitted scene".
-    """
+    do not fit. what: what the files should hold, as in "a fitted scene"."""
     try:
         yield
     except (LookupError, AttributeError, TypeError, ValueError, ArithmeticError, RuntimeError) as error:
@@ -214,11 +197,8 @@ def understood(what: str, where: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def named_by(where: str) -> Iterator[None]:
-    """Replace the owner that a type of ``base/types.py`` names by the record it was read from.
-
-    A refused field has the place ``view of 'front': world_from_cam`` in a constructor; ``WHERE.world_from_cam`` comes
-    out.
-    """
+    """Replace the owner that a type of ``base/types.py`` names by the record it was read from: ``view of 'front':
+    world_from_cam`` becomes ``WHERE.world_from_cam``."""
     try:
         yield
     except InputError as problem:

@@ -60,11 +60,8 @@ class Replacement:
         return store.retired_path(self.folder)
 
     def begin(self) -> Path:
-        """Make the staging folder, or take up the one that is there; returns it.
-
-        Raises:
-            ResourceError: the folder is a mount point, or its parent cannot be written.
-        """
+        """Make the staging folder, or take up the one that is there; returns it. ResourceError: the folder is a mount
+        point, or its parent cannot be written."""
         if os.path.ismount(self.folder):
             remedy = "choose an --out inside it"
             raise ResourceError("a mount point cannot be replaced", where=str(self.folder), remedy=remedy)
@@ -73,11 +70,8 @@ class Replacement:
         return self.staging
 
     def swap(self, own_names: OwnNames) -> None:
-        """Put the finished staging folder in the place of the folder, and remove the old result.
-
-        Raises:
-            ResourceError: a folder cannot be renamed; old and new content are both still there.
-        """
+        """Put the finished staging folder in the place of the folder, and remove the old result. ResourceError: a
+        folder cannot be renamed; old and new content are both still there."""
         try:
             if self.folder.exists():
                 self.folder.rename(self.retired)
@@ -92,14 +86,8 @@ class Replacement:
         self._remove_retired(own_names)
 
     def recover(self, is_finished: Callable[[Path], bool], own_names: OwnNames) -> None:
-        """Complete, or undo, a ``swap`` that was cut off by a crash; without one nothing happens.
-
-        Args:
-            is_finished: whether a folder holds a finished, unaltered result.
-
-        Raises:
-            UsageError: old and new content lie side by side in a way that no crash leaves.
-        """
+        """Complete, or undo, a ``swap`` that was cut off by a crash. is_finished: whether a folder holds a finished,
+        unaltered result. UsageError: old and new content lie side by side in a way that no crash leaves."""
         if not self.retired.is_dir():
             return
         if self.folder.is_dir() and not any(self.folder.iterdir()):
@@ -173,17 +161,9 @@ _LONGEST_NAME, _LONGEST_PATH = 230, 3800
 
 
 def refuse_overlap(out: Path | str | Sequence[Path], inputs: Mapping[str, Path | str | None]) -> None:
-    """Refuse an output that is, holds or lies in an input. To be called before anything is written.
-
-    Links, ``..`` and, where the file system does not tell them apart, upper and lower case make no difference.
-
-    Args:
-        out: folder to write, or several; it need not exist.
-        inputs: name for messages -> file or folder that is read (None or empty: not given).
-
-    Raises:
-        UsageError: they overlap, or an output cannot be.
-    """
+    """UsageError for an output that is, holds or lies in an input, or that cannot be. To be called before anything is
+    written. Links, ``..`` and, where the file system does not tell them apart, upper and lower case make no difference.
+    inputs: name for messages -> file or folder that is read (None or empty: not given)."""
     outs = [out] if isinstance(out, Path | str) else out
     for one in outs:
         _refuse_impossible(one)
@@ -283,11 +263,8 @@ def is_temporary(name: str) -> bool:
 
 
 def run_state(folder: Path) -> dict[str, Any]:
-    """What ``run.json`` says; empty if the folder is missing or holds nothing.
-
-    Raises:
-        UsageError: the folder holds something else than a run.
-    """
+    """What ``run.json`` says; empty if the folder is missing or holds nothing. UsageError: it holds something else than
+    a run."""
     what, empty = "the output folder holds files of something else", "choose an empty --out"
     refused = UsageError(what, where=str(folder), remedy=empty)
     if not folder.is_dir():
@@ -337,11 +314,7 @@ def _owner(lock: Path) -> tuple[int, str] | None:
 
 def own_names(output: VerbOutput, folder: Path) -> list[str]:
     """Names of the files in a run folder that the run made, the bookkeeping last: those that its manifest lists, of an
-    unfinished one those that its verb may write.
-
-    Args:
-        output: speaks for an unfinished run of its verb that did not note what it may write.
-    """
+    unfinished one those that its verb may write. output: speaks for an unfinished run of its verb."""
     try:
         state = run_state(folder)
     except UsageError:
@@ -604,11 +577,7 @@ def locked(lock: Path, what: Path | None = None) -> Iterator[None]:
 
 def take_lock(lock: Path, what: Path | None = None) -> None:
     """Write this process into a lock: that of a file ``what``, else of the folder in which the lock lies. Of several
-    that try at the same moment one succeeds.
-
-    Raises:
-        ResourceError: another live process of this machine holds it.
-    """
+    that try at the same moment one succeeds. ResourceError: another live process of this machine holds it."""
     store.make_folder(lock.parent)
     folder = os.open(lock.parent, os.O_RDONLY) if fcntl is not None else -1
     try:
@@ -635,9 +604,8 @@ def refuse_while_others_work(lock: Path, what: Path | None = None) -> None:
 # result file --------------------------------------------------------------------------------------
 #
 # Beside the file OUT (or a second form of it, such as the folder of a large page) lies OUT.json, its description: verb,
-# key of settings and inputs, SHA-256, and what else the verb says. Whoever finds a file finds the description of just
-# this file: an older file leaves before the new description gets its name, and the new file gets its name last. What a
-# stop leaves in between is completed, or undone, by the next command that writes there.
+# key of settings and inputs, SHA-256, and what else the verb says. The description gets its name first and the file its
+# last, so that the same command completes what a stop leaves in between.
 
 
 def description_path(out: Path) -> Path:
@@ -647,16 +615,12 @@ def description_path(out: Path) -> Path:
 
 class ResultFile:
     """The output file of one verb, for this process alone. Make it at ``staged(form)``, then call ``finish``.
-
-    ``complete`` is True where the same command has finished before and the file is as it was written.
-    """
+    ``complete``: the same command has finished before and the file is as it was written."""
 
     def __init__(self, out: Path, verb: str, key: str, forms: Sequence[Path]) -> None:
         self.out, self.verb, self.key = out, verb, key
         self.complete = False
         self._forms = tuple(forms) or (out,)
-        self._unknown = False
-        """Whether a file without a description is there: it may be this very result, and is compared with it."""
 
     @classmethod
     @contextlib.contextmanager
@@ -678,14 +642,12 @@ class ResultFile:
 
         Raises:
             UsageError: another result, or somebody else's file, is there. IntegrityError: the finished result was
-                altered.
-            ResourceError: it cannot be written, or another live process is writing it.
+                altered. ResourceError: it cannot be written, or another live process is writing it.
         """
         key = hashlib.sha256(store.json_text([verb, dict(settings), dict(inputs)], indent=None).encode()).hexdigest()
         result = cls(Path(out), verb, key, forms)
         with locked(_lock_path(out), out):
             try:
-                result._recover()
                 result._examine(overwrite)
                 yield result
             finally:
@@ -702,26 +664,18 @@ class ResultFile:
         return form.with_name(f".{form.name}.new.part{form.suffix}")
 
     def finish(self, about: Mapping[str, Any], form: Path | None = None) -> Path:
-        """Give what was made its name, and its description; returns where it lies.
-
-        Raises:
-            UsageError: a file that nothing describes is there, and it is another.
-        """
+        """Give what was made its description, and its name; returns where it lies."""
         form = form or self.out
-        old = [one for one in self._forms if os.path.lexists(one)]
         values = {"schema": 1, "verb": self.verb, "key": self.key, "file": form.name}
         values |= {"sha256": store.digest(self.staged(form)), **about}
-        if self._unknown and (old != [form] or store.digest(form) != values["sha256"]):
-            raise UsageError("the file exists", where=str(old[0]), remedy="choose another --out, or add --overwrite")
         with store.disk_errors("the result cannot get its name", form):
-            if self._unknown:
-                store.write_json(description_path(self.out), values)
-                log.info(f"{self.verb}: {form} was there, and is the same")
-                return form
-            for one in old:
-                one.rename(self._retired(one))
             store.write_json(description_path(self.out), values)
-            self.staged(form).rename(form)
+            for one in self._forms:
+                if one.is_dir():
+                    shutil.rmtree(one)
+                elif one != form:
+                    one.unlink(missing_ok=True)
+            self.staged(form).replace(form)
             store.fsync_directory(form.parent)
         return form
 
@@ -730,9 +684,6 @@ class ResultFile:
         form = next(filter(os.path.lexists, self._forms))
         log.info(f"{self.verb}: reused {form} (verified)")
         return form
-
-    def _retired(self, form: Path) -> Path:
-        return form.with_name(f".{form.name}.old.part{form.suffix}")
 
     def description(self) -> dict[str, Any]:
         """What ``OUT.json`` says; empty where it is missing or somebody else's."""
@@ -751,34 +702,16 @@ class ResultFile:
                 what = "a file was altered after it was written"
                 remedy = "add --overwrite to make it again, or choose another --out"
                 raise IntegrityError(what, where=str(there[0]), expected=f"sha256 {about['sha256']}", remedy=remedy)
-        elif not overwrite:
-            self._unknown = bool(there) and not os.path.lexists(file)
-            blocked = (not there and not about and os.path.lexists(file)) or (there and not self._unknown)
-            if blocked:
-                got = "a result of other settings or inputs" if about else "a file of something else"
-                remedy = "choose another --out, or add --overwrite"
-                raise UsageError("the file exists", where=str(there[0] if there else file), got=got, remedy=remedy)
-
-    def _recover(self) -> None:
-        """Complete a ``finish`` that was cut off after its description was written, undo one that was before."""
-        if any(os.path.lexists(one) for one in self._forms):
-            return
-        wanted = self.description().get("sha256")
-        for one in self._forms:
-            if self.staged(one).exists() and store.digest(self.staged(one)) == wanted:
-                self.staged(one).rename(one)
-                return
-        for one in self._forms:
-            if os.path.lexists(self._retired(one)):
-                self._retired(one).rename(one)
+        elif not overwrite and (there or (os.path.lexists(file) and not about)):
+            got = "a result of other settings or inputs" if about else "a file of something else"
+            remedy = "choose another --out, or add --overwrite"
+            raise UsageError("the file exists", where=str([*there, file][0]), got=got, remedy=remedy)
 
     def _tidy(self) -> None:
         """Remove what this and earlier, killed commands left: no other is at work here."""
         targets = (*self._forms, description_path(self.out), _lock_path(self.out))
         names = [re.escape(f".{one.stem}.") + r"[a-z0-9_]{8}\.part" + re.escape(one.suffix) for one in targets]
-        for one in self._forms:
-            staged = re.escape(self.staged(one).name.removesuffix(one.suffix))
-            names += [re.escape(self._retired(one).name), rf"\.?{staged}.*"]
+        names += [rf"\.?{re.escape(self.staged(one).name.removesuffix(one.suffix))}.*" for one in self._forms]
         left = re.compile("|".join(names))
         with contextlib.suppress(OSError):  # an error may have brought us here, and that one is to be told
             for one in [one for one in self.out.parent.iterdir() if left.fullmatch(one.name)]:

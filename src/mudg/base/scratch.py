@@ -18,49 +18,37 @@ from mudg.base.store import disk_errors
 
 
 class ScratchFile:
-    """A file without a name, for what does not fit into memory. The system removes it with the process, however that
-    ends.
-
-    Blocks are appended by one thread; any thread may read them.
-    """
+    """A file without a name, for what does not fit into memory; any thread may append and read. The system removes it
+    with the process, however that ends."""
 
     def __init__(self, folder: Path) -> None:
         self.where = str(folder)
         with disk_errors("cannot make a scratch file", folder):
             self._file = tempfile.TemporaryFile(dir=folder, buffering=0)
-        self._end = 0
         self._lock = threading.Lock()
         weakref.finalize(self, self._file.close)
 
     def append(self, content: NDArray[np.uint8]) -> int:
         """Write a block, u8[N], at the end; returns where it begins. ResourceError if the disk is full."""
-        left, began = content.data, self._end
+        left = content.data
         with self._lock, disk_errors("writing failed", Path(self.where), "free disk space or choose another --out"):
-            self._file.seek(began)
+            began = self._file.seek(0, os.SEEK_END)
             while len(left):
                 left = left[self._file.write(left) :]
-        self._end += len(content)
         return began
 
     def read(self, begins: int, size: int) -> NDArray[np.uint8]:
         """The bytes of a block. ResourceError if the disk does not give them back."""
         found = np.empty(size, np.uint8)
         left, remedy = found.data, "check the disk, then repeat the command to resume"
-        with disk_errors("a scratch file cannot be read", Path(self.where), remedy):
+        with self._lock, disk_errors("a scratch file cannot be read", Path(self.where), remedy):
+            self._file.seek(begins)
             while len(left):
-                count = self._read_into(left, begins + size - len(left))
-                if count == 0:
-                    what, where, got = "a scratch file ended early", self.where, f"{begins + size - len(left)}"
-                    raise ResourceError(what, where=where, expected=f"{begins + size} bytes", got=got, remedy=remedy)
+                count = self._file.readinto(left)
+                if not count:
+                    raise ResourceError("a scratch file ended early", where=self.where, remedy=remedy)
                 left = left[count:]
         return found
-
-    def _read_into(self, buffer: memoryview, position: int) -> int:
-        if hasattr(os, "preadv"):
-            return os.preadv(self._file.fileno(), [buffer], position)
-        with self._lock:
-            self._file.seek(position)
-            return self._file.readinto(buffer)
 
     def close(self) -> None:
         """Give the space back."""
@@ -72,11 +60,7 @@ _MAPPED: weakref.WeakValueDictionary[int, np.memmap] = weakref.WeakValueDictiona
 
 def mapped_array(folder: Path, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
     """An array of zeros in a file without a name: the system keeps of it in memory what it can spare, and removes it
-    with the array.
-
-    Raises:
-        ResourceError: the disk has no room for all of it. Writing to the array later needs none.
-    """
+    with the array. ResourceError: the disk has no room for all of it. Writing to the array later needs none."""
     size = max(1, int(np.prod(shape)) * np.dtype(dtype).itemsize)
     with disk_errors("cannot make a scratch file", folder), tempfile.TemporaryFile(dir=folder, buffering=0) as file:
         if hasattr(os, "posix_fallocate"):

@@ -44,19 +44,9 @@ def refuse_secrets(words: Sequence[str]) -> None:
 def run_staged(
     verb: str, args: Any, call: Callable[[Any], dict[str, Any]], scratch: Path | None = None
 ) -> dict[str, Any]:
-    """Call a verb with its flags; those that are addresses are staged.
-
-    Args:
-        verb: its name. args: its flags, a dataclass. call: flags of this machine's paths -> what the verb says.
-            scratch: folder for what is fetched and made (None: the system's for temporary files).
-
-    Returns:
-        What the verb says, with addresses for the paths.
-
-    Raises:
-        UsageError: an address where none can be, or an output that touches an input. Whatever transfers and the verb
-            raise.
-    """
+    """Call a verb with its flags, a dataclass; those that are addresses are staged in ``scratch`` (None: the system's
+    folder for temporary files). Returns what ``call`` says, with addresses for paths. UsageError: an address where none
+    can be, or an output that touches an input. And what transfers and the verb raise."""
     plan = _Staging.of(verb, args, scratch)
     if not plan.inputs and not plan.outputs:
         return call(args)
@@ -171,16 +161,13 @@ def _address(value: Any) -> Location | None:
     if isinstance(value, Path) and not value.exists():
         found = _IN_A_PATH.match(value.as_posix())
         if found:
-            return Location.of(f"{found[1]}://{'/' if found[1] == 'file' else ''}{value.as_posix()[found.end() :]}")
+            return Location.of(f"{found[1]}://{value.as_posix()[found.end() :]}")
     return None
 
 
 def _refuse_in_settings(settings: Any, where: str) -> None:
-    """UsageError for an address in a setting: settings are part of what a result is made of, and name paths.
-
-    Settings that their group names in ``STREAMED`` may be addresses: the verb itself reads there what it needs, when it
-    needs it.
-    """
+    """UsageError for an address in a setting: settings are part of what a result is made of, and name paths. Those that
+    their group names in ``STREAMED`` may be addresses: the verb itself reads there what it needs."""
     if is_dataclass(settings):
         for item in fields(settings):
             if item.name in getattr(settings, "STREAMED", ()):

@@ -91,13 +91,8 @@ def _complete(temporary: Path) -> None:
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path`` (same suffix); on success it is fsynced and renamed to ``path``.
-
-    For writers that want a file name (images, video). On any exception the temporary file is removed.
-
-    Raises:
-        ResourceError: the folder cannot be written or the disk is full.
-    """
+    """Yield a temporary path beside ``path`` (same suffix) for writers that want a file name; on success it is fsynced
+    and renamed to ``path``. ResourceError: the folder cannot be written, or the disk is full."""
     path = Path(path)
     make_folder(path.parent)
     with disk_errors("cannot write here", path):
@@ -133,11 +128,8 @@ def write_image(path: Path, picture: NDArray[np.uint8] | Image.Image, **options:
 
 
 def write_in_tree(path: Path, content: bytes) -> None:
-    """Write a file of a tree that is still under a temporary name. ``sync_tree`` must follow before the tree is
-    renamed.
-
-    One journal flush for a thousand small files instead of a thousand.
-    """
+    """Write a file of a tree that is still under a temporary name; ``sync_tree`` must follow before the tree is
+    renamed: one journal flush for a thousand small files."""
     make_folder(path.parent)
     with _writing(path):
         Path(path).write_bytes(content)
@@ -151,10 +143,8 @@ def copy_in_tree(source: Path, path: Path) -> None:
 
 
 def sync_tree(folder: Path) -> None:
-    """Wait until every file below ``folder`` is on the disk.
-
-    One flush of everything where the system offers that (30 times faster for many small files), else file by file.
-    """
+    """Wait until every file below ``folder`` is on the disk: one flush of everything where the system offers that,
+    which is 30 times faster for many small files, else file by file."""
     if hasattr(os, "sync"):
         os.sync()
         return
@@ -306,11 +296,7 @@ _KINDS += ((stat.S_ISCHR, "a device"), (stat.S_ISBLK, "a device"))
 
 def regular(path: Path) -> Path:
     """``path``, if a regular file is there: others would be waited for, or never end. For libraries that open files
-    themselves.
-
-    Raises:
-        InputError: it is missing, cannot be read, or is a folder, a named pipe, a socket or a device.
-    """
+    themselves. InputError: it is missing, unreadable, a folder, a named pipe, a socket or a device."""
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError as error:
@@ -349,12 +335,8 @@ def read_text(path: Path) -> str:
 
 
 def append_line(path: Path, text: str) -> None:
-    """Append one line to a log. A crash or a full disk can lose the last line, never an earlier one; half a line does
-    not stay.
-
-    Raises:
-        ResourceError: it cannot be written; the log is as before.
-    """
+    """Append one line to a log. A crash or a full disk (ResourceError) can lose the last line, never an earlier one;
+    half a line does not stay."""
     make_folder(path.parent)
     with _writing(path), Path(path).open("ab+", buffering=0) as handle:
         end = _end_of_lines(handle)
@@ -391,12 +373,8 @@ def sha256_file(path: Path) -> str:
 def write_safetensors(
     path: Path, tensors: Mapping[str, NDArray[Any] | Tensor], metadata: Mapping[str, str] | None = None
 ) -> None:
-    """Write named arrays (numpy or torch, any device) as one safetensors file, atomically; without a copy of them in
-    memory.
-
-    Args:
-        metadata: texts for the file's header.
-    """
+    """Write named arrays (numpy or torch, any device) as one safetensors file with these texts in its header,
+    atomically; without a copy of them in memory."""
     from safetensors import SafetensorError
     from safetensors.numpy import save_file
 
@@ -510,11 +488,8 @@ def write_manifest(folder: Path, names: Sequence[str] | None = None) -> str:
 
 
 def verify_manifest(folder: Path) -> str:
-    """Check every file named in the manifest; return the manifest's digest.
-
-    Raises:
-        IntegrityError: the manifest is missing or malformed, or a file is missing or altered.
-    """
+    """Check every file named in the manifest; return the manifest's digest. IntegrityError: the manifest is missing or
+    malformed, or a file is missing or altered."""
     path = folder / MANIFEST
     try:
         files = read_json(path)["files"]
@@ -557,14 +532,8 @@ def _check(record: Mapping[str, Any]) -> str:
 
 
 def verify_record(folder: Path) -> None:
-    """Check the bookkeeping of a run folder: that the run is finished, and its record, log and manifest are as it wrote
-    them.
-
-    Nothing is checked where no record lies (foreign folders, copies).
-
-    Raises:
-        InputError: the run is not finished. IntegrityError: something was altered or is missing.
-    """
+    """Check the bookkeeping of a run folder, if it has a record: its log and manifest are as the run wrote them.
+    InputError: the run is not finished. IntegrityError: something was altered or is missing."""
     path = folder / RUN_STATE
     if not path.is_file():
         return
@@ -606,12 +575,8 @@ def require(path: Path) -> None:
 
 
 def digest(path: Path) -> str:
-    """Digest of an artefact: of its verified manifest, or of all its bytes where there is no manifest.
-
-    Raises:
-        InputError: nothing is there, or an unfinished result. IntegrityError: a finished result or its bookkeeping was
-            altered.
-    """
+    """Digest of an artefact: of its verified manifest, or of all its bytes where there is no manifest. InputError:
+    nothing is there, or an unfinished result. IntegrityError: a finished result or its bookkeeping was altered."""
     path = Path(path)
     require(path)
     if path.is_file():

@@ -80,7 +80,7 @@ def pose_keys(times_s: Any, poses: Any, owner: str, name: str) -> tuple[NDArray[
     if matrices.shape != (len(times), 4, 4):
         expected, got = f"({len(times)}, 4, 4) for {len(times)} times", str(matrices.shape)
         raise InputError("times and poses do not pair up", where=f"{owner}: {name}", expected=expected, got=got)
-    problem = increasing_problem(times) if np.isfinite(times).all() else shortened(times)
+    problem = increasing_problem(times) if np.isfinite(times).all() else short(times)
     if problem is not None:
         what, where, remedy = "times do not increase", f"{owner}: times_s", "sort the poses by time and drop duplicates"
         raise InputError(what, where=where, expected="finite seconds, strictly increasing", got=problem, remedy=remedy)
@@ -90,12 +90,6 @@ def pose_keys(times_s: Any, poses: Any, owner: str, name: str) -> tuple[NDArray[
     times.setflags(write=False)
     matrices.setflags(write=False)
     return times, matrices
-
-
-def shortened(values: NDArray[Any]) -> str:
-    """Numbers as text, at most about 200 characters."""
-    text = np.array2string(np.asarray(values), threshold=6, edgeitems=3, precision=6)
-    return text if len(text) < 200 else text[:200] + "..."
 
 
 def _fits(shape: Any, expected: tuple[int | None, ...]) -> bool:
@@ -240,14 +234,8 @@ class Camera:
 
     @classmethod
     def from_fov(cls, name: str, width: int, height: int, horizontal_deg: float) -> Camera:
-        """A pinhole camera with square pixels that looks through the middle of its image.
-
-        Args:
-            width, height: pixels. horizontal_deg: field of view from left to right, degrees.
-
-        Raises:
-            UsageError: an angle that is none.
-        """
+        """A pinhole camera of this size in pixels with square pixels and this field of view from left to right
+        (degrees, above 0 and below 180, else UsageError), which looks through the middle of its image."""
         if not 0 < horizontal_deg < 180:
             raise UsageError("no field of view", expected="0 to 180 degrees", got=str(horizontal_deg))
         focal = width / 2 / math.tan(math.radians(horizontal_deg) / 2)
@@ -262,13 +250,8 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class View(_Brief):
-    """A camera at a place and time.
-
-    Args:
-        camera: its intrinsics.
-        world_from_cam: f64[4, 4], rigid, metres; copied and read-only.
-        time_s: seconds on the scene's clock.
-    """
+    """A camera at a place and time: ``world_from_cam`` f64[4, 4], rigid, metres, copied and read-only; ``time_s`` in
+    seconds on the scene's clock."""
 
     camera: Camera
     world_from_cam: Matrix
@@ -296,13 +279,8 @@ class View(_Brief):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Trajectory(_Brief):
-    """An ordered path of views of one camera.
-
-    Args:
-        name: of the trajectory, e.g. ``left_2m``.
-        views: in the order of their times.
-        origin: how it came about: recorded, or a recorded one shifted.
-    """
+    """An ordered path of views of one camera. name: e.g. ``left_2m``. origin: a recorded path, or one shifted from
+    it."""
 
     name: str
     views: tuple[View, ...]
@@ -321,14 +299,8 @@ class Ref:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Frame(_Brief):
-    """One recorded image.
-
-    Args:
-        id: ``<camera>/<digits>``, unique in the scene.
-        view: its camera, pose and time.
-        image: 8-bit RGB of the camera's size.
-        labels: name (depth, semantics, sky, ego, dynamic, instance, ...) -> file.
-    """
+    """One recorded image, 8-bit RGB of the camera's size. id: ``<camera>/<digits>``, unique in the scene. labels: name
+    (depth, semantics, sky, ego, dynamic, instance, ...) -> file."""
 
     id: str
     view: View
@@ -353,15 +325,9 @@ class Photo(_Brief):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Sweep(_Brief):
-    """One turn of a LiDAR.
-
-    Args:
-        id: ``<sensor>/<digits>``, unique in the scene.
-        sensor: name of the LiDAR.
-        time_s: seconds on the scene's clock; the points are motion-compensated to it.
-        world_from_lidar: f64[4, 4], rigid, metres, at ``time_s``; copied and read-only.
-        points: see ``SweepPoints``.
-    """
+    """One turn of a LiDAR. id: ``<sensor>/<digits>``, unique in the scene. time_s: seconds on the scene's clock; the
+    points (``SweepPoints``) are motion-compensated to it. world_from_lidar: f64[4, 4], rigid, metres, at that time;
+    copied and read-only."""
 
     id: str
     sensor: str
@@ -377,15 +343,9 @@ class Sweep(_Brief):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class SweepPoints(_Brief):
-    """Points of a sweep.
-
-    Args:
-        xyz: f32[N, 3] metres in the LiDAR frame.
-        intensity: f32[N] in [0, 1].
-        dt_s: f32[N] seconds relative to the sweep's time.
-        classes: u8[N] train ids that people gave the points (255 = unlabelled), or None where the log has none.
-        no_returns: rows of the source that mark a beam without a return; they are not among the points.
-    """
+    """Points of a sweep: ``xyz`` f32[N, 3] metres in the LiDAR frame, ``intensity`` f32[N] in [0, 1], ``dt_s`` f32[N]
+    seconds relative to the sweep's time. classes: u8[N] train ids that people gave the points (255 = unlabelled), or
+    None. no_returns: rows of the source that mark a beam without a return; they are not among the points."""
 
     xyz: NDArray[np.float32]
     intensity: NDArray[np.float32]
@@ -403,15 +363,9 @@ class SweepPoints(_Brief):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Track(_Brief):
-    """A tracked box.
-
-    Args:
-        id: unique in the scene.
-        label: free class name (``car``, ``pedestrian``, ...).
-        size_m: f64[3] length (x), width (y), height (z); the object frame sits in the centre of the box.
-        times_s: f64[T], strictly increasing.
-        world_from_object: f64[T, 4, 4], rigid, metres.
-    """
+    """A tracked box. id: unique in the scene. label: free class name (``car``, ``pedestrian``, ...). size_m: f64[3]
+    length (x), width (y), height (z); the object frame sits in the centre of the box. times_s: f64[T], strictly
+    increasing. world_from_object: f64[T, 4, 4], rigid, metres."""
 
     id: str
     label: str
@@ -426,7 +380,7 @@ class Track(_Brief):
         size = np.array(self.size_m, np.float64).reshape(-1)
         if size.shape != (3,) or not np.isfinite(size).all() or (size <= 0).any():
             what = "a box needs a positive length, width and height"
-            raise InputError(what, where=f"{owner}: size_m", got=shortened(size))
+            raise InputError(what, where=f"{owner}: size_m", got=short(size))
         size.setflags(write=False)
         times, poses = pose_keys(self.times_s, self.world_from_object, owner, "world_from_object")
         if len(times) == 0:
@@ -442,12 +396,8 @@ class Track(_Brief):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class EgoPath(_Brief):
-    """The path of the recording vehicle.
-
-    Args:
-        times_s: f64[T], strictly increasing.
-        world_from_ego: f64[T, 4, 4], rigid, metres.
-    """
+    """The path of the recording vehicle: times f64[T] in seconds, strictly increasing, and rigid poses f64[T, 4, 4],
+    metres."""
 
     times_s: NDArray[np.float64]
     world_from_ego: Matrix
@@ -464,14 +414,9 @@ class EgoPath(_Brief):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Source(_Brief):
-    """Where a scene comes from.
-
-    Args:
-        dataset: name of the data set, or of the generator.
-        licence: under which the log may be used.
-        recipe: what a generated scene needs to rebuild its exact truth; None for recordings.
-        notes: sentences a reader of results should know (assumed timestamps, derived poses).
-    """
+    """Where a scene comes from: data set or generator, and licence. recipe: what a generated scene needs to rebuild its
+    exact truth; None for recordings. notes: sentences a reader of results should know (assumed timestamps, derived
+    poses)."""
 
     dataset: str
     licence: str
@@ -481,14 +426,8 @@ class Source(_Brief):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class PointCloud(_Brief):
-    """Coloured points.
-
-    Args:
-        xyz: f32[N, 3] metres in ``frame``.
-        rgb: u8[N, 3].
-        frame: the world's, or a tracked box's own.
-        semantics: u8[N] train ids (255 = unlabelled), or None.
-    """
+    """Coloured points: ``xyz`` f32[N, 3] metres in ``frame`` (the world's, or a tracked box's own), ``rgb`` u8[N, 3],
+    ``semantics`` u8[N] train ids (255 = unlabelled) or None."""
 
     xyz: NDArray[np.float32]
     rgb: NDArray[np.uint8]
@@ -507,10 +446,8 @@ class PointCloud(_Brief):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class FusedCloud(_Brief):
-    """The static world, and one cloud per dynamic object: track id -> cloud in its box frame.
-
-    The points' colours are common ones; ``colors`` says how the cameras of the log show them.
-    """
+    """The static world, and one cloud per dynamic object: track id -> cloud in its box frame. The points' colours are
+    common ones; ``colors`` says how the cameras of the log show them."""
 
     static: PointCloud
     objects: Mapping[str, PointCloud]
@@ -522,19 +459,8 @@ class FusedCloud(_Brief):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Scene(_Brief):
-    """A prepared driving log. Files are referenced, not loaded.
-
-    Args:
-        id: name of the log.
-        root: directory that the references are relative to.
-        cameras: by name.
-        frames: images, in time order per camera.
-        sweeps: LiDAR sweeps, in time order per sensor.
-        tracks: tracked boxes.
-        ego: path of the vehicle.
-        split: frame id -> ``train`` or ``test``; frames not named are for training.
-        source: data set, licence, notes.
-    """
+    """A prepared driving log. Files are referenced, relative to the folder ``root``, and not loaded. Frames are in time
+    order per camera, sweeps per sensor. split: frame id -> ``train`` or ``test``; frames not named are for training."""
 
     id: str
     root: str
@@ -632,6 +558,13 @@ class Condition(_Tensors):
         if self.measured is not None:
             check_tensors(self.measured, depth=one)
 
+    def cropped(self, rows: slice, columns: slice) -> Self:
+        """A rectangle of pixels of all views. Its cameras only say how large it is: they look straight ahead."""
+        width, height = columns.stop - columns.start, rows.stop - rows.start
+        lens = {"width": width, "height": height, "cx": width / 2, "cy": height / 2}
+        views = tuple(replace(view, camera=replace(view.camera, **lens)) for view in self.views)
+        return replace(self.map(lambda x: x[..., rows, columns].contiguous()), views=views)
+
     @property
     def measurement(self) -> SparseDepth:
         """Depth to hold generated depth against."""
@@ -640,13 +573,8 @@ class Condition(_Tensors):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class FinePatch(_Tensors):
-    """A rectangle of a training clip at a higher resolution.
-
-    Args:
-        clip: condition and truth of the rectangle; its sides are ``scale`` times those of the part that it covers.
-        row, column: the upper left pixel of that part in the clip.
-        scale: pixels of the patch per pixel of the clip.
-    """
+    """A rectangle of a training clip at a higher resolution. row, column: the upper left pixel, in the clip, of the
+    part that it covers; its sides are ``scale`` times those of that part."""
 
     clip: Clip
     row: int
@@ -760,15 +688,10 @@ class Gaussians(_Brief):
 
 @dataclass(slots=True, eq=False, repr=False)
 class RasterTrace(_Brief):
-    """What densification needs to know about a render. Several views drawn at once add a leading dimension V to
-    everything.
-
-    Args:
-        means2d: f32[N, 2] pixels; its gradient is kept after backward.
-        radii: i32[N, 2] half extent in pixels, 0 = not drawn.
-        visible: bool[N].
-        abs_grad2d: f32[N, 2], sum over pixels of absolute gradients; filled by backward if asked for.
-    """
+    """What densification needs to know about a render; of several views drawn at once, with a leading dimension V.
+    means2d: f32[N, 2] pixels; its gradient is kept after backward. radii: i32[N, 2] half extent in pixels, 0 = not
+    drawn. visible: bool[N]. abs_grad2d: f32[N, 2], sum over pixels of absolute gradients; filled by backward if asked
+    for."""
 
     means2d: Tensor
     radii: Tensor
@@ -778,15 +701,9 @@ class RasterTrace(_Brief):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Render(_Brief):
-    """A rendered view. Several views drawn at once add a leading dimension V to everything.
-
-    Args:
-        rgb: f32[3, H, W].
-        depth: f32[1, H, W] metres: expected camera z (accumulated / alpha).
-        alpha: f32[1, H, W] in [0, 1].
-        extra: f32[C, H, W] or None: accumulated, not divided by alpha.
-        trace: what densification needs.
-    """
+    """A rendered view; of several views drawn at once, with a leading dimension V. rgb: f32[3, H, W]. depth: f32[1, H,
+    W] metres: expected camera z (accumulated / alpha). alpha: f32[1, H, W] in [0, 1]. extra: f32[C, H, W] or None:
+    accumulated, not divided by alpha."""
 
     rgb: Tensor
     depth: Tensor

@@ -80,10 +80,7 @@ def is_torchscript(path: Path) -> bool:
 
 def read_torchscript(path: Path) -> dict[str, Tensor]:
     """All tensors of an archive by the attributes that lead to them, such as ``mixed_3b.branch_0.conv3d.weight``.
-
-    Raises:
-        InputError: the archive is malformed, or names what no network needs.
-    """
+    InputError: the archive is malformed, or names what no network needs."""
     try:
         with zipfile.ZipFile(path) as archive:
             (index,) = (name for name in archive.namelist() if name.endswith("/data.pkl") and name.count("/") == 1)
@@ -271,12 +268,8 @@ _TO_PUBLISHED = _index((clean, published) for published, clean in RULES)
 
 
 def published_names(clean: Iterable[str]) -> dict[str, str]:
-    """Our names -> published names. All names of a model are needed: the number of what enlarges
-    depends on whether its stage has transformers.
-
-    Raises:
-        InputError: a name that the map does not know.
-    """
+    """Our names -> published names; InputError: a name that the map does not know. All names of a model are needed: the
+    number of what enlarges depends on whether its stage has transformers."""
     names = list(clean)
     known = set(names)
     result = {}
@@ -422,16 +415,8 @@ def with_towers(state: Mapping[str, Tensor], towers: Mapping[str, Tensor]) -> di
 
 
 def match(state: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int]], where: str) -> dict[str, Tensor]:
-    """The tensors of a checkpoint under our names, strictly.
-
-    Args:
-        state: published name -> tensor.
-        wanted: our name -> shape, all that the model needs and nothing else.
-
-    Raises:
-        InputError: names are missing, unknown, or have another shape; the first ones of each kind are listed with the
-            counts.
-    """
+    """The tensors of a checkpoint (published name -> tensor) under our names, strictly. wanted: our name -> shape, all
+    that the model needs and nothing else. InputError as in ``match_exactly``."""
     published = published_names(wanted)
     known = set(published.values())
     read = {name: value for name, value in state.items() if name in known or name not in UNUSED}
@@ -450,12 +435,8 @@ def refuse_bad_values(tensors: Mapping[str, Tensor], where: str) -> None:
 
 
 def match_exactly(state: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int]], where: str, network: str) -> None:
-    """Names and shapes of a checkpoint against what its network needs, strictly; ``network``: what to call it.
-
-    Raises:
-        InputError: names are missing, unknown, or have another shape; the first ones of each kind are listed with the
-            counts.
-    """
+    """InputError where names of a checkpoint are missing, unknown, or have another shape than its network needs; the
+    first ones of each kind are listed with the counts. ``network``: what to call it."""
     missing = [name for name in wanted if name not in state]
     unexpected = [name for name in state if name not in wanted]
     misshaped = [

@@ -25,7 +25,7 @@ import torch
 from numpy.typing import NDArray
 
 from mudg import native
-from mudg.base import crop, geometry, seeds
+from mudg.base import geometry, seeds
 from mudg.base.config import result_settings
 from mudg.base.log import progress
 from mudg.base.run_folder import RunDir
@@ -537,7 +537,7 @@ def cropped(clip: Clip, rows: slice, columns: slice) -> Clip:
     """A rectangle of a clip and of its condition. Its cameras only say how large it is: they look straight ahead."""
     cut = lambda x: x[..., rows, columns].contiguous()
     own = {name: cut(getattr(clip, name)) for name in ("rgb", "depth", "depth_valid", "semantics")}
-    condition = crop.cropped(clip.condition, rows, columns)
+    condition = clip.condition.cropped(rows, columns)
     return replace(clip, condition=condition, **own, fine=None, point_color=None)
 
 

@@ -24,7 +24,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mudg.base import palette, scratch, seeds
-from mudg.base.crop import cropped
 from mudg.base.errors import UsageError
 from mudg.base.types import Clip, Condition, FinePatch, RenderPlanes
 from mudg.core import losses, noise
@@ -548,7 +547,7 @@ class _FinePixels:
 
     def crop(self, rows: slice, columns: slice) -> ConditionPixels:
         """A rectangle of pixels."""
-        found = cropped(self.fine, rows, columns)
+        found = self.fine.cropped(rows, columns)
         scratch.rest_mapped()
         return self.model._pixels_of(Stacked.of([found]))
 

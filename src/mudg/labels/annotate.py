@@ -42,9 +42,8 @@ from mudg.labels.inputs import DepthInput, DepthNetwork, DepthOptions, LabelInpu
 from mudg.labels.labellers import labeller
 from mudg.labels.settings import AnnotateConfig
 from mudg.networks.folders import CPU, Compute, find, title
-from mudg.scene.contact_sheet import spread
 from mudg.scene.labels import read_label
-from mudg.scene.read import read_image, read_points, read_scene
+from mudg.scene.read import read_image, read_points, read_scene, spread
 from mudg.scene.write import SceneWriter
 
 # depth --------------------------------------------------------------------------------------------

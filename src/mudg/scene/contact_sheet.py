@@ -8,8 +8,8 @@ people violet, of all else light blue, and the edges of their fronts red.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Final, TypeVar
+from collections.abc import Mapping
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +19,9 @@ from mudg.base import geometry
 from mudg.base.types import Frame, Scene, Track, View
 from mudg.core.pictures import depth_colors, resize_area
 from mudg.scene.motion import VEHICLES
-from mudg.scene.read import read_image, read_points, sweeps_beside
+from mudg.scene.read import read_image, read_points, spread, sweeps_beside
 
 Floats = NDArray[np.float64]
-Record = TypeVar("Record")
 
 # a scene from above: points, the recorded path, boxes and their courses ---------------------------
 
@@ -163,15 +162,6 @@ def contact_sheet(scene: Scene) -> Image.Image:
     return sheet
 
 
-def spread(records: Sequence[Record], count: int) -> list[Record]:
-    """At most ``count`` of the records, evenly spread, first and last among them."""
-    places = np.unique(np.linspace(0, len(records) - 1, count).astype(int)) if records else ()
-    return [records[place] for place in places]
-
-
-# --- from the cameras -----------------------------------------------------------------------------
-
-
 def frame_tile(scene: Scene, frame: Frame) -> Image.Image:
     """One image with the points of the sweeps of its moment and the boxes of its time."""
     camera, width = frame.view.camera, TILE_WIDTH_PX
@@ -179,10 +169,10 @@ def frame_tile(scene: Scene, frame: Frame) -> Image.Image:
     view = frame.view.resized(width, height)
     pixels = np.array(resize_area(read_image(scene, frame), width, height))
     sweeps = sweeps_beside(scene, frame, MAX_GAP_S)
-    points = [
-        geometry.transform_points(s.world_from_lidar, read_points(scene, s).xyz.astype(np.float64)) for s in sweeps
-    ]
-    draw_points(pixels, view, np.concatenate(points) if points else np.zeros((0, 3)))
+    world = lambda sweep, xyz: geometry.transform_points(sweep.world_from_lidar, xyz.astype(np.float64))
+    draw_points(
+        pixels, view, np.concatenate([np.zeros((0, 3)), *(world(s, read_points(scene, s).xyz) for s in sweeps)])
+    )
     tile = Image.fromarray(pixels)
     draw = ImageDraw.Draw(tile)
     for track in scene.tracks:
@@ -257,9 +247,6 @@ def draw_box(draw: ImageDraw.ImageDraw, view: View, world_from_object: Floats, t
     for number, uv in edges:
         front = all(corner & 4 for corner in _EDGES[number])
         draw.line(pairs(uv), fill=FRONT_COLOR if front else box_color(track.label), width=line)
-
-
-# --- from above -----------------------------------------------------------------------------------
 
 
 def top_view(scene: Scene, width: int, height: int) -> Image.Image:

@@ -152,12 +152,11 @@ def mean_around(rgb: NDArray[np.uint8], row: NDArray[np.intp], column: NDArray[n
 def report_record(report: FusionReport, rules: FusionRules) -> dict[str, Any]:
     """The report as JSON values for ``fuse.json``."""
     values = dataclasses.asdict(report)
+    verdicts, points, left_out = (values.pop(name) for name in ("verdicts", "object_points", "left_out"))
     tracks = {
-        track_id: {**verdict, "points": report.object_points.get(track_id), "left_out": report.left_out.get(track_id)}
-        for track_id, verdict in values.pop("verdicts").items()
+        name: {**verdict, "points": points.get(name), "left_out": left_out.get(name)}
+        for name, verdict in verdicts.items()
     }
-    values.pop("object_points")
-    values.pop("left_out")
     return {"counts": values, "rules": dataclasses.asdict(rules), "tracks": tracks}
 
 

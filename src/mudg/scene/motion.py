@@ -36,10 +36,6 @@ MOST_TURN_RAD_S: Final = 2.0
 """Vehicles turn slower than this."""
 MOST_WALKER_TURN_RAD_S: Final = 8.0
 MOST_JUMP_M_S2: Final = 30.0
-MOST_ACCELERATION_M_S2: Final = 20.0
-MOST_BOX_ACCELERATION_M_S2: Final = 40.0
-"""Boxes that people drew jitter: those of a real log reach 21."""
-_ACCELERATION_OVER_S: Final = 0.2
 _VELOCITY_OVER_S: Final = 0.1
 _VELOCITY_WITHIN_S: Final = 1.0
 MIN_TURN_DEG: Final = 30.0
@@ -63,11 +59,6 @@ class Gap:
     end_s: float
     moved_m: float
     off_m: float
-
-    @property
-    def is_guess(self) -> bool:
-        """Whether poses in it would be guesses."""
-        return self.off_m > OFF_M or self.end_s - self.start_s > LONG_GAP_S
 
     def __str__(self) -> str:
         return (
@@ -222,20 +213,3 @@ def jumps(times_s: Times, poses: Matrix, least_m: float) -> list[tuple[int, floa
         if off >= least_m and off / steps_s[key] ** 2 >= MOST_JUMP_M_S2:
             found.append((key, off, off / float(steps_s[key]) ** 2))
     return sorted(found, key=lambda jump: -jump[1])
-
-
-def largest_acceleration(times_s: Times, poses: Matrix) -> tuple[int, float]:
-    """The key at which the velocity changes fastest, and by how much, m/s^2: of the velocities over a fifth of a second
-    on either side."""
-    best = 0, 0.0
-    for key in range(1, len(times_s) - 1):
-        before = int(np.searchsorted(times_s, times_s[key] - _ACCELERATION_OVER_S + 1e-9, side="right")) - 1
-        after = int(np.searchsorted(times_s, times_s[key] + _ACCELERATION_OVER_S - 1e-9))
-        if before < 0 or after >= len(times_s):
-            continue
-        lead, trail = (
-            (poses[b, :3, 3] - poses[a, :3, 3]) / (times_s[b] - times_s[a]) for a, b in ((before, key), (key, after))
-        )
-        change = float(np.linalg.norm(trail - lead)) * 2 / float(times_s[after] - times_s[before])
-        best = max(best, (key, change), key=lambda one: one[1])
-    return best

@@ -8,9 +8,9 @@ import hashlib
 import io
 import os
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,7 @@ from mudg.scene.schema import parse_object, ref_problem
 # point somewhere else.
 
 
+Record = TypeVar("Record")
 MAX_FILE_BYTES: Final = 4 * 1024**3
 READABLE: Final = "a readable file inside the scene"
 
@@ -102,9 +103,7 @@ class SceneFiles:
         return None
 
 
-@functools.lru_cache(maxsize=16)
-def _open_cached(path: str, _mtime_ns: int, _size: int, _manifest_ns: int) -> SceneFiles:
-    return SceneFiles(path)
+_open_cached = functools.lru_cache(maxsize=16)(lambda path, *_state: SceneFiles(path))
 
 
 # read ---------------------------------------------------------------------------------------------
@@ -259,6 +258,12 @@ def sweeps_beside(scene: Scene, frame: Frame, max_gap_s: float) -> list[Sweep]:
         if gap <= max_gap_s and (best is None or gap < abs(best.time_s - frame.view.time_s)):
             nearest[sweep.sensor] = sweep
     return sorted(nearest.values(), key=lambda sweep: abs(sweep.time_s - frame.view.time_s))
+
+
+def spread(records: Sequence[Record], count: int) -> list[Record]:
+    """At most ``count`` of the records, evenly spread, first and last among them."""
+    places = np.unique(np.linspace(0, len(records) - 1, count).astype(int)) if records else ()
+    return [records[place] for place in places]
 
 
 def checked_points(arrays: Mapping[str, NDArray[Any]], where: str) -> SweepPoints:

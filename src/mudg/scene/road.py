@@ -80,9 +80,8 @@ class Road:
         axes = np.stack([ahead, np.cross(up, ahead), up], 1)
         return geometry.from_rotation_translation(axes, (x_m, y_m, z))
 
-    def route(self, pose: Matrix, shift_m: float = 0.0, length_m: float = 60.0, step_m: float = 2.0) -> Matrix:
-        """The road ahead of a vehicle f64[N, 3] in its frame, moved to the left."""
+    def route(self, pose: Matrix, step_m: float = 2.0) -> Matrix:
+        """The next 60 m of road ahead of a vehicle f64[N, 3] in its frame."""
         station, _ = self.locate(pose[:2, 3])
-        stations = station + np.arange(0.0, length_m, step_m)
-        points = [geometry.transform_points(self.recorded(s), np.array([[0.0, shift_m, 0.0]]))[0] for s in stations]
-        return geometry.transform_points(geometry.invert(pose), np.stack(points))
+        places = np.stack([self.recorded(ahead)[:3, 3] for ahead in station + np.arange(0.0, 60.0, step_m)])
+        return geometry.transform_points(geometry.invert(pose), places)

@@ -147,12 +147,10 @@ def matrices_of(poses: list[list[float]]) -> NDArray[np.float64]:
     return np.array(poses, np.float64).reshape(len(poses), 4, 4)
 
 
-# --- records --------------------------------------------------------------------------------------
+# --- records: those in lists and tables are checked one by one -----------------------------------------
 
 
-class CameraEntry(StrictRecord):
-    """Intrinsics in pixels; the camera's name is its key."""
-
+class _CameraEntry(StrictRecord):
     width: int
     height: int
     fx: Number
@@ -163,9 +161,7 @@ class CameraEntry(StrictRecord):
     readout_s: Number = 0.0
 
 
-class FrameEntry(StrictRecord):
-    """One image."""
-
+class _FrameEntry(StrictRecord):
     id: str
     camera: str
     time_s: Number
@@ -174,9 +170,7 @@ class FrameEntry(StrictRecord):
     labels: LabelRefs = {}
 
 
-class SweepEntry(StrictRecord):
-    """One LiDAR sweep."""
-
+class _SweepEntry(StrictRecord):
     id: str
     sensor: Name
     time_s: Number
@@ -184,9 +178,7 @@ class SweepEntry(StrictRecord):
     points: FileRef
 
 
-class TrackEntry(StrictRecord):
-    """One tracked box."""
-
+class _TrackEntry(StrictRecord):
     id: str
     label: str
     size_m: BoxSize
@@ -194,40 +186,32 @@ class TrackEntry(StrictRecord):
     world_from_object: list[PoseNumbers]
 
 
-class EgoEntry(StrictRecord):
-    """The path of the vehicle."""
-
+class _EgoEntry(StrictRecord):
     times_s: Annotated[list[Number], Field(min_length=1)]
     world_from_ego: list[PoseNumbers]
 
 
-class SourceEntry(StrictRecord):
-    """Where the log comes from and under which licence."""
-
+class _SourceEntry(StrictRecord):
     dataset: str
     licence: str
     recipe: dict[str, Any] | None = None
     notes: list[str] = []
 
 
-class SceneIndex(StrictRecord):
-    """The top of ``scene.json``; frames and sweeps are checked one by one."""
-
+class _SceneIndex(StrictRecord):
     format: str
     schema_version: int
     id: str
-    source: SourceEntry
+    source: _SourceEntry
     cameras: dict[str, Any]
     frames: list[Any]
-    ego: EgoEntry
+    ego: _EgoEntry
     sweeps: list[Any] = []
     split: dict[str, Literal["train", "test"]] = {}
     conventions: Any = None
 
 
-class TracksIndex(StrictRecord):
-    """The top of ``tracks.json``; tracks are checked one by one."""
-
+class _TracksIndex(StrictRecord):
     format: str
     schema_version: int
     tracks: list[Any]
@@ -236,7 +220,7 @@ class TracksIndex(StrictRecord):
 def parse_camera(name: str, value: object, where: str) -> Camera:
     """Parse and check one camera; InputError names ``where`` and the field."""
     check_name(name, where)
-    record = parse_record(CameraEntry, value, where)
+    record = parse_record(_CameraEntry, value, where)
     width, height, longest = record.width, record.height, max(record.width, record.height)
     focal = "give the focal length in pixels, not millimetres, and not zero"
     cropped = "check units and whether the image was cropped"
@@ -260,7 +244,7 @@ def parse_camera(name: str, value: object, where: str) -> Camera:
 
 def parse_frame(value: object, where: str, cameras: Mapping[str, Camera]) -> Frame:
     """Parse one frame; its camera must be known."""
-    record = parse_record(FrameEntry, value, where)
+    record = parse_record(_FrameEntry, value, where)
     camera = cameras.get(record.camera)
     if camera is None:
         what = f"frame names the camera {record.camera!r}, which the scene does not have"
@@ -275,7 +259,7 @@ def parse_frame(value: object, where: str, cameras: Mapping[str, Camera]) -> Fra
 
 def parse_sweep(value: object, where: str) -> Sweep:
     """Parse one LiDAR sweep record."""
-    record = parse_record(SweepEntry, value, where)
+    record = parse_record(_SweepEntry, value, where)
     pose = matrices_of([record.world_from_lidar])[0]
     with named_by(where):
         return Sweep(record.id, record.sensor, record.time_s, pose, Ref(record.points))
@@ -283,7 +267,7 @@ def parse_sweep(value: object, where: str) -> Sweep:
 
 def parse_track(value: object, where: str) -> Track:
     """Parse one tracked box."""
-    record = parse_record(TrackEntry, value, where)
+    record = parse_record(_TrackEntry, value, where)
     size_m, times_s = np.array(record.size_m), np.array(record.times_s)
     with named_by(where):
         return Track(record.id, record.label, size_m, times_s, matrices_of(record.world_from_object))
@@ -312,7 +296,7 @@ def parse_scene(
         InputError: the frame of the file itself is wrong, or ``complain`` raised.
     """
     _check_format(scene_json, FORMAT, where)
-    top = parse_record(SceneIndex, scene_json, f"{where}: ")
+    top = parse_record(_SceneIndex, scene_json, f"{where}: ")
     if not top.cameras:
         raise InputError("scene has no cameras", where=f"{where}: cameras", expected="at least one camera by name")
     cameras = parse_table(top.cameras, f"{where}: cameras", parse_camera, complain)
@@ -322,7 +306,7 @@ def parse_scene(
     if tracks_json is not None:
         where_tracks = where.replace("scene.json", "tracks.json")
         _check_format(tracks_json, TRACKS_FORMAT, where_tracks)
-        listed = parse_record(TracksIndex, tracks_json, f"{where_tracks}: ").tracks
+        listed = parse_record(_TracksIndex, tracks_json, f"{where_tracks}: ").tracks
         tracks = parse_each(listed, f"{where_tracks}: tracks", parse_track, complain)
     with named_by(f"{where}: ego"):
         ego = EgoPath(np.array(top.ego.times_s), matrices_of(top.ego.world_from_ego))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import log, store
-from mudg.base.errors import InputError, ResourceError
+from mudg.base.errors import InputError
 from mudg.base.processes import process_alive
 from mudg.base.run_folder import all_names
 from mudg.base.types import Camera, EgoPath, Frame, Matrix, Photo, Ref, Scene, Source, Sweep, SweepPoints, Track, View
@@ -55,11 +55,8 @@ class SceneWriter:
             remedy = "choose another folder or remove it"
             raise InputError("there is a scene here already", where=str(self.root), remedy=remedy)
         self._partial = _partial_folder(self.root)
-        try:
+        with store.disk_errors("cannot create the scene's folder", self.root):
             self._partial.mkdir(parents=True)
-        except OSError as error:
-            what, got = "cannot create the scene's folder", str(error)
-            raise ResourceError(what, where=str(self.root), got=got, remedy="choose another --out") from error
         self._cameras: dict[str, Camera] = {}
         self._frames: dict[str, Frame] = {}
         self._sweeps: dict[str, Sweep] = {}
@@ -267,7 +264,7 @@ class SceneWriter:
         return replace(checked, root=str(self.root.absolute()))
 
     def _move_into_place(self) -> None:
-        try:
+        with store.disk_errors("scene cannot be moved into place", self.root, ""):
             if not self.root.exists():
                 self._partial.rename(self.root)
                 return
@@ -280,8 +277,6 @@ class SceneWriter:
                 else:
                     entry.replace(self.root / entry.name)
             shutil.rmtree(self._partial)
-        except OSError as error:
-            raise ResourceError("scene cannot be moved into place", where=str(self.root), got=str(error)) from error
 
     def _submit(self, ref: str, encode: Callable[[], bytes]) -> None:
         with self._lock:
@@ -297,10 +292,8 @@ class SceneWriter:
 
 
 def _partial_folder(root: Path) -> Path:
-    """Where to build a scene: inside its folder where that exists (a run's folder, a mounted one), else beside it.
-
-    What a killed writer left there is removed; another live process's work is not touched.
-    """
+    """Where to build a scene: inside its folder where that exists (a run's folder, a mounted one), else beside it. What
+    killed writers left there is removed."""
     root = root.absolute()
     parent, prefix = (root, ".scene.") if root.is_dir() else (root.parent, f".{root.name}.")
     for stale in parent.iterdir() if parent.is_dir() else ():
