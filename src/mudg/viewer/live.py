@@ -28,7 +28,6 @@ from mudg.editing.apply import FACT, Drawer, EditedDrive, carry_out, in_weather,
 from mudg.editing.harmonised import RenderMixer
 from mudg.editing.model import motion_of
 from mudg.editing.plan import EditPlan
-from mudg.editing.render import mixing
 from mudg.editing.runs import find_run
 from mudg.editing.script import EditScript, conditions_of, parse_edits, read_edits
 from mudg.formats.exporters.video import mp4_bytes
@@ -369,7 +368,7 @@ class FrameSource:
             seen = model if request.camera else over_ground(model)
             draw = _drawer_of(seen.without_nodes(gone) if gone else seen)
             if self._mixers and request.layer != "class" and not gone and not request.edits.strip():
-                return mixing(self._mixers[index], draw)
+                return lambda view: self._mixers[index](view, draw(view))
             conditions = conditions_of(model.facts.get(FACT, {}).get("script", ()))
             if conditions is None or request.layer != "color":
                 return draw
