@@ -370,7 +370,7 @@ def test_sessions_and_exact_frames_are_repaired_like_renders(run: Path) -> None:
     lens = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     at = {"eye": pose[:3, 3].tolist(), "axes": pose[:3, :3].T.tolist(), "time_s": view.time_s}
     question = FrameRequest(scene=0, layer="color", hidden=[], camera="front", **lens, **at)
-    shown = lambda request: np.asarray(Image.open(io.BytesIO(source.png(request)))).astype(int)
+    shown = lambda request: np.asarray(Image.open(io.BytesIO(source.png(request)[0]))).astype(int)
     assert np.abs(shown(question) - wanted).max() <= 1
     plain = render_view(model.without_nodes(["car"]), view, raster)
     assert np.abs(shown(question.model_copy(update={"hidden": ["car"]})) - to_bytes(plain.rgb)).max() <= 1
