@@ -19,7 +19,7 @@ from tiny_networks import small_mdm
 from toy_published import write_tiny
 from toy_world import write_scene
 
-from mudg.base import geometry, log, store
+from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Condition, FusedCloud, Observation, Photo, PointCloud, RenderPlanes, View
@@ -42,7 +42,7 @@ from mudg.diffusion.settings import HarmonizeConfig, SynthesizeConfig
 from mudg.diffusion.synthesize import JobInputs, view_maker
 from mudg.diffusion.views import recorded_images
 from mudg.editing import harmonised
-from mudg.editing.harmonised import RenderMixer, Touched, corrected, guarded, pasted, soft_edge
+from mudg.editing.harmonised import RenderMixer, Touched, guarded, pasted, soft_edge
 from mudg.editing.plan import Actor, EditPlan, EditSources, EditWorld, plan_edits
 from mudg.editing.recorded import boxes_mask, cleared_cloud, ground_mask, photos_of_edited, vacated_at
 from mudg.editing.script import parse_edits
@@ -50,7 +50,6 @@ from mudg.editing.settings import EditConfig, RenderConfig
 from mudg.gaussians import fit
 from mudg.gaussians.rendering import raster_of, render_view
 from mudg.gaussians.storage import load_model
-from mudg.scene.clouds import read_fused
 from mudg.scene.labels import read_label
 from mudg.scene.observations import read_observations
 from mudg.scene.read import read_image, read_scene
@@ -371,7 +370,7 @@ def test_sessions_and_exact_frames_are_repaired_like_renders(run: Path) -> None:
     lens = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     at = {"eye": pose[:3, 3].tolist(), "axes": pose[:3, :3].T.tolist(), "time_s": view.time_s}
     question = FrameRequest(scene=0, layer="color", hidden=[], camera="front", **lens, **at)
-    shown = lambda request: np.asarray(Image.open(io.BytesIO(source.png(request)))).astype(int)
+    shown = lambda request: np.asarray(Image.open(io.BytesIO(source.png(request)[0]))).astype(int)
     assert np.abs(shown(question) - wanted).max() <= 1
     plain = render_view(model.without_nodes(["car"]), view, raster)
     assert np.abs(shown(question.model_copy(update={"hidden": ["car"]})) - to_bytes(plain.rgb)).max() <= 1
@@ -443,26 +442,6 @@ def test_renders_are_repaired_where_the_edit_touches_them(
         assert not bool((differs & ~torch.from_numpy(near)).any())  # beside the car and its ground every bit stays
         assert torch.equal(new.semantics[~near], plain.semantics[~near])
     assert changed > 0
-
-
-def test_weather_is_that_of_the_formulas_with_another_model(run: Path, tmp_path: Path, capsys) -> None:
-    log.set_quiet(False)  # a command before may have been asked to be
-    parts = {"edits": script(tmp_path, "- weather: {fog: {visibility_m: 20}}"), "fused": run / "fuse"}
-    model = {"model": str(run / "model"), "steps": 2, "weather": 1.0}
-    physical = views_of(rendered(run, tmp_path / "physical", **parts))
-    kept = views_of(rendered(run, tmp_path / "asked", **parts, harmonize=model))
-    assert "no published-type model" in capsys.readouterr().err
-    assert all(torch.equal(one.rgb, before.rgb) for before, one in zip(physical, kept, strict=True))
-
-
-def test_a_correction_keeps_the_detail_of_the_render() -> None:
-    generator = torch.Generator().manual_seed(2)
-    render_ = observed(0.2 + 0.5 * torch.rand(3, 32, 48, generator=generator), torch.full((32, 48), ID["road"]))
-    small = torch.nn.functional.interpolate(render_.rgb[None], size=(16, 24), mode="area")[0]
-    assert torch.allclose(corrected(render_, small).rgb, render_.rgb, atol=1e-6)
-    assert torch.allclose(corrected(render_, small + 0.1).rgb, render_.rgb + 0.1, atol=1e-6)
-    own_size = 1 - render_.rgb  # what the model made
-    assert torch.allclose(corrected(render_, own_size).rgb, own_size, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -567,34 +546,6 @@ def test_points_and_reference_of_the_published_condition_are_in_fog_at_their_own
 
 
 @pytest.mark.slow
-def test_weather_is_generated_by_a_published_type_model(
-    run: Path, published: str, tmp_path: Path, monkeypatch, capsys
-) -> None:
-    """Its points and its reference are in the fog; beside the recorded path the first frame, which is the reference,
-    stays as rendered."""
-    log.set_quiet(False)
-    edits, shifts = script(tmp_path, "- weather: {fog: {visibility_m: 8}}"), (0.0, 1.0)
-    paths, model = ("front_recorded", "front_shift+1.0"), {"model": published, "steps": 1, "weather": 1.0}
-    folder = rendered(run, tmp_path / "physical", edits=edits, shifts_m=shifts)
-    before, given = {path: views_of(folder, path) for path in paths}, watched(monkeypatch)
-    parts = {"edits": edits, "fused": run / "fuse", "harmonize": model}
-    folder = rendered(run, tmp_path / "made", **parts, shifts_m=shifts)
-    made = {path: views_of(folder, path) for path in paths}
-    assert "formulas alone" not in capsys.readouterr().err
-    for path, frames in made.items():
-        for number, (one, new) in enumerate(zip(before[path], frames, strict=True)):
-            assert torch.equal(one.rgb, new.rgb) == (path != "front_recorded" and number == 0)
-            assert torch.equal(one.semantics, new.semantics)
-    scene, cloud = read_scene(run / "scene"), read_fused(run / "fuse")
-    recorded = recorded_images(scene, SynthesizeConfig())
-    rules = ConditionRules(12, 8, 60, 40, published=True)
-    clear = build_conditions(cloud, scene.tracks, given[0].views, recorded, rules)[0]
-    seen = (clear.color[0].amax(0) > 0) & (clear.measured.depth[0, 0] > 8) & clear.measured.valid[0, 0]
-    assert float(given[0].reference.std()) < 0.5 * float(clear.reference.std())  # fog takes contrast
-    assert float(given[0].color[0][:, seen].std()) < 0.5 * float(clear.color[0][:, seen].std())
-
-
-@pytest.mark.slow
 def test_views_are_generated_in_weather_by_a_published_type_model(
     run: Path, published: str, tmp_path: Path, monkeypatch
 ) -> None:
@@ -628,7 +579,7 @@ def test_a_removed_car_is_repaired_by_a_published_type_model(
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"weather": 0.5}, "makes views from noise"),
+        ({"objects": 0.5}, "makes views from noise"),
         ({"uncovered": 0.3}, "--harmonize.uncovered"),
         ({"short": True}, "at least 4 frames"),
     ],

@@ -103,7 +103,7 @@ def test_an_exact_frame_is_the_render_of_the_edited_fit(toy: Toy, tmp_path: Path
     source = FrameSource(desk.edited, scene, 1600, torch.device("cpu"))
 
     def drawn(script: str) -> np.ndarray:
-        return np.asarray(Image.open(io.BytesIO(source.png(asked.model_copy(update={"edits": script}))))) / 255.0
+        return np.asarray(Image.open(io.BytesIO(source.png(asked.model_copy(update={"edits": script}))[0]))) / 255.0
 
     seen, edited = drawn(SCRIPT), carry_out(parse_edits(SCRIPT, "edits.yaml"), model, scene).model(model)
     true = render_view(edited, wanted, raster_of(model)).rgb.permute(1, 2, 0).numpy()

@@ -53,7 +53,7 @@ from mudg.diffusion.views import windows
 from mudg.editing.apply import Drawer, EditedDrive, carry_out, complete_asset, write_asset
 from mudg.editing.harmonised import repairing
 from mudg.editing.model import linear_of
-from mudg.editing.recorded import DriveChange, EditedImages, write_edited_scene
+from mudg.editing.recorded import EditedImages, write_edited_scene
 from mudg.editing.script import parse_edits
 from mudg.editing.settings import EditConfig
 from mudg.gaussians import fit
@@ -700,9 +700,8 @@ def _script(case: EditCase, text: str, out: Path) -> str:
 def _refitted(config: BenchConfig, case: EditCase, drive: EditedDrive, images: EditedImages, out: Path) -> SceneModel:
     """The edited fit after as many steps again on the repaired images; as `mudg fit --start-from` on an edited run does
     it."""
-    # both were given
-    if not (out / "scene" / "scene.json").is_file() and drive.scene is not None and drive.cloud is not None:
-        write_edited_scene(case.scene, DriveChange(drive.plan, drive.scene, drive.cloud), images, out / "scene")
+    if not (out / "scene" / "scene.json").is_file():
+        write_edited_scene(case.scene, drive, images, out / "scene")
     save_model(images.after, out / "start")
     scene, start = read_scene(out / "scene"), StartFit(out / "start", "")
     settings = fit_settings(config, "fixed")

@@ -100,9 +100,6 @@ class HarmonizeConfig:
     schedule, 0 (it stays) to 1."""
     objects: float = setting(default=0.0, ge=0, le=1)
     """The same for objects that were moved or put in, and their shadows; 0 leaves all of them as rendered."""
-    weather: float = setting(default=0.0, ge=0, le=1)
-    """The same for every pixel of a view in other weather or light; 0 leaves it as the formulas of the edit make it.
-    For published-type models alone, whose points and reference are edited."""
     seed: int = 0
     """Seed of the noise."""
     precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"

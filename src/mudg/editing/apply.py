@@ -44,7 +44,7 @@ from mudg.editing import plan as plans
 from mudg.editing.model import GROUND_CLASSES, Asset, linear_of
 from mudg.editing.plan import Actor, Background, EditPlan, EditSources, EditWorld
 from mudg.editing.runs import RunParts, find_run
-from mudg.editing.script import AssetSource, EditScript, conditions_of
+from mudg.editing.script import EditScript, conditions_of
 from mudg.gaussians.model import CERTAINTY, SceneModel
 from mudg.gaussians.nodes import RigidNode, SkyNode
 from mudg.gaussians.rendering import raster_of, render_view
@@ -402,22 +402,31 @@ class EditedDrive:
 
 
 def carry_out(
-    script: EditScript, model: SceneModel, scene: Scene | None = None, cloud: FusedCloud | None = None
+    script: EditScript, model: SceneModel | None, scene: Scene | None = None, cloud: FusedCloud | None = None
 ) -> EditedDrive:
     """Carry out a script on a drive, but for its fitted scenes (``EditedDrive.model``). ``model``: a fit of the drive:
-    its objects are those that a script can name where there is no scene; its ground where there is no cloud.
-    InputError: something in the script that cannot be done here."""
-    if conditions_of(script.canonical()) is not None and not model.classes:
+    its objects are those that a script can name where there is no scene; its ground where there is no cloud. None: only
+    scene and cloud are wanted. InputError: something in the script that cannot be done here."""
+    if model is not None and conditions_of(script.canonical()) is not None and not model.classes:
         what = "weather, light and season need the classes of surfaces, and this scene was fitted without"
         remedy = "fit a scene with labels (`mudg annotate` makes them), or take them out of the script"
         raise InputError(what, where="weather, light, season", remedy=remedy)
     ground = ground_of(cloud, model)
     world = EditWorld.of_model(model, ground) if scene is None else EditWorld.of_scene(scene, ground)
-    background = lambda name: background_of(find_run(script.path_of(name)), name)
+
+    def background(name: str) -> Background:
+        if model is None:
+            what, remedy = "points alone cannot get another background", "give a fit (--fitted)"
+            raise InputError(what, where="run", got=name, remedy=remedy)
+        return background_of(find_run(script.path_of(name)), name)
+
     closes = scene is not None and scene.source.recipe is None  # a city has exact pictures of what an object hid
-    plan = plans.plan_edits(script, world, EditSources(opener(script), background, close_street=closes))
+    from_run = lambda source: asset_from(find_run(script.path_of(source.run)), source.id)
+    asset = lambda source: from_run(source) if source.file is None else read_asset(script.path_of(source.file))
+    plan = plans.plan_edits(script, world, EditSources(asset, background, close_street=closes))
     plan.views = () if scene is None else tuple(frame.view for frame in scene.frames)
-    take_light(plan, model)
+    if model is not None:
+        take_light(plan, model)
     if scene is None and plan.closed:
         names, why = sorted(plan.closed), "what recorded views show of it is not known (give --scene)"
         text = f"the street behind {', '.join(names)} stays as it was fitted: {why}"
@@ -449,12 +458,6 @@ def background_of(parts: RunParts, name: str) -> Background:
         raise InputError("the other street has no ground: its fit knows no classes", where="run", got=name)
     light = surface_light(model, [frame.view for frame in scene.frames])
     return Background(model, Motion.recorded(scene.ego.times_s, scene.ego.world_from_ego), ground, cloud, light)
-
-
-def opener(script: EditScript) -> Callable[[AssetSource], Asset]:
-    """What reads the objects that a script names."""
-    from_run = lambda source: asset_from(find_run(script.path_of(source.run or "")), source.id or "")
-    return lambda source: from_run(source) if source.file is None else read_asset(script.path_of(source.file))
 
 
 # -- objects as files --------------------------------------------------------------------------------

@@ -25,14 +25,7 @@ from mudg.diffusion.synthesize import DriveInputs, JobInputs
 from mudg.diffusion.views import recorded_images
 from mudg.editing.apply import EditedDrive, carry_out, weather_of
 from mudg.editing.harmonised import check_paths, repairing
-from mudg.editing.recorded import (
-    DriveChange,
-    EditedImages,
-    drive_of_edits,
-    photos_of_edited,
-    vacated_at,
-    write_edited_scene,
-)
+from mudg.editing.recorded import EditedImages, cleared_cloud, photos_of_edited, vacated_at, write_edited_scene
 from mudg.editing.runs import RunParts
 from mudg.editing.script import EditScript, conditions_of
 from mudg.editing.settings import EditConfig
@@ -105,7 +98,7 @@ def _write_run(drive: EditedDrive, parts: RunParts, scene: Scene, images: Edited
     if not (out / "fuse" / "fuse.json").is_file():
         write_fused(out / "fuse", cloud, _report_of(parts, cloud))
     if not (out / "scene" / "scene.json").is_file():
-        counts = write_edited_scene(scene, DriveChange(drive.plan, edited, cloud), images, out / "scene").record()
+        counts = write_edited_scene(scene, drive, images, out / "scene")
         store.write_json(out / "lidar.json", {"schema": 1, **counts})
     for name, path in parts.fits.items():
         if not (out / "fit" / name / "model.json").is_file():
@@ -128,9 +121,14 @@ def _report_of(parts: RunParts, cloud: FusedCloud) -> dict[str, object]:
 def edited_scene(script: EditScript, config: SynthesizeConfig, inputs: JobInputs, scene: Scene) -> Scene:
     """The scene as the script leaves it. What cannot be done is told here, before anything is written. UsageError: an
     edit that the drive does not allow."""
-    told = not shows_weather(config, script, inputs.fitted is not None)
-    fitted = None if inputs.fitted is None else load_model(inputs.fitted)
-    return drive_of_edits(script, scene, read_fused(inputs.fused), fitted, told=told).scene
+    if conditions_of(script.canonical()) is not None and not shows_weather(config, script, inputs.fitted is not None):
+        takes = "that takes --fitted and a published-type model"
+        log.info(f"generated views show no weather and light ({takes}); `mudg render` does")
+    fit = None if inputs.fitted is None else load_model(inputs.fitted)
+    drive = carry_out(script, fit, scene, read_fused(inputs.fused))
+    if fit is not None:
+        drive.model(fit)
+    return drive.scene or scene
 
 
 def edited_drive(script: EditScript, config: SynthesizeConfig, inputs: JobInputs) -> DriveInputs:
@@ -138,13 +136,13 @@ def edited_drive(script: EditScript, config: SynthesizeConfig, inputs: JobInputs
     its weather."""
     scene, cloud = read_scene(inputs.scene), read_fused(inputs.fused)
     fit = None if inputs.fitted is None else load_model(inputs.fitted)
-    drive = drive_of_edits(script, scene, cloud, fit)
+    drive = carry_out(script, fit, scene, cloud)
+    edited, fit = drive.scene or scene, None if fit is None else drive.model(fit)
     conditions, weather = conditions_of(script.canonical()), None
-    if conditions is not None and drive.model is not None and shows_weather(config, script, True):
-        draw = functools.partial(render_view, drive.model, raster=raster_of(drive.model))
-        weather = weather_of(draw, conditions, drive.scene)
-    recorded = photos_of_edited(recorded_images(scene, config), drive.plan)
-    return DriveInputs(drive.scene, drive.cloud, recorded, drive.model, vacated_at(drive.plan), weather)
+    if conditions is not None and fit is not None and shows_weather(config, script, True):
+        weather = weather_of(functools.partial(render_view, fit, raster=raster_of(fit)), conditions, edited)
+    recorded, cloud = photos_of_edited(recorded_images(scene, config), drive.plan), drive.cloud or cloud
+    return DriveInputs(edited, cleared_cloud(cloud, drive.plan), recorded, fit, vacated_at(drive.plan), weather)
 
 
 def shows_weather(config: SynthesizeConfig, script: EditScript, fitted: bool) -> bool:

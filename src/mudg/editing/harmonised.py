@@ -19,7 +19,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 import torch
@@ -28,25 +28,23 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
 
-from mudg.base import log
 from mudg.base.errors import UsageError
 from mudg.base.palette import DYNAMIC_IDS
 from mudg.base.types import FusedCloud, Observation, Photo, Scene, Track, Trajectory, View
 from mudg.diffusion import views as loading
-from mudg.diffusion.condition import GROUND_IDS, ConditionRules, WarpSource, determined
-from mudg.diffusion.inputs import ConditionSources, InWeather, conditions_of
+from mudg.diffusion.condition import GROUND_IDS, ConditionRules, determined
+from mudg.diffusion.inputs import ConditionSources
 from mudg.diffusion.published import is_published, window_of
-from mudg.diffusion.requests import StartClip, generated
+from mudg.diffusion.requests import StartClip
 from mudg.diffusion.settings import HarmonizeConfig, SynthesizeConfig
 from mudg.diffusion.synthesize import JobInputs, view_maker
-from mudg.diffusion.views import EDITED_IMAGES_PER_VIEW, ViewMaker, recorded_at_pose, recorded_images, windows
+from mudg.diffusion.views import EDITED_IMAGES_PER_VIEW, ViewMaker, recorded_images
 from mudg.editing import recorded as records
 from mudg.editing.apply import FACT, EditedDrive
 from mudg.editing.plan import EditPlan
 from mudg.editing.recorded import EditedImages, boxes_mask, ground_mask, others, touched_boxes, vacated_at
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import FAR_M, raster_of, render_planes, render_view
-from mudg.networks.codec import Modality
 
 DYNAMIC: Final = torch.tensor(sorted(DYNAMIC_IDS), dtype=torch.uint8)
 FEATHER_PX: Final = 3
@@ -65,12 +63,10 @@ PUBLISHED_OVERLAP: Final = 8
 def settings_of(config: HarmonizeConfig, device: str) -> SynthesizeConfig:
     """How the model of a configuration samples. UsageError: a published-type model is to leave a render part of the
     way: it makes its clips from noise alone."""
-    strengths = {"uncovered": config.uncovered, "objects": config.objects, "weather": config.weather}
-    partial = [f"--harmonize.{name} {value:g}" for name, value in strengths.items() if 0 < value < 1]
-    if partial and is_published(config.model):
-        name, value = partial[0].split()
-        what = "a published-type model makes views from noise: it cannot stay near a render"
-        raise UsageError(what, where=name, expected="0 or 1", got=value)
+    for name, value in {"uncovered": config.uncovered, "objects": config.objects}.items():
+        if 0 < value < 1 and is_published(config.model):
+            what = "a published-type model makes views from noise: it cannot stay near a render"
+            raise UsageError(what, where=f"--harmonize.{name}", expected="0 or 1", got=f"{value:g}")
     own = {name: getattr(config, name) for name in ("model", "steps", "precision", "seed")}
     return SynthesizeConfig(**own, device=device, processes=1)
 
@@ -79,9 +75,8 @@ def check_as_recorded(fitted: SceneModel, where: str) -> None:
     """UsageError if the Gaussians are of an edited drive: photographs may still show what was removed."""
     if FACT in fitted.facts:
         what, expected = "only a fit of the drive as it was recorded can be repaired", "Gaussians made by fit"
-        raise UsageError(
-            what, where=where, expected=expected, got="Gaussians of an edited drive", remedy="leave it out"
-        )
+        got, remedy = "Gaussians of an edited drive", "leave it out"
+        raise UsageError(what, where=where, expected=expected, got=got, remedy=remedy)
 
 
 def check_paths(config: HarmonizeConfig, frames: Mapping[str, int]) -> None:
@@ -136,11 +131,6 @@ class EditedSources:
         plan, cloud = drive.plan, records.cleared_cloud(drive.cloud, drive.plan)
         photos = records.photos_of_edited(recorded_images(recorded, SynthesizeConfig()), plan)
         return cls(fitted, plan, cloud, drive.scene.tracks, photos)
-
-    def conditions(self, rules: ConditionRules, *how: InWeather) -> ConditionSources:
-        """What conditions of views of the drive are made of, in weather if there is some."""
-        render, vacated = functools.partial(render_planes, self.fitted), vacated_at(self.plan)
-        return ConditionSources(self.cloud, self.tracks, self.photos, rules, render, None, vacated, *how)
 
 
 def touched_pixels(plan: EditPlan, view: View, pictures: tuple[Observation, Observation]) -> Touched:
@@ -217,40 +207,39 @@ class Harmoniser:
         self, sources: EditedSources, config: HarmonizeConfig, size: tuple[int, int], device: str = "auto"
     ) -> None:
         """``size``: width and height of the views."""
-        self._settings = loading.check_config(settings_of(config, device), fitted=not is_published(config.model))
+        settings = loading.check_config(settings_of(config, device), fitted=not is_published(config.model))
         self._sources, self._config = sources, config
-        model = loading.load_any(self._settings)
-        self.window, overlap = model.config.window, PUBLISHED_OVERLAP if model.points_alone else OVERLAP
-        self._overlap = min(overlap, self.window - 1)
+        model = loading.load_any(settings)
+        self._overlap, alone = PUBLISHED_OVERLAP if model.points_alone else OVERLAP, model.points_alone
         width, height = model.image_size(*size, 0)
-        alone = model.points_alone
         rules = ConditionRules(width, height, *size, images_per_view=EDITED_IMAGES_PER_VIEW, published=alone)
-        self._maker = ViewMaker(model, sources.conditions(rules), self._settings, None if alone else self._start_at)
-        self._parts: list[tuple[Observation, Touched]] = []
+        render, vacated = functools.partial(render_planes, sources.fitted), vacated_at(sources.plan)
+        shown = ConditionSources(sources.cloud, sources.tracks, sources.photos, rules, render, None, vacated)
+        self._maker = ViewMaker(model, shown, settings, None if alone else self._start_at)
+        self._parts: dict[int, tuple[Observation, Touched]] = {}
+        """Renders of the window that is being made, by the number of their view, and what edits touch in them."""
 
     def _start_at(self, views: Sequence[View]) -> StartClip:
         """The renders of the window that is being made, at the size that the model works at."""
         size, config = (views[0].camera.height, views[0].camera.width), self._config
-        renders, touched = [part[0] for part in self._parts], [part[1] for part in self._parts]
+        renders, touched = zip(*self._parts.values(), strict=True)
         freedom = [config.uncovered * (t.uncovered | t.shaded) + config.objects * t.objects for t in touched]
         return start_clip(renders, freedom, size)
 
     def along(self, views: Sequence[View], draw: DrawPair) -> Iterator[Observation]:
         """The views of a path, in order, with the touched pixels repaired. Nothing is generated for a window that edits
         do not touch."""
-        done, tail = 0, dict[Modality, Tensor]()
-        parts: dict[int, tuple[Observation, Touched]] = {}
-        for number, span in enumerate(windows(len(views), self.window, self._overlap)):
-            parts = {i: parts[i] if i in parts else self._part(views[i], draw) for i in span}
-            if not any(bool((touched.objects | touched.uncovered).any()) for _, touched in parts.values()):
-                yield from (parts[i][0] for i in span if i >= done)
-                done, tail = span.stop, {}
-                continue
-            self._parts = list(parts.values())
-            known = {m: z[-(done - span.start) :] for m, z in tail.items()} if tail and done > span.start else None
-            sample, _, generated = self._maker.make([views[i] for i in span], number, known)
-            yield from [self._repaired(*parts[i], generated[i - span.start]) for i in span if i >= done]
-            done, tail = span.stop, sample.latents
+
+        def touched(span: range) -> bool:
+            before = self._parts
+            self._parts = {i: before[i] if i in before else self._part(views[i], draw) for i in span}
+            return any(bool((touched.objects | touched.uncovered).any()) for _, touched in self._parts.values())
+
+        self._parts, spans = {}, self._maker.spans(len(views), self._overlap)
+        for number, fresh, made in self._maker.along(views, spans, wanted=touched):
+            for i in fresh:
+                render, area = self._parts[i]
+                yield render if made is None else self._repaired(render, area, made[2][i - spans[number].start])
 
     def _part(self, view: View, draw: DrawPair) -> tuple[Observation, Touched]:
         usual, made = draw(view)
@@ -287,18 +276,10 @@ def repairing(images: EditedImages, drive: EditedDrive, recorded: Scene) -> Edit
     return replace(images, repaired=made)
 
 
-class AlongPaths(Protocol):
-    """What changes the views of a path, in order."""
-
-    def along(self, views: Sequence[View], draw: DrawPair) -> Iterator[Observation]:
-        """The views, changed; ``draw`` makes each without and with the edits."""
-        ...
-
-
 class RepairedViews:
     """Draws the views of paths repaired, one path at a time and in order; any other view as the renders show it."""
 
-    def __init__(self, harmoniser: AlongPaths, draw: DrawPair) -> None:
+    def __init__(self, harmoniser: Harmoniser, draw: DrawPair) -> None:
         self._harmoniser, self._draw = harmoniser, draw
         self._left: Iterator[tuple[View, Observation]] = iter(())
         self._views: tuple[View, ...] = ()
@@ -358,75 +339,3 @@ def mixed(render: Observation, generated: Observation) -> Observation:
         depth = torch.where(known & torch.isfinite(generated.depth), mean(depth, generated.depth), depth)
         depth = torch.where(known, depth, generated.depth)
     return replace(render, rgb=mean(render.rgb, generated.rgb).clamp(0, 1), depth=depth)
-
-
-# -- weather ---------------------------------------------------------------------------------------
-#
-# Views in other weather or light that a published-type diffusion model makes, after the formulas of `core.weather`.
-# The model is given points and a reference image in that weather, as in the paper's figure of edited backgrounds, and
-# makes the view from noise. It works at its own size: what it changes there is enlarged and added to the render, which
-# so keeps its detail. Depth, classes and confidence stay as rendered.
-
-
-def harmonises_weather(config: HarmonizeConfig, how: InWeather) -> bool:
-    """Whether a diffusion model corrects this weather; says so where it was asked for and cannot be."""
-    if not how.settings.changes_air_ground_or_light:
-        return False
-    published = is_published(config.model)
-    if config.weather > 0 and published:
-        return True
-    why = "--harmonize.weather is 0" if published else f"{config.model} is no published-type model"
-    log.info(f"weather and light are those of the formulas alone: {why}")
-    return False
-
-
-class WeatherHarmoniser:
-    """Corrects views in other weather, window after window along a path."""
-
-    def __init__(
-        self,
-        sources: EditedSources,
-        how: InWeather,
-        config: HarmonizeConfig,
-        size: tuple[int, int],
-        device: str = "auto",
-    ) -> None:
-        """``size``: width and height of the views."""
-        settings = loading.check_config(settings_of(config, device), fitted=False)
-        self._model = loading.load_any(settings)
-        self._request = loading.request_of(settings, loading.half_of(settings) == torch.bfloat16)
-        width, height = self._model.image_size(*size, 0)
-        rules = ConditionRules(width, height, *size, images_per_view=EDITED_IMAGES_PER_VIEW, published=True)
-        self._given = sources.conditions(rules, how)
-        self._kept: dict[int, WarpSource] = {}
-
-    def along(self, views: Sequence[View], draw: DrawPair) -> Iterator[Observation]:
-        """The views of a path, in order, corrected; ``draw`` makes each without and with the weather."""
-        done, tail = 0, dict[Modality, Tensor]()
-        renders: dict[int, Observation] = {}
-        window = self._model.config.window
-        for number, span in enumerate(windows(len(views), window, min(PUBLISHED_OVERLAP, window - 1))):
-            renders = {i: renders[i] if i in renders else draw(views[i])[1] for i in span}
-            condition = conditions_of(self._given, "full", [views[i] for i in span], self._kept)[0]
-            known = {m: z[-(done - span.start) :] for m, z in tail.items()} if tail and done > span.start else None
-            clip = generated(self._model, condition, replace(self._request, index=number, known=known))
-            elsewhere = not recorded_at_pose(views[span.start], self._given.recorded)  # frame 0 is the reference
-            for i in span:
-                if i >= done:
-                    stays = elsewhere and i == span.start
-                    yield renders[i] if stays else corrected(renders[i], clip.rgb[i - span.start])
-            done, tail = span.stop, clip.latents
-
-
-def corrected(render: Observation, generated: Tensor) -> Observation:
-    """A render with what `generated` f32[3,h,w], of any size, changes of it (see `changed_by`)."""
-    return replace(render, rgb=changed_by(render.rgb, generated))
-
-
-def changed_by(rgb: Tensor, generated: Tensor) -> Tensor:
-    """Colours f32[3,H,W] with what `generated` f32[3,h,w], of any size, changes of them at that size."""
-    area = functional.interpolate(rgb[None], size=generated.shape[-2:], mode="area")
-    change = functional.interpolate(generated[None] - area, size=rgb.shape[-2:], mode="bilinear", align_corners=False)[
-        0
-    ]
-    return (rgb + change).clamp(0, 1)

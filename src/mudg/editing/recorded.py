@@ -7,10 +7,11 @@ the render of the edited one. Where the vehicle drives another path or through a
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 import torch
@@ -19,18 +20,16 @@ from PIL import Image, ImageDraw
 from scipy import ndimage
 
 from mudg.base import geometry, log, seeds
-from mudg.base.errors import InputError
 from mudg.base.palette import DYNAMIC_IDS, ID, UNLABELLED
 from mudg.base.types import Frame, FusedCloud, Observation, Photo, PointCloud, Scene, Sweep, SweepPoints, View
 from mudg.core import lidar
-from mudg.core.edit import HeightMap, Motion
+from mudg.core.edit import Motion
 from mudg.core.pictures import to_bytes
 from mudg.core.weather.lidar import SOFT, sweep_in_weather
 from mudg.diffusion.condition import Vacated, VacatedAt, ray_directions
-from mudg.editing.apply import SEED, carry_out, edited_cloud, edited_scene, opener
+from mudg.editing.apply import SEED, EditedDrive, some_points
 from mudg.editing.model import FLOOR_M, GROUND_CLASSES, STRAY_M
-from mudg.editing.plan import Actor, Background, EditPlan, EditSources, EditWorld, plan_edits
-from mudg.editing.script import EditScript, conditions_of
+from mudg.editing.plan import Actor, EditPlan
 from mudg.editing.settings import EditConfig
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import raster_of, render_view
@@ -49,36 +48,17 @@ BEHIND_M: Final = 20.0
 ON_GROUND_M: Final = 0.15
 LEAST_GROUND: Final = 10
 Rows = NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True)
-class SweptCounts:
-    """What became of returns: ``cleared`` met an object that is gone; of these ``on_ground`` meet the ground behind it;
-    ``on_objects`` meet an object at its new place, of which ``hidden`` had met something behind it; ``unknown`` do not
-    come back. Of those that do, ``lost`` do not in fog or rain, and ``droplets`` come from fog."""
-
-    cleared: int = 0
-    on_ground: int = 0
-    on_objects: int = 0
-    hidden: int = 0
-    unknown: int = 0
-    lost: int = 0
-    droplets: int = 0
-
-    def plus(self, other: SweptCounts) -> SweptCounts:
-        """Both together."""
-        return SweptCounts(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
-
-    def record(self) -> dict[str, int]:
-        """As JSON values; those of weather where there is some."""
-        return {name: value for name, value in asdict(self).items() if value or name not in ("lost", "droplets")}
+SWEPT: Final = ("cleared", "on_ground", "on_objects", "hidden", "unknown")
+"""What becomes of returns: cleared met an object that is gone; of these on_ground meet the ground behind it; on_objects
+meet an object at its new place, of which hidden had met something behind it; unknown do not come back. Of those that
+do, ``lost`` do not in fog or rain, and ``droplets`` come from fog."""
 
 
 def edited_points(
     points: SweepPoints, sweep: Sweep, plan: EditPlan, cloud: FusedCloud
-) -> tuple[SweepPoints, SweptCounts]:
-    """The points of a sweep as the sensor would see the edited drive. ``cloud``: edited fused clouds: they hold the
-    surfaces of objects, in the frames of their boxes."""
+) -> tuple[SweepPoints, dict[str, int]]:
+    """The points of a sweep as the sensor would see the edited drive, and how many became what (`SWEPT`). ``cloud``:
+    edited fused clouds: they hold the surfaces of objects, in the frames of their boxes."""
     xyz = points.xyz.astype(np.float64)
     ranges = np.linalg.norm(xyz, axis=1)
     usable = ranges > 1e-3
@@ -111,8 +91,8 @@ def edited_points(
     kinds = (cleared, fallen & ~taken & back, taken & back, taken & np.isfinite(before), usable & ~back)
     kept = back | ~(usable | cleared)
     classes = None if classes is None else classes[kept]
-    points = SweepPoints(made[kept], intensity[kept], points.dt_s[kept], classes)
-    return points, SweptCounts(*(int(kind.sum()) for kind in kinds))
+    counts = {name: int(kind.sum()) for name, kind in zip(SWEPT, kinds, strict=True)}
+    return SweepPoints(made[kept], intensity[kept], points.dt_s[kept], classes), counts
 
 
 def _pose(motion: Motion, sweep: Sweep) -> NDArray[np.float64] | None:
@@ -221,41 +201,6 @@ FARTHEST_GROUND_M: Final = 80.0
 """Nothing is known of how the ground goes on farther away."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DriveOfEdits:
-    """A drive as the diffusion model is to see it: what was planned, the edited scene, clouds and fit (None where there
-    is none)."""
-
-    plan: EditPlan
-    scene: Scene
-    cloud: FusedCloud
-    model: SceneModel | None
-
-
-def drive_of_edits(
-    script: EditScript, scene: Scene, cloud: FusedCloud, model: SceneModel | None, *, told: bool = False
-) -> DriveOfEdits:
-    """Carry out a script on a scene and its clouds, and on its fit where there is one. ``told``: warn of what the
-    script says and the conditions do not show. InputError: something in the script that cannot be done here."""
-    if told and conditions_of(script.canonical()) is not None:
-        takes = "that takes --fitted and a published-type model"
-        log.info(f"generated views show no weather and light ({takes}); `mudg render` does")
-    if model is not None:
-        drive = carry_out(script, model, scene, cloud)
-        cleared = cleared_cloud(drive.cloud or cloud, drive.plan)
-        return DriveOfEdits(drive.plan, drive.scene or scene, cleared, drive.model(model))
-    xyz = cloud.static.xyz
-    xyz = xyz[:0] if cloud.static.semantics is None else xyz[np.isin(cloud.static.semantics, GROUND_CLASSES)]
-    world = EditWorld.of_scene(scene, HeightMap.from_points(xyz) if len(xyz) else None)
-    plan = plan_edits(script, world, EditSources(opener(script), _no_background))
-    return DriveOfEdits(plan, edited_scene(scene, plan), cleared_cloud(edited_cloud(cloud, plan), plan), None)
-
-
-def _no_background(name: str) -> Background:
-    what, remedy = "points alone cannot get another background", "give a fit (--fitted)"
-    raise InputError(what, where="run", got=name, remedy=remedy)
-
-
 def photos_of_edited(photos: Iterable[Photo], plan: EditPlan) -> list[Photo]:
     """Recorded photographs with the pixels marked that do not show the edited drive."""
     return [replace(photo, usable=_usable(photo, plan)) for photo in photos]
@@ -337,9 +282,7 @@ def cleared_cloud(cloud: FusedCloud, plan: EditPlan) -> FusedCloud:
             half = np.asarray(actor.size_m) / 2
             inside = (np.abs(local[:, :2]) <= half[:2] + STRAY_M).all(1) & (local[:, 2] <= half[2] + STRAY_M)
             stray |= inside & (local[:, 2] > FLOOR_M - half[2])
-    kept = ~(stray & ~low_of)
-    semantics = None if static.semantics is None else static.semantics[kept]
-    return replace(cloud, static=replace(static, xyz=static.xyz[kept], rgb=static.rgb[kept], semantics=semantics))
+    return replace(cloud, static=some_points(static, ~(stray & ~low_of)))
 
 
 def others(plan: EditPlan, time_s: float) -> list[Box]:
@@ -416,31 +359,22 @@ class EditedImages:
         return np.where(changed[..., None], to_bytes(made.rgb), recorded), changed, made
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DriveChange:
-    """What is to be written. ``plan``: what was done. ``scene``: with the edited boxes, path and poses
-    (``apply.edited_scene``). ``cloud``: edited."""
-
-    plan: EditPlan
-    scene: Scene
-    cloud: FusedCloud
-
-
-def write_edited_scene(scene: Scene, drive: DriveChange, images: EditedImages, root: Path) -> SweptCounts:
-    """Write a scene whose files show the edits; returns what became of LiDAR returns. ``scene``: as recorded."""
-    edited, counts = drive.scene, SweptCounts()
+def write_edited_scene(scene: Scene, drive: EditedDrive, images: EditedImages, root: Path) -> dict[str, int]:
+    """Write a scene whose files show the edits; returns what became of LiDAR returns. ``scene``: as recorded.
+    ``drive``: with its scene and its cloud."""
+    edited, cloud, counts = cast("Scene", drive.scene), cast("FusedCloud", drive.cloud), Counter[str]()
     source = replace(scene.source, recipe=None, notes=(*scene.source.notes, NOTE))
     with SceneWriter(root, scene.id, source) as writer:
         for camera in scene.cameras.values():
             writer.add_camera(camera)
         # another street was not measured from here
         for number, sweep in enumerate(scene.sweeps if drive.plan.background is None else ()):
-            points, became = edited_points(read_points(scene, sweep), sweep, drive.plan, drive.cloud)
+            points, became = edited_points(read_points(scene, sweep), sweep, drive.plan, cloud)
+            counts.update(became)
             if drive.plan.weather_of_beams is not None:
                 there, seed = len(points.xyz), seeds.key(SEED, number, "LiDAR in weather")
                 points, kinds = sweep_in_weather(points, drive.plan.weather_of_beams, seed)
-                became = replace(became, lost=there - len(kinds), droplets=int((kinds == SOFT).sum()))
-            counts = counts.plus(became)
+                counts.update(lost=there - len(kinds), droplets=int((kinds == SOFT).sum()))
             writer.add_sweep(sweep.id, sweep.sensor, sweep.time_s, sweep.world_from_lidar, points)
         for track in edited.tracks:
             writer.add_track(track)
@@ -454,7 +388,7 @@ def write_edited_scene(scene: Scene, drive: DriveChange, images: EditedImages, r
             else:
                 writer.add_frame(new.id, new.view, image, _labels(scene, old, changed, made))
         writer.finish()
-    return counts
+    return {name: counts[name] for name in (*SWEPT, *(name for name in ("lost", "droplets") if counts[name]))}
 
 
 def _labels(scene: Scene, frame: Frame, changed: NDArray[np.bool_], generated: Observation) -> dict[str, NDArray[Any]]:

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, closing
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, cast
-
-import torch
 
 from mudg import native
 from mudg.base import log, memory
@@ -29,7 +27,6 @@ from mudg.baselines.emernerf import load_field, observe
 from mudg.core import trajectory
 from mudg.core.pictures import panels_of, side_by_side
 from mudg.core.raster.rasterize import drawing_device
-from mudg.diffusion.inputs import InWeather
 from mudg.diffusion.synthesize import JobInputs
 from mudg.editing import harmonised
 from mudg.editing.apply import FACT, Drawer, EditedDrive, carry_out, in_weather, scene_seen_by, weather_of
@@ -50,12 +47,8 @@ from mudg.scene.read import read_scene
 VIEW_BYTES: Final = 4 * (3 + 1 + 1 + len(CLASSES))
 """Bytes per pixel that drawing a view needs at least: colour, depth, coverage and shares of the classes."""
 AHEAD_PIXELS: Final = 1_000_000
-VIDEO_FPS: Final = 10.0
 """Larger views are drawn one at a time by all threads: less memory."""
-Drawers = Callable[[Sequence[View]], AbstractContextManager[Iterator[Observation]]]
-"""Draws views in order."""
-
-
+VIDEO_FPS: Final = 10.0
 Edited = tuple[Scene, SceneModel, EditedDrive | None]
 """Scene and fit as they are rendered, and what an edit script did to them (None: there is none)."""
 
@@ -105,30 +98,30 @@ def write_views(
     summary. An interrupted run continues with the next missing view. ``scene``: gives cameras, times and the path of
     the vehicle. ``model``: folder made by fit. ``edited``: what ``prepare`` made of them. ``path``: as of
     ``trajectories``. ``fused``: fused clouds of the scene, for ``config.repair``."""
-    followers, out = list[RepairedViews](), work.path
+    repaired, out = None, work.path
     if kind_of(model) == RADIANCE:
         device = choose_device(config.device, "render")
-        loaded, (draw, source) = read_scene(scene), _field_drawer(config, model, device)
+        loaded, (field, budget) = read_scene(scene), load_field(model)
+        source = str(field.facts.get("method", "fit"))
+        draw = functools.partial(observe, field.to(device), budget=budget, source=source)
     else:
         device = drawing_device(config.device, "render", config.raster)
         loaded, fitted, drive = edited or _edited(scene, model, None)
         draw, source = _scene_drawer(config, fitted.to(device))
         if config.repair:
             inputs = JobInputs(scene, cast("Path", fused), model)
-            draw = mixing(harmonised.RenderMixer(inputs, config.harmonize, config.device), draw)
+            mixer, plain = harmonised.RenderMixer(inputs, config.harmonize, config.device), draw
+            draw = lambda view: mixer(view, plain(view))
         if config.harmonize.on and drive is not None:
-            draw = _repaired(config, drive, fitted, scene, model, draw)
-            followers.append(draw)
+            draw = repaired = _repaired(config, drive, fitted, scene, model, draw)
         conditions = conditions_of(fitted.facts.get(FACT, {}).get("script", ()))
         if conditions is not None:
-            how = weather_of(draw, conditions, loaded)
-            draw = in_weather(draw, how)
-            if config.harmonize.on and drive is not None and harmonised.harmonises_weather(config.harmonize, how):
-                draw = _corrected(config, drive, fitted, scene, draw, how)
-                followers.append(draw)
+            draw = in_weather(draw, weather_of(draw, conditions, loaded))
     paths = trajectories(loaded, config, path)
-    _require_memory(paths)
-    threads = 1 if followers or config.repair or device.type != "cpu" else native.threads()
+    largest = max((view.camera for path in paths for view in path.views), key=lambda one: one.width * one.height)
+    asked = f"a view of {largest.width} x {largest.height} pixels"
+    memory.require(largest.width * largest.height * VIEW_BYTES, asked, "smaller views (--width-px)")
+    threads = 1 if repaired or config.repair or device.type != "cpu" else native.threads()
     with (
         log.task(f"render {source}", sum(len(path) for path in paths)) as bar,
         memory_of(device, "render"),
@@ -136,21 +129,14 @@ def write_views(
     ):
         videos = list[Future[None]]()
         for path in paths:
-            for follower in followers:
-                follower.follow(path)
-            _render_trajectory(_several(draw, threads), path, out / path.name, source, bar)
+            if repaired:
+                repaired.follow(path)
+            _render_trajectory(draw, threads, path, out / path.name, source, bar)
             if config.video:
-                videos.append(encoder.submit(_write_video, out / path.name, out / f"{path.name}.mp4", VIDEO_FPS))
+                videos.append(encoder.submit(_write_video, out / path.name, out / f"{path.name}.mp4"))
         for video in videos:
             video.result()
     return {"trajectories": [path.name for path in paths], "views": sum(len(path) for path in paths)}
-
-
-def _require_memory(paths: Sequence[Trajectory]) -> None:
-    """ResourceError where one view of a trajectory cannot fit into memory."""
-    camera = max((view.camera for path in paths for view in path.views), key=lambda one: one.width * one.height)
-    pixels, asked = camera.width * camera.height, f"a view of {camera.width} x {camera.height} pixels"
-    memory.require(pixels * VIEW_BYTES, asked, "smaller views (--width-px)")
 
 
 def _edited(
@@ -166,15 +152,6 @@ def _edited(
     return drive.scene or loaded, drive.model(fitted), drive
 
 
-def mixing(mixer: harmonised.RenderMixer, draw: Drawer) -> Drawer:
-    """What draws views and repairs each."""
-    return lambda view: mixer(view, draw(view))
-
-
-def _twice(draw: Drawer, view: View) -> tuple[Observation, Observation]:
-    return (draw(view),) * 2
-
-
 def _repaired(
     config: RenderConfig, drive: EditedDrive, fitted: SceneModel, scene: Path, model: Path, draw: Drawer
 ) -> RepairedViews:
@@ -184,24 +161,9 @@ def _repaired(
     recorded = scene_seen_by(read_scene(scene), before.facts)
     usual, _ = _scene_drawer(config, before.to(fitted.device))
     sources = EditedSources.of(drive, fitted, recorded)
-    repair = harmonised.Harmoniser(sources, config.harmonize, _size(recorded, config), config.device)
+    camera = trajectories(recorded, config)[0].views[0].camera
+    repair = harmonised.Harmoniser(sources, config.harmonize, (camera.width, camera.height), config.device)
     return RepairedViews(repair, lambda view: (usual(view), draw(view)))
-
-
-def _corrected(
-    config: RenderConfig, drive: EditedDrive, fitted: SceneModel, scene: Path, draw: Drawer, how: InWeather
-) -> RepairedViews:
-    """What draws views in other weather, which ``draw`` makes by the formulas, corrected by the diffusion model."""
-    recorded = scene_seen_by(read_scene(scene), fitted.facts)
-    sources, size = EditedSources.of(drive, fitted, recorded), _size(recorded, config)
-    correct = harmonised.WeatherHarmoniser(sources, how, config.harmonize, size, config.device)
-    return RepairedViews(correct, functools.partial(_twice, draw))
-
-
-def _size(scene: Scene, config: RenderConfig) -> tuple[int, int]:
-    """Width and height of the views."""
-    camera = trajectories(scene, config)[0].views[0].camera
-    return camera.width, camera.height
 
 
 def _scene_drawer(config: RenderConfig, fitted: SceneModel) -> tuple[Drawer, str]:
@@ -212,13 +174,6 @@ def _scene_drawer(config: RenderConfig, fitted: SceneModel) -> tuple[Drawer, str
     return lambda view: render_view(fitted, view, raster, source), source
 
 
-def _field_drawer(config: RenderConfig, model: Path, device: torch.device) -> tuple[Drawer, str]:
-    """What draws the views of a radiance field, and its name."""
-    field, budget = load_field(model)
-    source = str(field.facts.get("method", "fit"))
-    return functools.partial(observe, field.to(device), budget=budget, source=source), source
-
-
 def trajectories(scene: Scene, config: RenderConfig, path: Path | None = None) -> tuple[Trajectory, ...]:
     """The trajectories a configuration names: every camera at every shift (0 = recorded), and on every further path; or
     that in the file ``path`` alone, with the optics of the first camera. UsageError: an unknown camera, or nothing to
@@ -226,18 +181,16 @@ def trajectories(scene: Scene, config: RenderConfig, path: Path | None = None) -
     cameras = config.cameras or tuple(scene.cameras)[:1]
     if path is not None:
         camera = scene.frames_of(cameras[0])[0].view.camera
-        found = read_path(path, scene, camera)
-        return (Trajectory(found.name, tuple(_optics(view, config) for view in found.views), found.origin),)
-    if not config.shifts_m and not config.paths:
+        paths = [read_path(path, scene, camera)]
+    elif not config.shifts_m and not config.paths:
         what, remedy = "nothing to render: no shifts were given", "at least one of --shifts-m; 0 is the recorded path"
         raise UsageError(what, remedy=remedy)
-    paths = []
-    for camera in cameras:
-        paths += [trajectory.at_shift(scene, camera, shift_m) for shift_m in config.shifts_m]
-        paths += [trajectory.named(scene, camera, name) for name in config.paths]
-    return tuple(
-        Trajectory(found.name, tuple(_optics(view, config) for view in found.views), found.origin) for found in paths
-    )
+    else:
+        paths = []
+        for camera in cameras:
+            paths += [trajectory.at_shift(scene, camera, shift_m) for shift_m in config.shifts_m]
+            paths += [trajectory.named(scene, camera, name) for name in config.paths]
+    return tuple(Trajectory(one.name, tuple(_optics(view, config) for view in one.views), one.origin) for one in paths)
 
 
 def _optics(view: View, config: RenderConfig) -> View:
@@ -248,21 +201,18 @@ def _optics(view: View, config: RenderConfig) -> View:
     return resized_view(view, config.width_px)
 
 
-def _several(draw: Drawer, threads: int) -> Drawers:
-    """What draws views in order; small ones beforehand, in as many threads, so that a thread draws while another
-    writes."""
-
-    def drawn(views: Sequence[View]) -> Generator[Observation, None, None]:
-        if threads == 1 or any(view.camera.width * view.camera.height > AHEAD_PIXELS for view in views):
-            yield from map(draw, views)
-            return
-        with native.one_thread():
-            yield from computed_ahead(lambda number: draw(views[number]), len(views), threads)
-
-    return lambda views: closing(drawn(views))
+def _drawn(draw: Drawer, views: Sequence[View], threads: int) -> Generator[Observation, None, None]:
+    """Views in order; small ones beforehand, in as many threads, so that a thread draws while another writes."""
+    if threads == 1 or any(view.camera.width * view.camera.height > AHEAD_PIXELS for view in views):
+        yield from map(draw, views)
+        return
+    with native.one_thread():
+        yield from computed_ahead(lambda number: draw(views[number]), len(views), threads)
 
 
-def _render_trajectory(draw: Drawers, path: Trajectory, out: Path, source: str, bar: log.ProgressTask) -> None:
+def _render_trajectory(
+    draw: Drawer, threads: int, path: Trajectory, out: Path, source: str, bar: log.ProgressTask
+) -> None:
     """One folder of observations; views that an earlier, interrupted run wrote are kept."""
     if (out / "observations.json").is_file():
         bar.advance(len(path))
@@ -272,14 +222,14 @@ def _render_trajectory(draw: Drawers, path: Trajectory, out: Path, source: str, 
         for view in kept:
             writer.skip(view)
             bar.advance()
-        with draw(path.views[len(kept) :]) as made:
+        with closing(_drawn(draw, path.views[len(kept) :], threads)) as made:
             for observation in made:
                 writer.add(observation)
                 bar.advance()
 
 
-def _write_video(observations: Path, path: Path, fps: float) -> None:
+def _write_video(observations: Path, path: Path) -> None:
     if path.is_file():
         return
     views = read_observations(observations)
-    write_mp4(path, (side_by_side(panels_of(views[index])) for index in range(len(views))), fps)
+    write_mp4(path, (side_by_side(panels_of(views[index])) for index in range(len(views))), VIDEO_FPS)

@@ -42,59 +42,40 @@ class GalleryEntry:
     pages: Mapping[str, Path]
 
 
-@dataclass(frozen=True)
-class Unread:
-    """A folder that is not on the page, and why."""
-
-    folder: Path
-    reason: str
-
-
 def read_shown(folder: Path) -> GalleryEntry:
     """What a folder of ``mudg run``, ``mudg score`` or ``mudg bench`` holds. InputError: it is none of them,
     unfinished, or damaged."""
     if not folder.is_dir():
         raise InputError("no such folder", where=str(folder))
     with understood("a finished run", str(folder)):
-        entry = _bench(folder) if (folder / "bench.json").is_file() else _run_or_scores(folder)
-        page([replace(entry, picture=None)], [], folder / "page.html")  # what cannot be shown ends here
+        entry = _read(folder)
+        page([replace(entry, picture=None)], {}, folder / "page.html")  # what cannot be shown ends here
     return entry
 
 
-def _run_or_scores(folder: Path) -> GalleryEntry:
+def _read(folder: Path) -> GalleryEntry:
+    pages = lambda **known: {title: path for title, path in known.items() if path.is_file()}
+    if (folder / "bench.json").is_file():
+        found = store.read_json(folder / "bench.json")
+        name = str(found.get("bench", "")) if isinstance(found, dict) else ""
+        own = pages(page=folder / "page.html", tables=folder / "bench.md")
+        return GalleryEntry(folder, f"bench {name}".strip(), None, "", None, own)
     state = store.read_json(folder / store.RUN_STATE) if (folder / store.RUN_STATE).is_file() else {}
-    asked = state.get("asked", {}) if isinstance(state, dict) else {}
-    if isinstance(asked, dict) and asked.get("verb") == "run":
-        return _run(folder, state)
-    if isinstance(state, dict) and state.get("verb") == "score":
-        _require_finished(folder, state)
-        return GalleryEntry(folder, "score", _scores(folder / "metrics.json"), "", None, {})
-    raise InputError("not a folder of mudg run, score or bench", where=str(folder))
-
-
-def _require_finished(folder: Path, state: Mapping[str, Any]) -> None:
+    state = state if isinstance(state, dict) else {}
+    asked = state.get("asked", {})
+    is_run = isinstance(asked, dict) and asked.get("verb") == "run"
+    if not is_run and state.get("verb") != "score":
+        raise InputError("not a folder of mudg run, score or bench", where=str(folder))
     if state.get("state") != "complete":
         got, remedy = str(state.get("state"))[:40], "repeat its command: it resumes"
         raise InputError("the run is not finished", where=str(folder), got=got, remedy=remedy)
-
-
-def _run(folder: Path, state: Mapping[str, Any]) -> GalleryEntry:
-    _require_finished(folder, state)
+    if not is_run:
+        return GalleryEntry(folder, "score", _scores(folder / "metrics.json"), "", None, {})
     scores = _scores(folder / "score" / "metrics.json")
-    seconds = sum(float(step.get("seconds", 0)) for step in state.get("steps", {}).values())
+    minutes, rest = divmod(round(sum(float(step.get("seconds", 0)) for step in state.get("steps", {}).values())), 60)
     known = {"report": folder / "report.html", "viewer": folder / viewer_address(folder)}
-    known["scores"] = folder / "score" / "metrics.md"
-    pages = {title: path for title, path in known.items() if path.is_file()}
-    minutes, rest = divmod(round(seconds), 60)
-    return GalleryEntry(folder, "run", scores, f"{minutes} min {rest} s", _picture(folder), pages)
-
-
-def _bench(folder: Path) -> GalleryEntry:
-    found = store.read_json(folder / "bench.json")
-    name = str(found.get("bench", "")) if isinstance(found, dict) else ""
-    known = {"page": folder / "page.html", "tables": folder / "bench.md"}
-    pages = {title: path for title, path in known.items() if path.is_file()}
-    return GalleryEntry(folder, f"bench {name}".strip(), None, "", None, pages)
+    own = pages(**known, scores=folder / "score" / "metrics.md")
+    return GalleryEntry(folder, "run", scores, f"{minutes} min {rest} s", _picture(folder), own)
 
 
 def _scores(path: Path) -> Mapping[str, Any]:
@@ -118,13 +99,14 @@ def _picture(folder: Path) -> Path | None:
 # ---- the page ----
 
 
-def page(shown: Sequence[GalleryEntry], unread: Sequence[Unread], out: Path) -> str:
+def page(shown: Sequence[GalleryEntry], unread: Mapping[Path, str], out: Path) -> str:
     """The whole page. Links are relative to ``out``, the file that it becomes; pictures lie inside. ``shown``: in this
-    order. ``unread``: listed with their reasons."""
+    order. ``unread``: folders that are listed with the reason why they are not shown."""
     names = _names([one.folder for one in shown])
     width = THUMBNAIL_PX[len(shown) > MANY]
     cards = [_card(one, name, out, width) for one, name in zip(shown, names, strict=True)]
-    metrics = _metrics(shown)
+    found = {m["name"]: m for one in shown if one.scores is not None for m in one.scores["metrics"]}
+    metrics = [found[name] for name in TERMINAL_METRICS if name in found]
     rows = [row for one, name in zip(shown, names, strict=True) for row in _rows(one, name, metrics)]
     return html.render(
         "gallery.html.j2",
@@ -135,7 +117,7 @@ def page(shown: Sequence[GalleryEntry], unread: Sequence[Unread], out: Path) -> 
         metrics=[{"title": m["title"], "unit": m["unit"], "better": m["better"]} for m in metrics],
         rows=rows,
         places=list(dict.fromkeys(row["place"] for row in rows)),
-        unread=[{"name": str(one.folder), "reason": one.reason} for one in unread],
+        unread=[{"name": str(folder), "reason": reason} for folder, reason in unread.items()],
     )
 
 
@@ -170,12 +152,6 @@ def _thumbnail(picture: Path | None, width: int) -> str:
     content = io.BytesIO()
     image.save(content, "JPEG", quality=80)
     return f"data:image/jpeg;base64,{base64.b64encode(content.getvalue()).decode('ascii')}"
-
-
-def _metrics(shown: Sequence[GalleryEntry]) -> list[Mapping[str, Any]]:
-    """The main metrics that any of the scores have, each once."""
-    found = {m["name"]: m for one in shown if one.scores is not None for m in one.scores["metrics"]}
-    return [found[name] for name in TERMINAL_METRICS if name in found]
 
 
 def _rows(one: GalleryEntry, name: str, metrics: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -220,18 +196,18 @@ def run(runs: Sequence[Path], out: Path, *, overwrite: bool = False) -> dict[str
     if out.suffix != ".html":
         raise UsageError("the page is an HTML file", where="--out", expected="a name that ends in .html", got=str(out))
     shown: list[GalleryEntry] = []
-    unread: list[Unread] = []
+    unread: dict[Path, str] = {}
     for folder in _folders(runs):
         try:
             shown.append(read_shown(folder))
         except InputError as error:
             log.warn(f"{folder}: {error.what}")
-            unread.append(Unread(folder, error.what if not error.got else f"{error.what}: {error.got}"))
+            unread[folder] = error.what if not error.got else f"{error.what}: {error.got}"
         except PermissionError as error:
             log.warn(f"{folder}: access was refused")
-            unread.append(Unread(folder, f"access was refused: {error.filename}"))
+            unread[folder] = f"access was refused: {error.filename}"
     if not shown:
-        where, got = ", ".join(str(one.folder) for one in unread[:4]), dict.fromkeys(one.reason for one in unread[:4])
+        where, got = ", ".join(map(str, [*unread][:4])), dict.fromkeys([*unread.values()][:4])
         expected = "folders of mudg run, score or bench"
         raise InputError("no finished run to show", where=where, got="; ".join(got), expected=expected)
     content = page(shown, unread, out.resolve()).encode()

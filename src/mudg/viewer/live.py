@@ -18,9 +18,8 @@ from pydantic import Field
 from mudg.base import store
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.plain_yaml import LARGEST_BYTES
-from mudg.base.records import Number, StrictRecord
-from mudg.base.types import Camera, FusedCloud, Observation, Scene, View
-from mudg.core.edit import Motion
+from mudg.base.records import Number, StrictRecord, parse_record
+from mudg.base.types import Camera, FusedCloud, Scene, View
 from mudg.core.pictures import class_colors, depth_colors, to_bytes
 from mudg.core.table import Table
 from mudg.diffusion.inputs import InWeather
@@ -28,7 +27,6 @@ from mudg.editing.apply import FACT, Drawer, EditedDrive, carry_out, in_weather,
 from mudg.editing.harmonised import RenderMixer
 from mudg.editing.model import motion_of
 from mudg.editing.plan import EditPlan
-from mudg.editing.render import mixing
 from mudg.editing.runs import find_run
 from mudg.editing.script import EditScript, conditions_of, parse_edits, read_edits
 from mudg.formats.exporters.video import mp4_bytes
@@ -135,14 +133,21 @@ class EditDesk:
                 self._planned = {**_last(self._planned, KEPT - 1), text: drive}
             return self._planned[text]
 
-    def answer(self, request: EditRequest) -> tuple[bytes, str]:
-        """What a script does, as JSON: paths of changed objects, who is gone, notes, the file that was saved."""
+    def answer(self, asked: object) -> tuple[bytes, str]:
+        """To an ``EditRequest``, as JSON: what a script does: paths of changed objects, who is gone, notes, the file
+        that was saved."""
+        request = parse_record(EditRequest, asked, "request")
         said: dict[str, Any] = {"paths": {}, "removed": [], "inserted": [], "notes": [], "saved": None}
         if request.script.strip():
-            drive = self._checked(request.script)
-            notes = [note["text"] for note in drive.notes] + _unseen(drive)
+            drive, notes = self._checked(request.script), list[str]()
+            if drive.plan.closed and drive.plan.views:
+                later = "the first one after some seconds; the page's own picture shows it as it was fitted"
+                notes.append(f"exact frames close the street that objects leave (close_street), {later}")
+            if drive.plan.moves_ego:
+                moved = "mudg render moves them with the vehicle"
+                notes.append(f"the recorded cameras of this page stay on the recorded path; {moved}")
             said |= {"paths": self._paths(drive), "removed": list(drive.plan.removed)}
-            said |= {"inserted": list(drive.plan.inserted), "notes": notes}
+            said |= {"inserted": list(drive.plan.inserted), "notes": [note["text"] for note in drive.notes] + notes}
         if request.save:
             said["saved"] = str(self.save(request.script))
         return store.json_text(said, indent=None).encode(), "application/json"
@@ -153,9 +158,9 @@ class EditDesk:
         drive = self._carried(text)
         if not (drive.plan.closed or drive.plan.sides):
             self.edited(text)
-            return drive
-        for model in self.models:
-            drive.model(model, street=street_left(model, drive.plan, close=False))
+        else:
+            for model in self.models:
+                drive.model(model, street=street_left(model, drive.plan, close=False))
         return drive
 
     def _paths(self, drive: EditedDrive) -> dict[str, Any]:
@@ -163,15 +168,11 @@ class EditDesk:
         show."""
         begin = begin_of(self.scene)
         nodes = {node.name: node for node in self.models[0].nodes if isinstance(node, RigidNode)}
-
-        def record(motion: Motion) -> dict[str, Any]:
-            rows = key_rows(motion.times_s - begin, motion.poses).tolist()
-            return {"rows": rows, "source": (motion.source_s - begin).tolist()}
-
         own = [name for name in drive.plan.changes if name in nodes]
-        changed = {name: drive.plan.changed(name, motion_of(nodes[name])) for name in own}
-        standing = {name: drive.plan.after.actors[name].motion for name in drive.plan.touched() if name not in changed}
-        return {name: record(motion) for name, motion in {**changed, **standing}.items()}
+        paths = {name: drive.plan.changed(name, motion_of(nodes[name])) for name in own}
+        paths |= {name: drive.plan.after.actors[name].motion for name in drive.plan.touched() if name not in paths}
+        rows = lambda path: key_rows(path.times_s - begin, path.poses).tolist()
+        return {name: {"rows": rows(path), "source": (path.source_s - begin).tolist()} for name, path in paths.items()}
 
     def save(self, text: str) -> Path:
         """Write the script. InputError: there is nothing to save, or the file belongs to somebody else."""
@@ -187,18 +188,6 @@ class EditDesk:
 def _last(kept: dict[Any, Any], count: int) -> dict[Any, Any]:
     """The last entries of a dictionary."""
     return dict(list(kept.items())[len(kept) - min(count, len(kept)) :])
-
-
-def _unseen(drive: EditedDrive) -> list[str]:
-    """What the page, or its exact frames, do not show of a script."""
-    found = []
-    if drive.plan.closed and drive.plan.views:
-        later = "the first one after some seconds; the page's own picture shows it as it was fitted"
-        found.append(f"exact frames close the street that objects leave (close_street), {later}")
-    if drive.plan.moves_ego:
-        moved = "mudg render moves them with the vehicle"
-        found.append(f"the recorded cameras of this page stay on the recorded path; {moved}")
-    return found
 
 
 def desk_for(
@@ -217,17 +206,14 @@ def desk_for(
 def place_for(run: Path, given: Path | None) -> Path:
     """Where edits of a run are saved: the given file, else beside the run, else in the current folder. UsageError: the
     given file lies in the result of a command."""
+    sealed = lambda file: any((folder / name).is_file() for folder in file.resolve().parents for name in SEALED)
     if given is not None:
-        if _sealed(given) or given.is_dir():
+        if sealed(given) or given.is_dir():
             what, expected = "edits are not saved into the result of a command", "a file outside of runs"
             raise UsageError(what, where="--edits-out", got=str(given), expected=expected)
         return given
     beside = Path(run).resolve().parent / NAME
-    return Path(NAME) if _sealed(beside) else beside
-
-
-def _sealed(path: Path) -> bool:
-    return any((folder / name).is_file() for folder in path.resolve().parents for name in SEALED)
+    return Path(NAME) if sealed(beside) else beside
 
 
 # -- frames ----------------------------------------------------------------------------------------
@@ -277,16 +263,6 @@ class VideoRequest(Wanted):
     moments: Annotated[list[Moment], Field(min_length=1, max_length=MOST_FRAMES)]
 
 
-@dataclass(frozen=True, slots=True)
-class _Shown:
-    """The scenes with a script carried out, on the device, and the weather of those that were asked for in colour, by
-    their number."""
-
-    edits: str
-    models: list[SceneModel]
-    weather: dict[int, InWeather]
-
-
 def over_ground(model: SceneModel) -> SceneModel:
     """The scene with grey ground where nothing covers it below the horizon. Its sky reaches there, too, but is right
     from the recorded path only."""
@@ -318,21 +294,36 @@ class FrameSource:
     ) -> None:
         self._mixers = mixers
         self._edited, self._scene, self._widest, self._device = edited, scene, widest, device
-        self._shown: _Shown | None = None
+        self._edits: str | None = None
+        self._models: list[SceneModel] = []
+        """The scenes with the script ``_edits`` carried out, on the device."""
+        self._weather: dict[int, InWeather] = {}
+        """Of the scenes that were asked for in colour, by their number."""
         self._lock, self._filming = threading.Lock(), threading.Lock()
 
-    def png(self, request: FrameRequest) -> bytes:
-        """A frame as PNG bytes. InputError: a camera that is none, or edits that cannot be carried out."""
-        content, view = io.BytesIO(), View(self._camera(request), _pose(request), float(request.time_s))
-        picture = self._picture(request.layer, self._drawer(request), view)
+    def png(self, asked: object) -> tuple[bytes, str]:
+        """The frame of a ``FrameRequest`` as PNG. InputError: a camera that is none, or edits that cannot be carried
+        out."""
+        request, content = parse_record(FrameRequest, asked, "request"), io.BytesIO()
+        picture = self._picture(request, self._drawer(request), self._camera(request), request)
         Image.fromarray(picture).save(content, "PNG", compress_level=1)
-        return content.getvalue()
+        return content.getvalue(), "image/png"
 
-    def film(self, request: VideoRequest, send: Callable[[bytes], None]) -> None:
-        """Make a video and send it: after each frame a line of JSON with its number, then one with the number of bytes,
-        then the MP4 file. Frames that are asked for meanwhile are drawn in between. InputError: as ``png``, or too many
-        pixels. ResourceError: another video is being made. OSError: of ``send``; nothing is left."""
+    def film(self, asked: object, send: Callable[[bytes], None]) -> None:
+        """Make the video of a ``VideoRequest`` and send it: after each frame a line of JSON with its number, then one
+        with the number of bytes, then the MP4 file. Frames that are asked for meanwhile are drawn in between.
+        InputError: as ``png``, or too many pixels. ResourceError: another video is being made. OSError: of ``send``;
+        nothing is left."""
+        request = parse_record(VideoRequest, asked, "request")
         camera, count = self._camera(request), len(request.moments)
+        line = lambda **values: send(store.json_text(values, indent=None).encode() + b"\n")
+
+        def pictures() -> Iterator[NDArray[np.uint8]]:
+            draw = self._drawer(request)
+            for number, moment in enumerate(request.moments, 1):
+                yield self._picture(request, draw, camera, moment)
+                line(frame=number, frames=count)
+
         if camera.width * camera.height * count > MOST_PIXELS:
             expected = f"at most {MOST_PIXELS:,} pixels in all frames together"
             got = f"{count} frames of {camera.width} x {camera.height}"
@@ -342,76 +333,54 @@ class FrameSource:
             remedy = "wait for it, or cancel it where it was asked for"
             raise ResourceError("another video is being made", remedy=remedy)
         try:
-            content = mp4_bytes(self._pictures(request, camera, send), request.fps, crf=VIDEO_CRF)
+            content = mp4_bytes(pictures(), request.fps, crf=VIDEO_CRF)
         finally:
             self._filming.release()
-        send(_line(bytes=len(content)))
+        line(bytes=len(content))
         send(content)
-
-    def _pictures(
-        self, request: VideoRequest, camera: Camera, send: Callable[[bytes], None]
-    ) -> Iterator[NDArray[np.uint8]]:
-        draw = self._drawer(request)
-        for number, moment in enumerate(request.moments, 1):
-            yield self._picture(request.layer, draw, View(camera, _pose(moment), float(moment.time_s)))
-            send(_line(frame=number, frames=len(request.moments)))
 
     def _drawer(self, request: Wanted) -> Drawer:
         """What draws the scene that is asked for, without what is hidden, in the weather and light of the script."""
         with self._lock:
-            if self._shown is None or self._shown.edits != request.edits:
-                self._shown = _Shown(
-                    request.edits, [model.to(self._device) for model in self._edited(request.edits)], {}
-                )
-            index = min(request.scene, len(self._shown.models) - 1)
-            model = self._shown.models[index]
+            if self._edits != request.edits:
+                self._models = [model.to(self._device) for model in self._edited(request.edits)]
+                self._edits, self._weather = request.edits, {}
+            index = min(request.scene, len(self._models) - 1)
+            model = self._models[index]
             gone = [name for name in request.hidden if name in model.node_names()]
             seen = model if request.camera else over_ground(model)
             draw = _drawer_of(seen.without_nodes(gone) if gone else seen)
             if self._mixers and request.layer != "class" and not gone and not request.edits.strip():
-                return mixing(self._mixers[index], draw)
+                return lambda view: self._mixers[index](view, draw(view))
             conditions = conditions_of(model.facts.get(FACT, {}).get("script", ()))
             if conditions is None or request.layer != "color":
                 return draw
-            if index not in self._shown.weather:
-                self._shown.weather[index] = weather_of(_drawer_of(model), conditions, self._scene)
-            return in_weather(draw, self._shown.weather[index])
+            if index not in self._weather:
+                self._weather[index] = weather_of(_drawer_of(model), conditions, self._scene)
+            return in_weather(draw, self._weather[index])
 
-    def _picture(self, layer: str, draw: Drawer, view: View) -> NDArray[np.uint8]:
+    def _picture(self, request: Wanted, draw: Drawer, camera: Camera, moment: Moment) -> NDArray[np.uint8]:
+        pose = np.eye(4)
+        pose[:3, :3] = orthonormal(np.array(moment.axes, np.float64).T)
+        pose[:3, 3] = moment.eye
         with self._lock:
-            return _colors(draw(view), layer)
+            seen = draw(View(camera, pose, float(moment.time_s)))
+            if request.layer == "depth" and seen.depth is not None:
+                return depth_colors(seen.depth[0].numpy(), NEAR_M, FAR_M)
+            if request.layer == "class" and seen.semantics is not None:
+                return class_colors(seen.semantics.numpy())
+            return to_bytes(seen.rgb)
 
     def _camera(self, request: Wanted) -> Camera:
         """The camera, not wider than allowed."""
-        camera = Camera(
-            request.camera or "free", request.width, request.height, request.fx, request.fy, request.cx, request.cy
-        )
+        lens = (request.width, request.height, request.fx, request.fy, request.cx, request.cy)
+        camera = Camera(request.camera or "free", *lens)
         if request.width > self._widest:
             camera = camera.resized(self._widest, max(1, round(request.height * self._widest / request.width)))
         return camera
-
-
-def _pose(moment: Moment) -> NDArray[np.float64]:
-    """World from camera, f64[4, 4]."""
-    pose = np.eye(4)
-    pose[:3, :3] = orthonormal(np.array(moment.axes, np.float64).T)
-    pose[:3, 3] = moment.eye
-    return pose
-
-
-def _line(**values: int) -> bytes:
-    return store.json_text(values, indent=None).encode() + b"\n"
 
 
 def orthonormal(axes: NDArray[np.float64]) -> NDArray[np.float64]:
     """The nearest rotation: axes come with the rounding of a browser's sums."""
     left, _, right = np.linalg.svd(axes)
     return left @ right
-
-
-def _colors(seen: Observation, layer: str) -> NDArray[np.uint8]:
-    if layer == "depth" and seen.depth is not None:
-        return depth_colors(seen.depth[0].numpy(), NEAR_M, FAR_M)
-    if layer == "class" and seen.semantics is not None:
-        return class_colors(seen.semantics.numpy())
-    return to_bytes(seen.rgb)

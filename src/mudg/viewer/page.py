@@ -32,6 +32,7 @@ from mudg.core.pictures import depth_colors, resize_area
 from mudg.core.weather.air import FLAKE_EDGES_MM, RAIN_EDGES_MM
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import DeformableNode, RigidNode
+from mudg.gaussians.start import SH_C0
 from mudg.scene.read import read_image, read_points
 from mudg.viewer.report import FAR_M, NEAR_M
 
@@ -193,7 +194,7 @@ SCALE_STEP: Final = 0.01
 DEFORM_STEP_M: Final = 1e-4
 """Of displacements of what deforms; beyond 3.2 m they are cut."""
 SAMPLE: Final = 100_000
-SH_BAND_0: Final = 0.28209479177387814
+"""Rows, evenly spread, that tell the step of further bands."""
 COLOR_LIMITS: Final = (-0.5, 2.0)
 """Colours of Gaussians beyond these are cut; a Gaussian may be darker than black or brighter than white where others
 cover it."""
@@ -227,15 +228,19 @@ class Packed:
         something moves."""
         rows, columns, facts = self.layout.chunk(index), _columns(self.model), self.facts
         node = self.model.table.labels["node"].numpy()[rows].astype(np.int64)
-        blocks = list(_blocks(node))
-        owners = np.array([(node, len(own)) for node, own in blocks], np.uint32)
-        sections = _geometry(columns, rows, blocks) | {"block_of": owners}
+        blocks = []
+        for one in np.unique(node):  # rows are ordered by node
+            own = np.flatnonzero(node == one)
+            blocks += [(int(one), own[start : start + BLOCK]) for start in range(0, len(own), BLOCK)]
+        owners = np.array([(one, len(own)) for one, own in blocks], np.uint32)
+        sections = _geometry(columns, rows, [own for _, own in blocks]) | {"block_of": owners}
         sections["color"] = _colors(columns, rows, facts["color_low"], facts["color_high"])
         sections["class"] = _classes(columns.get("semantics"), rows)
         if self.model.certainty is not None:
             sections["certainty"] = to_u8(self.model.certainty[torch.from_numpy(rows)].float().numpy())
         if self.model.sh_degree:
-            sections["harmonics"] = _harmonics(columns["sh_rest"][rows], facts["harmonic_step"])
+            levels = np.rint(columns["sh_rest"][rows].reshape(len(rows), -1) / facts["harmonic_step"])
+            sections["harmonics"] = (np.clip(levels, -127, 127) + 128).astype(np.uint8).T.copy()
         still = columns["means"][rows[node == 0]]
         box = [[round(float(v), 3) for v in corner] for corner in (still.min(0), still.max(0))] if len(still) else None
         return sections, {"rows": len(rows), "level": level_of(index), "box": box, "moves": bool((node != 0).any())}
@@ -267,12 +272,14 @@ def pack_scene(
         "color_low": low,
         "color_high": high,
         "certainty": model.certainty is not None,
-        "antialias": bool(_drawing(model).get("antialias", False)),
+        "antialias": bool(model.facts.get("drawing", {}).get("antialias", False)),
         "nodes": nodes,
         "deform_step": DEFORM_STEP_M,
     }
     if model.sh_degree:
-        facts["harmonic_step"] = _harmonic_step(columns["sh_rest"], layout)
+        # nearly all values lie within 127 steps
+        some = columns["sh_rest"][layout.rows[:: max(1, -(-len(layout.rows) // SAMPLE))]]
+        facts["harmonic_step"] = max(float(np.percentile(np.abs(some), 99.95)) if some.size else 0.0, 1e-6) / 127
     if model.sky is not None:
         panorama = model.sky.table["panorama"].detach()[0].numpy()
         moving["sky"] = to_u8(panorama.transpose(1, 2, 0))
@@ -285,34 +292,21 @@ def _columns(model: SceneModel) -> dict[str, NDArray[Any]]:
     return {name: value.detach().float().numpy() for name, value in model.table.columns.items()}
 
 
-def _drawing(model: SceneModel) -> Mapping[str, Any]:
-    """The settings of the rasterizer that the scene was fitted with, where they are not the usual ones."""
-    return model.facts.get("drawing", {})
-
-
 def _notes(model: SceneModel) -> tuple[str, ...]:
     notes = []
     if any(isinstance(node, (VibrationNode, HexPlaneNode, DeformedNode, BezierNode)) for node in model.nodes):
         rest = "The page shows them at rest; boxes still carry them."
         notes.append(f"Gaussians of this method change on their own with time. {rest}")
-    if set(_drawing(model)) - {"antialias", "packed"}:
+    if set(model.facts.get("drawing", ())) - {"antialias", "packed"}:
         notes.append("This scene was fitted to be drawn along rays or as discs. The page draws the usual ellipsoids.")
     return tuple(notes)
 
 
-def _blocks(node: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.intp]]]:
-    """Node and positions of every block; rows are ordered by node."""
-    for one in np.unique(node):
-        own = np.flatnonzero(node == one)
-        for start in range(0, len(own), BLOCK):
-            yield int(one), own[start : start + BLOCK]
-
-
-def _geometry(columns: Mapping[str, Any], rows: Any, blocks: list[tuple[int, Any]]) -> Sections:
+def _geometry(columns: Mapping[str, Any], rows: Any, blocks: Sequence[Any]) -> Sections:
     means, scales = columns["means"][rows].astype(np.float64), columns["log_scales"][rows].astype(np.float64)
     places, sizes = np.zeros((len(rows), 3), np.uint16), np.zeros((len(rows), 3), np.uint8)
     bounds = np.zeros((len(blocks), 12), np.float32)
-    for index, (_, own) in enumerate(blocks):
+    for index, own in enumerate(blocks):
         bounds[index, :3], bounds[index, 3:6], places[own] = _quantised(means[own], 65535, PLACE_STEP_M)
         bounds[index, 6:9], bounds[index, 9:], sizes[own] = _quantised(scales[own], 255, SCALE_STEP)
     bytes_of = np.concatenate([(places & 255).T, (places >> 8).T]).astype(np.uint8)
@@ -344,13 +338,13 @@ def _color_range(bands: Any, layout: Layout, degree: int) -> tuple[float, float]
     """Between which colours the page tells levels apart. Without further bands what is below 0 is drawn as 0."""
     low, high = 0.0, 1.0
     for index in range(len(layout)):
-        rgb = bands[layout.chunk(index), 0] * SH_BAND_0 + 0.5
+        rgb = bands[layout.chunk(index), 0] * SH_C0 + 0.5
         low, high = min(low, float(rgb.min())), max(high, float(rgb.max()))
     return max(low, COLOR_LIMITS[0]) if degree else 0.0, min(high, COLOR_LIMITS[1])
 
 
 def _colors(columns: Mapping[str, Any], rows: Any, low: float, high: float) -> NDArray[np.uint8]:
-    red, green, blue = to_u8((columns["sh_dc"][rows, 0] * SH_BAND_0 + 0.5 - low) / (high - low)).T
+    red, green, blue = to_u8((columns["sh_dc"][rows, 0] * SH_C0 + 0.5 - low) / (high - low)).T
     return np.stack([red - green, green, blue - green, to_u8(opacity_of(columns["logits"][rows]))])
 
 
@@ -361,16 +355,6 @@ def _classes(logits: Any, rows: Any) -> NDArray[np.uint8]:
     best = np.partition(here, -2, axis=1)[:, -2:]
     lead = np.clip(np.rint((best[:, 1] - best[:, 0]) / LEAD_STEP), 1, 255)
     return np.stack([here.argmax(1), lead]).astype(np.uint8)
-
-
-def _harmonic_step(rest: Any, layout: Layout) -> float:
-    """Step of the levels: nearly all values lie within 127 of them. Taken from at most `SAMPLE` rows, evenly."""
-    some = rest[layout.rows[:: max(1, -(-len(layout.rows) // SAMPLE))]]
-    return max(float(np.percentile(np.abs(some), 99.95)) if some.size else 0.0, 1e-6) / 127
-
-
-def _harmonics(rest: Any, step: float) -> NDArray[np.uint8]:
-    return (np.clip(np.rint(rest.reshape(len(rest), -1) / step), -127, 127) + 128).astype(np.uint8).T.copy()
 
 
 def to_u8(values: NDArray[np.floating]) -> NDArray[np.uint8]:
@@ -503,17 +487,15 @@ def with_ground(page: PageFacts, ground: HeightMap | None) -> PageFacts:
     Section ``ground``: world z as ``low + value * step``, steps of `LEAST_STEP_M`, larger where heights span more than
     33 m; `UNKNOWN` where it is not known.
     """
-    heights = None if ground is None else ground.heights
-    if ground is None or heights is None or heights.size > MOST_CELLS or min(heights.shape) < 2:
-        return replace(page, facts=page.facts | {"ground": None})
-    if not np.isfinite(heights).any():
+    heights = np.zeros((0, 0)) if ground is None else ground.heights
+    if ground is None or heights.size > MOST_CELLS or min(heights.shape) < 2 or not np.isfinite(heights).any():
         return replace(page, facts=page.facts | {"ground": None})
     low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
     step = max((high - low) / (UNKNOWN - 1), LEAST_STEP_M)
     levels = np.where(np.isfinite(heights), np.rint((heights - low) / step), UNKNOWN).astype(np.uint16)
-    record = {"origin": ground.origin.tolist(), "cell_m": ground.cell_m, "shape": list(levels.shape), "low": low}
-    record["step"] = step
-    return replace(page, facts=page.facts | {"ground": record}, sections=page.sections | {"ground": levels})
+    record = {"origin": ground.origin.tolist(), "cell_m": ground.cell_m, "shape": list(levels.shape)}
+    facts = page.facts | {"ground": {**record, "low": low, "step": step}}
+    return replace(page, facts=facts, sections=page.sections | {"ground": levels})
 
 
 def with_particles(page: PageFacts, seed: int) -> PageFacts:

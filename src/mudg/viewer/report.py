@@ -17,7 +17,6 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from mudg import native
 from mudg.base import html, log, memory, store
@@ -64,8 +63,12 @@ VIEWS: Final = {"street_gaussians": "render/street_gaussians", "mudg_r": "synthe
 def next_commands(out: Path, source: str) -> list[tuple[str, tuple[str, ...]]]:
     """What a run can be used for, as (title, lines). Each block works by itself, in the folder from which the run was
     started."""
-    run = str(out)
-    scene, movable = scene_of(out, source), _first_object(out)
+    run, scene = str(out), scene_of(out, source)
+    try:  # an object that an edit script can name
+        nodes = store.read_json(out / GUIDED / "model.json")["nodes"]
+        movable = next((str(node["name"]) for node in nodes if "label" in node), "")
+    except (InputError, KeyError, TypeError):
+        movable = ""
     edit = f"- remove: {{ids: [{json.dumps(movable)}]}}" if movable else "- weather: {fog: {visibility_m: 60}}"
     changes = [
         [f"printf '%s\\n' {shlex.quote(edit)} > edits.yaml"],
@@ -121,15 +124,6 @@ def scene_of(out: Path, source: str, labelled: bool = True) -> str:
 
 def _line(words: Sequence[str]) -> str:
     return words[0] if len(words) == 1 else f"mudg {shlex.join(words)}"
-
-
-def _first_object(out: Path) -> str:
-    """Id of an object that an edit script can name; empty if the fit has none."""
-    try:
-        nodes = store.read_json(out / GUIDED / "model.json")["nodes"]
-        return next((str(node["name"]) for node in nodes if "label" in node), "")
-    except (InputError, KeyError, TypeError):
-        return ""
 
 
 # -- the page: what ``templates/report.html.j2`` shows, worked out from plain values ---------------
@@ -328,6 +322,8 @@ def _score_values(scores: Mapping[str, Any]) -> dict[str, Any]:
     distances = sorted({d for m, d in values if any(isinstance(v, float) for v in values[m, d].values())})
     metrics = {m["name"]: m for m in scores["metrics"]}
     absent = [m for m in metrics.values() if all(r["values"].get(m["name"]) == NOT_COMPUTED for r in scores["results"])]
+    flag = lambda m: f": mudg score {WEIGHT_FLAGS[m['name']]} FILE" if m["name"] in WEIGHT_FLAGS else ""
+    remedy = lambda m: f"{m['needs'][-1]}{flag(m)}"
     main = [n for title, names in GROUPS if title not in OPTIONAL for n in names]
     sets = [name for name, entry in SET_METRICS.items() if entry in scores]
     distances = [d for d in distances if _shown(values, [*main, *sets], d)]
@@ -351,7 +347,7 @@ def _score_values(scores: Mapping[str, Any]) -> dict[str, Any]:
             results.append([r["trajectory"], title_of(r["method"]), r["views"], *texts])
     return {
         "score_groups": groups if distances or any(group["title"] in OPTIONAL for group in groups) else [],
-        "not_computed": ", ".join(f"{m['title']} ({_remedy_of(m)})" for m in absent),
+        "not_computed": ", ".join(f"{m['title']} ({remedy(m)})" for m in absent),
         "charts": [c for c in (_chart(scores, metrics[n]) for n in CHARTED if n in metrics) if c],
         "result_metrics": numeric,
         "results": results,
@@ -381,11 +377,6 @@ def _score_group(
     rows = [{"method": m["name"], "title": m["title"], "cells": list(cells(m["name"]))} for m in scores["methods"]]
     titles = [distance_title(scores, distance) for distance in distances]
     return {"title": title, "distances": titles, "metrics": metrics, "rows": rows}
-
-
-def _remedy_of(metric: Mapping[str, Any]) -> str:
-    flag = WEIGHT_FLAGS.get(metric["name"])
-    return f"{metric['needs'][-1]}" + (f": mudg score {flag} FILE" if flag else "")
 
 
 def _with_floor(scores: Mapping[str, Any], group: dict[str, Any], distances: Sequence[float]) -> dict[str, Any]:
@@ -546,26 +537,18 @@ def panel_grid(
     for x, seen in enumerate(views.values()):
         if seen is None:
             continue
-        against = None if seen is truth else true_rgb
+        rgb = resize_rgb(seen.rgb, height, width)
+        pictures: dict[str, NDArray[np.uint8]] = {"rgb": to_bytes(rgb)}
+        if seen.depth is not None:
+            pictures["depth"] = depth_colors(resize_nearest(seen.depth, height, width)[0].numpy(), NEAR_M, FAR_M)
+        if seen.semantics is not None:
+            pictures["semantics"] = class_colors(resize_nearest(seen.semantics, height, width).numpy())
+        if true_rgb is not None and seen is not truth:
+            pictures["error"] = error_image(rgb, true_rgb)
         for y, row in enumerate(rows):
-            picture = _panel(seen, row, size, against)
-            if picture is not None:
-                grid[y * height : (y + 1) * height, x * width : (x + 1) * width] = picture
+            if row in pictures:
+                grid[y * height : (y + 1) * height, x * width : (x + 1) * width] = pictures[row]
     return grid
-
-
-def _panel(seen: Observation, row: str, size: tuple[int, int], true_rgb: Tensor | None) -> NDArray[np.uint8] | None:
-    width, height = size
-    if row == "depth":
-        if seen.depth is None:
-            return None
-        return depth_colors(resize_nearest(seen.depth, height, width)[0].numpy(), NEAR_M, FAR_M)
-    if row == "semantics":
-        return None if seen.semantics is None else class_colors(resize_nearest(seen.semantics, height, width).numpy())
-    rgb = resize_rgb(seen.rgb, height, width)
-    if row == "error":
-        return None if true_rgb is None else error_image(rgb, true_rgb)
-    return to_bytes(rgb)
 
 
 # -- the report of a run ---------------------------------------------------------------------------

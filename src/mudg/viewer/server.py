@@ -29,7 +29,7 @@ from typing import Any, Final
 from urllib.parse import parse_qs, urlsplit
 
 from mudg.base import failures, log, store
-from mudg.base.errors import InputError, MudgError, ResourceError, UsageError
+from mudg.base.errors import InputError, ResourceError, UsageError
 
 MOST_BYTES: Final = 8 * 2**20
 """Of a request's body."""
@@ -169,12 +169,6 @@ def open_server(site: Site, host: str, port: int) -> SiteServer:
         raise ResourceError("cannot listen", where=f"{host}:{port}", got=str(error), remedy=remedy) from error
 
 
-def address_of(server: SiteServer, site: Site) -> str:
-    """Address of the page."""
-    host, port = server.server_address[:2]
-    return f"http://{host!s}:{port}/?token={site.token}"
-
-
 def show(address: str, port: int, wanted: bool) -> bool:
     """Open a browser, or say how to reach the page from another machine; whether one was opened."""
     graphical = any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))) or os.name == "nt"
@@ -255,15 +249,11 @@ class SiteRequest(BaseHTTPRequestHandler):
             told = failures.in_words(error)
             if told is None:
                 raise
-            self._tell(told, begun=bool(sent))
-
-    def _tell(self, error: MudgError, begun: bool) -> None:
-        """Answer with a problem; after the first piece of a stream, as a line of it."""
-        if begun:
-            self.wfile.write(store.json_text({"problem": str(error)}, indent=None).encode() + b"\n")
-            return
-        known = {InputError: HTTPStatus.BAD_REQUEST, ResourceError: HTTPStatus.SERVICE_UNAVAILABLE}
-        self._answer(known.get(type(error), HTTPStatus.INTERNAL_SERVER_ERROR), str(error).encode())
+            if sent:  # a line of the stream
+                self.wfile.write(store.json_text({"problem": str(told)}, indent=None).encode() + b"\n")
+                return
+            known = {InputError: HTTPStatus.BAD_REQUEST, ResourceError: HTTPStatus.SERVICE_UNAVAILABLE}
+            self._answer(known.get(type(told), HTTPStatus.INTERNAL_SERVER_ERROR), str(told).encode())
 
     def _send(self, content: bytes, sent: list[int]) -> None:
         """A piece of a stream; the first one begins the answer, which ends with the connection."""
@@ -288,24 +278,20 @@ class SiteRequest(BaseHTTPRequestHandler):
         except ValueError:
             self._answer(HTTPStatus.BAD_REQUEST, b"no address")
             return None
-        return None if self._refused(parse_qs(parts.query)) else parts.path.removeprefix("/")
-
-    def _refused(self, query: Mapping[str, list[str]]) -> bool:
-        """Whether the request was refused: another name for this server (a page elsewhere whose name was pointed here),
-        or no token."""
+        # a page elsewhere may have pointed its own name here
         host, port = self.server.server_address[:2]
         names = {f"{host}:{port}"} | ({f"localhost:{port}", f"127.0.0.1:{port}"} if is_loopback(str(host)) else set())
-        given = self.headers.get("Host", "")
-        if given not in names and (is_loopback(str(host)) or str(host) not in ("0.0.0.0", "::")):  # noqa: S104
-            self._answer(HTTPStatus.FORBIDDEN, b"this server has another name")
-            return True
+        anywhere = str(host) in ("0.0.0.0", "::")  # noqa: S104
         cookies = (part.strip().partition("=") for part in self.headers.get("Cookie", "").split(";"))
-        brought = [*query.get("token", []), self.headers.get("X-Mudg-Token", "")]
+        brought = [*parse_qs(parts.query).get("token", []), self.headers.get("X-Mudg-Token", "")]
         brought += [value for name, _, value in cookies if name == COOKIE]
-        if not any(hmac.compare_digest(one.encode(), self.site.token.encode()) for one in brought):
+        if self.headers.get("Host", "") not in names and not anywhere:
+            self._answer(HTTPStatus.FORBIDDEN, b"this server has another name")
+        elif not any(hmac.compare_digest(one.encode(), self.site.token.encode()) for one in brought):
             self._answer(HTTPStatus.FORBIDDEN, b"open the address that mudg view printed: it carries a token")
-            return True
-        return False
+        else:
+            return parts.path.removeprefix("/")
+        return None
 
     def _answer(
         self, status: HTTPStatus, content: bytes, kind: str = "text/plain; charset=utf-8", cookie: bool = False

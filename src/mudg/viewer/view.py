@@ -5,7 +5,7 @@ machine, with exact frames where the camera rests. The page is ``assets/viewer``
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -16,7 +16,6 @@ import numpy as np
 from mudg.base import log, store
 from mudg.base.config import result_settings
 from mudg.base.errors import InputError, UsageError
-from mudg.base.records import parse_record
 from mudg.base.run_folder import ResultFile, refuse_overlap
 from mudg.base.types import FusedCloud, Scene
 from mudg.core.edit import HeightMap
@@ -31,9 +30,9 @@ from mudg.gaussians.storage import load_model, model_of_scene
 from mudg.scene.clouds import read_fused
 from mudg.scene.read import read_scene
 from mudg.viewer import page as pages
-from mudg.viewer.live import LAYERS, EditFiles, EditRequest, FrameRequest, FrameSource, VideoRequest, desk_for
+from mudg.viewer.live import LAYERS, EditFiles, FrameSource, desk_for
 from mudg.viewer.page import CHUNK, ONE_FILE_BYTES, Packed, PageFile, ViewerPage
-from mudg.viewer.server import Answer, Site, SiteServer, Stream, address_of, open_server, show, token_for
+from mudg.viewer.server import Answer, Site, SiteServer, Stream, open_server, show, token_for
 from mudg.viewer.settings import PageConfig, ViewConfig
 
 MEGABYTE: Final = 1e6
@@ -81,12 +80,15 @@ def run_page(
     Raises:
         UsageError: another page is there, or the output is an input. InputError: no fitted scene, or another log.
     """
-    out = Path(out)
-    refuse_overlap(out, {"run": run if not _inside(out, run) else None, "scene": scene, "compare": compare})
+    out, run = Path(out), Path(run)
+    # beside a run's report it overwrites nothing that was read
+    beside = out.resolve().parent == run.resolve() and not (run / "model.json").is_file()
+    refuse_overlap(out, {"run": None if beside else run, "scene": scene, "compare": compare})
     if out.suffix != ".html":
         raise UsageError("the page is an HTML file", where="--out", expected="a name that ends in .html", got=str(out))
     folder = out.with_name(f"{out.stem}_page")
-    _refuse_foreign(folder)
+    if folder.exists() and not (folder / "index.html").is_file():
+        raise UsageError("this folder is not a page", where=str(folder), remedy="choose another --out")
     sources = find_sources(config, run, scene, compare)
     viewer = hashlib.sha256(pages.import_map().encode()).hexdigest()  # a newer viewer makes another page
     settings, inputs = {**result_settings(config), "report": report, "viewer": viewer}, sources.digests()
@@ -128,19 +130,17 @@ def write_page(page: ViewerPage, out: Path, folder: Path) -> dict[str, Any]:
     return {"page": path, "bytes": size, "gaussians": [packed.kept for _, packed in page.scenes]}
 
 
-def _refuse_foreign(folder: Path) -> None:
-    if folder.exists() and not (folder / "index.html").is_file():
-        raise UsageError("this folder is not a page", where=str(folder), remedy="choose another --out")
-
-
 def _write_folder(
     page: ViewerPage, folder: Path, begun: list[PageFile], more: Iterable[PageFile], facts: dict[str, Any]
 ) -> tuple[Path, int]:
     """Write a page as a folder, file by file, completely or not at all; its ``index.html`` and the bytes of
     everything."""
     page = replace(page, report=f"../{page.report}") if page.report else page  # the run's report lies beside the folder
-    size = f"about {_forecast(page, begun) / 1e6:.0f} MB in {page.chunks()} chunks"
-    log.info(needs_text(page, "to be written", size))
+    # only chunks are many and large, and the first ones tell about all
+    chunks = [len(file.content) for file in begun if file.name.count("-") == 2]
+    size = sum(len(file.content) for file in begun)
+    size += (page.chunks() - len(chunks)) * (sum(chunks) // max(1, len(chunks)))
+    log.info(needs_text(page, "to be written", f"about {size / 1e6:.0f} MB in {page.chunks()} chunks"))
     size = 0
     with store.atomic_directory(folder) as place:
         for file in chain(begun, more):
@@ -150,18 +150,6 @@ def _write_folder(
         store.write_in_tree(place / "index.html", index)
         store.sync_tree(place)
     return folder / "index.html", size + len(index)
-
-
-def _forecast(page: ViewerPage, begun: Sequence[PageFile]) -> int:
-    """Bytes of all files, judging by the first ones. Only chunks are many and large."""
-    chunks = [len(file.content) for file in begun if file.name.count("-") == 2]
-    done = sum(len(file.content) for file in begun)
-    return done + (page.chunks() - len(chunks)) * (sum(chunks) // max(1, len(chunks)))
-
-
-def _inside(out: Path, run: Path) -> bool:
-    """Whether the page goes into the run's own folder, beside its report, where it overwrites nothing that was read."""
-    return Path(out).resolve().parent == Path(run).resolve() and not (Path(run) / "model.json").is_file()
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,9 +169,14 @@ class ShownSources:
 
     def read(self) -> Shown:
         """What is there. InputError: it cannot be read, or the fits are of different logs."""
-        loaded = read_scene(self.scene)
-        fits = tuple(_read_fit(folder, whole, loaded) for folder, whole in self.fits)
-        return Shown(loaded, fits, None if self.cloud is None else read_fused(self.cloud))
+        loaded, fits = read_scene(self.scene), list[tuple[str, SceneModel]]()
+        for folder, whole in self.fits:
+            model = load_model(folder) if whole else model_of_scene(folder, loaded)
+            if (other := model.facts.get("scene", loaded.id)) != loaded.id:
+                what = "fits of different logs cannot be compared"
+                raise InputError(what, where=str(folder), expected=loaded.id, got=str(other))
+            fits.append((str(model.facts.get("method", "fit")), model))
+        return Shown(loaded, tuple(fits), None if self.cloud is None else read_fused(self.cloud))
 
 
 def find_sources(config: PageConfig, run: Path, scene: Path | None, compare: Path | None) -> ShownSources:
@@ -194,12 +187,18 @@ def find_sources(config: PageConfig, run: Path, scene: Path | None, compare: Pat
     if place is None:
         what, remedy = "the scene of this fit is not known, is gone or has changed", "add --scene FOLDER"
         raise UsageError(what, where=str(run), remedy=f"{remedy}, or give the folder of a run")
-    name, fits = config.method, [_fit_of(parts, config.method)]
+
+    def fit_of(parts: RunParts, method: str) -> tuple[Path, bool]:
+        if method and parts.whole and method not in parts.fits:
+            raise UsageError("the run has no such fit", where="--method", expected=", ".join(parts.fits), got=method)
+        return parts.fits.get(method, parts.model), parts.whole
+
+    name, fits = config.method, [fit_of(parts, config.method)]
     if compare is not None:
         others = find_run(compare)
         if Path(compare).resolve() == Path(run).resolve():
             name = next((n for n, folder in others.fits.items() if folder != fits[0][0]), "")
-        fits.append(_fit_of(others, name))
+        fits.append(fit_of(others, name))
     return ShownSources(place, tuple(fits), parts.fused)
 
 
@@ -208,61 +207,36 @@ def find_shown(config: PageConfig, run: Path, scene: Path | None, compare: Path 
     return find_sources(config, run, scene, compare).read()
 
 
-def _fit_of(parts: RunParts, method: str) -> tuple[Path, bool]:
-    if method and parts.whole and method not in parts.fits:
-        raise UsageError("the run has no such fit", where="--method", expected=", ".join(parts.fits), got=method)
-    return parts.fits.get(method, parts.model), parts.whole
-
-
-def _read_fit(folder: Path, whole: bool, scene: Scene) -> tuple[str, SceneModel]:
-    model = load_model(folder) if whole else model_of_scene(folder, scene)
-    if (other := model.facts.get("scene", scene.id)) != scene.id:
-        what = "fits of different logs cannot be compared"
-        raise InputError(what, where=str(folder), expected=scene.id, got=str(other))
-    return str(model.facts.get("method", "fit")), model
-
-
 def page_of(config: PageConfig, shown: Shown, report: str = "", live: dict[str, Any] | None = None) -> ViewerPage:
     """The page of what is shown."""
     scene, begin = shown.scene, pages.begin_of(shown.scene)
     path = np.stack([frame.view.center_world for frame in scene.frames])
-    most = lambda model: _most(config, model, len(shown.fits))
-    packed = [(name, pages.pack_scene(model, begin, path, most(model), CHUNK)) for name, model in shown.fits]
+    packed = []
+    for name, model in shown.fits:
+        most = config.budget  # 0 = all
+        if config.memory_mb:
+            within = pages.most_within(MEGABYTE * config.memory_mb / len(shown.fits), model.sh_degree, CHUNK)
+            most = min(most, within) if most else within
+        packed.append((name, pages.pack_scene(model, begin, path, most, CHUNK)))
     width = PAGE_IMAGE_PX if live is None else LIVE_IMAGE_PX
     facts = pages.log_facts(scene, shown.fits[0][1].colors, width, config.images)
     facts = pages.with_particles(pages.with_ground(facts, shown.ground()), SEED)
-    first = packed[0][1]
+    counted = lambda things, noun: f"{len(things)} {noun}{'' if len(things) == 1 else 's'}"
+    about = (
+        f"{kept_text(packed[0][1])}, {len(scene.frames)} recorded frames of {counted(scene.cameras, 'camera')},"
+        f" {counted(scene.tracks, 'tracked object')}. Places, sizes and colours are rounded for the page. Data:"
+        f" {scene.source.dataset}, licence {scene.source.licence}. This page loads nothing from elsewhere and sends"
+        " nothing."
+    )
     return ViewerPage(
         title=scene.id,
         subtitle=", ".join(f"{name} ({NAMES[name]})" if name in NAMES else name for name, _ in packed),
-        about=about_text(scene, first),
+        about=about,
         report=report,
         scenes=packed,
         log=facts,
         live=live,
     )
-
-
-def _most(config: PageConfig, model: SceneModel, fits: int) -> int:
-    """Gaussians of each fit that budget and memory allow; 0 = all."""
-    if not config.memory_mb:
-        return config.budget
-    most = pages.most_within(MEGABYTE * config.memory_mb / fits, model.sh_degree, CHUNK)
-    return min(config.budget, most) if config.budget else most
-
-
-def about_text(scene: Scene, first: Packed) -> str:
-    """A few sentences on the page."""
-    return (
-        f"{kept_text(first)}, {len(scene.frames)} recorded frames of {_counted(len(scene.cameras), 'camera')},"
-        f" {_counted(len(scene.tracks), 'tracked object')}. Places, sizes and colours are rounded for the page. Data:"
-        f" {scene.source.dataset}, licence {scene.source.licence}. This page loads nothing from elsewhere and sends"
-        " nothing."
-    )
-
-
-def _counted(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def kept_text(packed: Packed) -> str:
@@ -296,9 +270,10 @@ def run_view(
     saved. UsageError: an address that other machines reach, without a token. ResourceError: the port is taken. As
     ``run_page``."""
     server, site = server_of(config, run, compare, scene, files)
-    address = address_of(server, site)
+    host, port = server.server_address[:2]
+    address = f"http://{host!s}:{port}/?token={site.token}"
     log.info(f"viewer: {address}   (Ctrl-C ends it)")
-    show(address, server.server_address[1], config.browser)
+    show(address, port, config.browser)
     try:
         server.serve_forever()
     except KeyboardInterrupt:
@@ -328,12 +303,11 @@ def server_of(
     if report.is_file():
         served["report.html"] = store.read_bytes(report)
     streams: dict[str, Stream] = {}
-    answers: dict[str, Answer] = {"edits": lambda asked: desk.answer(parse_record(EditRequest, asked, "request"))}
+    answers: dict[str, Answer] = {"edits": desk.answer}
     if config.exact:
         device = drawing_device(config.device, "view")
         source = FrameSource(desk.edited, shown.scene, config.width_px, device, mixers)
-        answers["frame"] = lambda asked: (source.png(parse_record(FrameRequest, asked, "request")), "image/png")
-        streams["video"] = lambda asked, send: source.film(parse_record(VideoRequest, asked, "request"), send)
+        answers["frame"], streams["video"] = source.png, source.film
     site = Site(served, answers, token, streams)
     return open_server(site, config.host, config.port), site
 
