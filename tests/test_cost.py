@@ -159,9 +159,7 @@ def test_memory_and_disk_decide_which_presets_fit_this_machine() -> None:
     assert "suffice for: none" in text and "NOT free here" in text
 
 
-def test_the_probe_measures_this_machine_and_one_of_half_the_speed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_probe_measures_this_machine_and_one_of_half_the_speed(monkeypatch: pytest.MonkeyPatch) -> None:
     speed = probe.speed(2)
     assert 0.001 < speed.now <= speed.idle < 30
     clock = {"processor": 0.0}
