@@ -39,10 +39,7 @@ def test_round_trip(truth: Scene, folder: Path, tmp_path: Path) -> None:
     again = ingest(folder.parent, tmp_path / "again", sequence="scene_01", cameras=("FRONT_LEFT",), frames=(0, 2))
     assert list(again.cameras) == ["front_left"]
     assert (len(again.frames), len(again.sweeps)) == (2, 2)
-
-
-def test_clocks_that_run_ten_times_too_fast_are_set_right(truth: Scene, tmp_path: Path) -> None:
-    scene = ingest(made.write_dgp(truth, tmp_path / "scene", slowed=10), tmp_path / "out")
+    scene = ingest(made.write_dgp(truth, tmp_path / "scene", slowed=10), tmp_path / "slowed")
     roundtrip.assert_same_log(scene, truth, labels=made.READ_BACK)
     assert any("tenths of a microsecond" in note for note in scene.source.notes)
 
@@ -141,13 +138,7 @@ def test_real_scene(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
             uv, z = project(frame.view, world)
             size = (frame.view.camera.width, frame.view.camera.height)
             counts[frame.view.camera.name] = int(((z > 0.5) & (uv >= 0).all(1) & (uv < size).all(1)).sum())
-    assert counts == {
-        "camera_01": 5562,
-        "camera_05": 12691,
-        "camera_06": 12210,
-        "camera_07": 11174,
-        "camera_08": 10431,
-        "camera_09": 9770,
-    }
+    numbers = {1: 5562, 5: 12691, 6: 12210, 7: 11174, 8: 10431, 9: 9770}
+    assert counts == {f"camera_{number:02d}": count for number, count in numbers.items()}
     nearest = min(scene.tracks, key=lambda t: float(np.linalg.norm(invert(t.world_from_object[1])[:3, 3])))
     assert nearest.label in ("car", "truck")
