@@ -54,7 +54,7 @@ def overlap(found: np.ndarray, truth: np.ndarray, *names: str) -> float:
     return float((a & b & said).sum() / ((a | b) & said).sum())
 
 
-def test_labels_of_a_street_agree_with_the_truth() -> None:
+def test_labels_of_a_street_agree_with_the_truth_and_confidence_tells_right_from_wrong() -> None:
     given, truth = given_at(STREET)
     labels = label_by_geometry(given)
     assert overlap(labels.semantics, truth, "road") > 0.93 and overlap(labels.semantics, truth, "car") > 0.75
@@ -63,22 +63,12 @@ def test_labels_of_a_street_agree_with_the_truth() -> None:
     assert (labels.semantics != UNLABELLED).mean() > 0.95
     known = ("road", "sidewalk", "terrain", "building", "vegetation", "sky", "car")
     assert set(np.unique(labels.semantics)) <= {*(ID[name] for name in known), UNLABELLED}
-
-
-def test_confidence_tells_right_from_wrong() -> None:
-    given, truth = given_at(STREET)
-    labels = label_by_geometry(given)
     assert labels.confidence.dtype == np.float32 and ((labels.confidence >= 0) & (labels.confidence <= 1)).all()
     assert (labels.confidence[labels.semantics == UNLABELLED] == 0).all()
     right = labels.semantics == truth
     sure = labels.confidence > 0.7
     assert right[sure].mean() > 0.97
     assert labels.confidence[right].mean() > labels.confidence[~right & (labels.semantics != UNLABELLED)].mean() + 0.1
-
-
-def test_depth_is_measured_where_it_says_it_is_sure() -> None:
-    given, _ = given_at(STREET)
-    labels = label_by_geometry(given)
     _, _, truth = STREET.image(given.view)
     sure = (labels.depth_confidence > 0.6) & ~labels.sky
     assert sure.mean() > 0.3 and np.isfinite(truth[sure]).mean() > 0.99
@@ -98,10 +88,15 @@ def test_without_lidar_it_says_less_and_without_boxes_it_invents_no_car() -> Non
     assert not (label_by_geometry(given).semantics == ID["car"]).any()
 
 
-def test_a_box_hidden_behind_the_wall_is_not_painted() -> None:
+def test_a_box_that_is_hidden_or_unknown_is_not_painted() -> None:
     street = replace(STREET, car_start=(40.0, 0.0))
     given, truth = given_at(street)
     assert not (truth == ID["car"]).any() and not (label_by_geometry(given).semantics == ID["car"]).any()
+    assert set(LABELLERS) == {"embedded", "geometry", "network"} and TRAIN_ID_OF["van"] == ID["car"]
+    assert TRAIN_ID_OF["cyclist"] == ID["rider"]
+    unknown = replace(STREET.track(), label="shopping trolley")
+    given, _ = given_at(STREET)
+    assert not (label_by_geometry(replace(given, tracks=[unknown])).semantics == ID["car"]).any()
 
 
 def test_all_black_and_all_white_images_do_not_break_it() -> None:
@@ -112,24 +107,12 @@ def test_all_black_and_all_white_images_do_not_break_it() -> None:
         assert (labels.semantics[high] == ID["sky"]).mean() == pytest.approx(float(sky), abs=0.02)
 
 
-def test_labels_of_boxes_are_train_ids() -> None:
-    assert set(LABELLERS) == {"embedded", "geometry", "network"} and TRAIN_ID_OF["van"] == ID["car"]
-    assert TRAIN_ID_OF["cyclist"] == ID["rider"]
-    unknown = replace(STREET.track(), label="shopping trolley")
-    given, _ = given_at(STREET)
-    assert not (label_by_geometry(replace(given, tracks=[unknown])).semantics == ID["car"]).any()
-
-
 # --- parts ----------------------------------------------------------------------------------------
 
 
 def test_box_outline_covers_the_projected_box_exactly() -> None:
     view = STREET.view(0.0)
-    for x, y, yaw in (
-        (12, 1, 0.4),
-        (3.5, -1.5, 0.0),
-        (30, 6, 2.0),
-    ):  # the second reaches behind the camera's near plane
+    for x, y, yaw in ((12, 1, 0.4), (3.5, -1.5, 0.0), (30, 6, 2.0)):  # the second begins behind the near plane
         pose = yaw_matrix(yaw, (x, y, 0.8))
         outline = box_outline(view, pose, CAR_SIZE_M)
         street = ToyStreet(car_start=(x, y), wall_x=1e6)
@@ -140,7 +123,7 @@ def test_box_outline_covers_the_projected_box_exactly() -> None:
     assert box_outline(view, yaw_matrix(0, (5, 80, 0.8)), CAR_SIZE_M) is None
 
 
-def test_elevation_of_rays() -> None:
+def test_elevation_of_rays_and_sky_above_the_horizon() -> None:
     view = STREET.view(0.0)
     elevation = ray_elevation(view)
     middle = view.camera.height // 2
@@ -150,9 +133,6 @@ def test_elevation_of_rays() -> None:
     pitched = View(view.camera, pose, 0.0)
     column = view.camera.width // 2
     assert ray_elevation(pitched)[middle, column] == pytest.approx(elevation[middle, column] + 0.1, abs=1e-3)
-
-
-def test_sky_is_not_found_where_returns_are_or_below_the_horizon() -> None:
     rgb = np.full((60, 80, 3), 220, np.uint8)
     elevation = np.repeat(np.linspace(0.5, -0.5, 60)[:, None], 80, 1).astype(np.float32)
     # returns from column 50 on
@@ -186,7 +166,7 @@ def test_stage_makes_a_labelled_scene_and_leaves_the_given_one_alone(tmp_path: P
     assert (out / "scene.json").stat().st_mtime_ns == before_ns
 
 
-def test_a_scene_with_labels_passes_through_unchanged(tmp_path: Path) -> None:
+def test_a_scene_with_labels_passes_through_and_one_with_images_only_is_labelled(tmp_path: Path) -> None:
     given = STREET.write(tmp_path / "given")
     settings = AnnotateConfig(dynamic=False)
     scene = read_scene(Annotate(scene=tmp_path / "given", out=tmp_path / "out", settings=settings).run())
@@ -195,9 +175,6 @@ def test_a_scene_with_labels_passes_through_unchanged(tmp_path: Path) -> None:
         assert (read_label(scene, frame, "semantics") == read_label(given, before, "semantics")).all()
         assert np.array_equal(read_label(scene, frame, "depth"), read_label(given, before, "depth"), equal_nan=True)
     assert not any("not truth" in note for note in scene.source.notes)
-
-
-def test_a_scene_with_images_only_can_be_labelled(tmp_path: Path) -> None:
     street = ToyStreet(times=(0.0,))
     with SceneWriter(tmp_path / "s", "one image", Source("toy", "none")) as writer:
         view = street.view(0.0)
@@ -205,7 +182,7 @@ def test_a_scene_with_images_only_can_be_labelled(tmp_path: Path) -> None:
         writer.add_frame("front/000000", view, street.image(view)[0])
         writer.set_ego(EgoPath(np.zeros(1), np.eye(4)[None]))
         writer.finish()
-    scene = read_scene(Annotate(scene=tmp_path / "s", out=tmp_path / "out", settings=AnnotateConfig()).run())
+    scene = read_scene(Annotate(scene=tmp_path / "s", out=tmp_path / "new", settings=AnnotateConfig()).run())
     assert overlap(read_label(scene, scene.frames[0], "semantics"), street.image(view)[1], "sky") > 0.9
 
 
@@ -250,11 +227,16 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(tmp_path: Path) -> None:
         assert path.read_bytes() == (again / path.relative_to(whole)).read_bytes()
 
 
-def test_a_label_that_is_there_stays_and_gets_no_confidence() -> None:
+def test_a_label_that_is_there_stays_and_depth_without_lidar_too(tmp_path: Path) -> None:
     labels = label_by_geometry(given_at(STREET)[0])
     arrays = annotate.label_arrays(AnnotateConfig(depth=False, dynamic=False), labels)
     assert set(arrays) == {"semantics", "semantics_confidence", "sky"}
     assert annotate.wanted_labels(AnnotateConfig(ego=True)) == {"semantics", "sky", "depth", "dynamic", "ego"}
+    given = replace(given_at(STREET)[0], xyz_world=np.zeros((0, 3), np.float32))
+    labels = label_by_geometry(given)
+    network = lambda _: pytest.fail("asked")
+    assert annotate_depth.with_network(network, given, labels, "front/000000", tmp_path) is labels
+    assert (tmp_path / "front" / "000000.filled.json").is_file()
 
 
 def test_sweeps_nearest_in_time_are_chosen() -> None:
@@ -293,21 +275,17 @@ def test_depth_comes_from_the_network_where_it_fits_the_lidar(tmp_path: Path, mo
         Annotate(scene=tmp_path / "plain", out=tmp_path / "out", settings=config).run()
 
 
-def test_a_frame_without_lidar_keeps_its_depth(tmp_path: Path) -> None:
-    given = replace(given_at(STREET)[0], xyz_world=np.zeros((0, 3), np.float32))
-    labels = label_by_geometry(given)
-    network = lambda _: pytest.fail("asked")
-    assert annotate_depth.with_network(network, given, labels, "front/000000", tmp_path) is labels
-    assert (tmp_path / "front" / "000000.filled.json").is_file()
-
-
-def test_a_depth_network_needs_depth_and_a_folder(tmp_path: Path) -> None:
+def test_what_labellers_and_depth_networks_need_is_named(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="contradicts"):
         annotate_depth.digests(AnnotateConfig(depth=False, depth_network="x"))
     with pytest.raises(ResourceError, match="weights"):
         annotate_depth.digests(AnnotateConfig(depth_network=str(tmp_path)))
     assert annotate_depth.digests(AnnotateConfig(labeller="geometry")) == {}
     assert set(annotate_depth.digests(AnnotateConfig())) == {"weights"}
+    with pytest.raises(UsageError, match="labeller"):
+        labeller("magic")
+    with pytest.raises(ResourceError, match="weights"):
+        labeller("network", str(tmp_path / "nothing"))
 
 
 def test_bonnet_is_what_stays_the_same() -> None:
@@ -319,10 +297,3 @@ def test_bonnet_is_what_stays_the_same() -> None:
     found = steady_bottom(grey)
     assert (found & bonnet).sum() / (found | bonnet).sum() > 0.85
     assert not steady_bottom(rng.uniform(60, 200, (12, 60, 90))).any()
-
-
-def test_unknown_labeller_and_missing_weights_are_named(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="labeller"):
-        labeller("magic")
-    with pytest.raises(ResourceError, match="weights"):
-        labeller("network", str(tmp_path / "nothing"))

@@ -13,6 +13,7 @@ from fit_settings import fit_config
 from toy_world import camera, fused_cloud, truth, view_at, write_scene
 
 from mudg.base import geometry
+from mudg.base.config import to_dict
 from mudg.base.errors import InputError, NumericsError
 from mudg.base.run_folder import RunDir
 from mudg.core.native_ops import adam_columns
@@ -36,7 +37,7 @@ def everything(exposure="image") -> Appearance:
     return Appearance.of_views(RECORDED, AppearanceConfig(exposure=exposure, cameras=True))
 
 
-def test_the_start_is_the_identity():
+def test_the_start_is_the_identity_and_what_is_off_is_absent():
     made = everything()
     rgb = torch.rand(3, 4, 5, generator=torch.Generator().manual_seed(0))
     view = view_at(0.3, camera())
@@ -44,9 +45,6 @@ def test_the_start_is_the_identity():
     assert made.penalty(RECORDED[0], "recorded").item() == 0
     assert made.colored(rgb, VIRTUAL, "virtual") is rgb and made.penalty(VIRTUAL, "virtual") is None
     assert torch.allclose(made.world_from_cam(view, RECORDED[2]), torch.from_numpy(view.world_from_cam.copy()).float())
-
-
-def test_what_is_off_is_absent():
     made = Appearance.of_views(RECORDED, AppearanceConfig())
     rgb = torch.rand(3, 2, 2, generator=torch.Generator().manual_seed(0))
     assert not made
@@ -56,11 +54,17 @@ def test_what_is_off_is_absent():
     assert everything("camera").names == {"exposure": ("front", "left"), "cameras": RECORDED}
 
 
-def test_a_view_without_a_map_is_refused():
+def test_what_does_not_fit_or_is_not_finite_is_named():
     with pytest.raises(InputError, match="no colour map"):
         everything().colored(torch.zeros(3, 2, 2), "rear/000000", "recorded")
     with pytest.raises(InputError, match="do not fit"):
         Appearance({"exposure": ("a", "b")}, {"exposure": everything().tables["exposure"]})
+    made = everything()
+    made.tables["exposure"]["affine"].grad = torch.full((3, 3, 4), float("nan"))
+    scene = SceneModel(Table({"means": torch.zeros(1, 3)}), (StaticNode(),), None, (), 0)
+    with pytest.raises(NumericsError, match=r"exposure.affine, view v/1, step 3"):
+        FiniteCheck(3, at_once=True).gradients("v/1", scene, made)
+    assert made.tables["exposure"]["affine"].grad is None
 
 
 def test_maps_average_to_the_identity():
@@ -79,9 +83,8 @@ def test_maps_average_to_the_identity():
 def test_rigid_motion_agrees_with_the_rotation_about_an_axis():
     moved = rigid_motion(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0.0, 0.0, 0.7])).numpy()
     assert np.abs(moved - geometry.yaw_matrix(0.7, (1, 2, 3))).max() < 1e-6
-    any_turn = rigid_motion(
-        torch.zeros(3, dtype=torch.float64), torch.tensor([0.3, -0.4, 0.5], dtype=torch.float64)
-    ).numpy()
+    turn = torch.tensor([0.3, -0.4, 0.5], dtype=torch.float64)
+    any_turn = rigid_motion(torch.zeros(3, dtype=torch.float64), turn).numpy()
     assert geometry.rigid_problem(any_turn) is None
     assert math.acos((np.trace(any_turn[:3, :3]) - 1) / 2) == pytest.approx(math.sqrt(0.5), abs=1e-9)
 
@@ -100,10 +103,8 @@ def test_gradients_by_finite_differences(scale):
         pose = made.world_from_cam(view, RECORDED[1])
         return torch.cat([made.colored(rgb, RECORDED[1], "recorded").flatten(), pose.flatten()])
 
-    inputs = [
-        (scale * torch.randn(*shape, generator=g, dtype=torch.float64)).requires_grad_()
-        for shape in ((3, 3, 4), (3, 3), (3, 3))
-    ]
+    draw = lambda *shape: (scale * torch.randn(*shape, generator=g, dtype=torch.float64)).requires_grad_()
+    inputs = [draw(3, 3, 4), draw(3, 3), draw(3, 3)]
     assert torch.autograd.gradcheck(applied, inputs)
 
 
@@ -117,15 +118,6 @@ def test_only_the_image_of_a_step_moves(kernel):
     assert moved.tolist() == [False, True, False]
     assert not made.tables["cameras"]["turn"].detach().any()
     assert not made.tables["exposure"]["affine"].detach().any()
-
-
-def test_a_non_finite_gradient_is_named():
-    made = everything()
-    made.tables["exposure"]["affine"].grad = torch.full((3, 3, 4), float("nan"))
-    scene = SceneModel(Table({"means": torch.zeros(1, 3)}), (StaticNode(),), None, (), 0)
-    with pytest.raises(NumericsError, match=r"exposure.affine, view v/1, step 3"):
-        FiniteCheck(3, at_once=True).gradients("v/1", scene, made)
-    assert made.tables["exposure"]["affine"].grad is None
 
 
 def test_state_round_trip():
@@ -153,20 +145,12 @@ def world(tmp_path_factory):
 
 def begin(world, change=None, **options) -> tuple[fit.FitState, FitConfig]:
     scene, cloud = world
-    config = fit_config(
-        method="street_gaussians", **{"iterations": 120, "start__gaussians": 700, "densify__kind": "none", **options}
-    )
+    few = {"iterations": 120, "start__gaussians": 700, "densify__kind": "none"}
+    config = fit_config(method="street_gaussians", **{**few, **options})
     views, classes = fit.recorded_views(config, scene)
     if change is not None:
         views = replace(views, recorded=tuple(map(change, views.recorded)))
     return fit.start_state(config, scene, cloud, views, classes), config
-
-
-def optimised(state, config, tmp_path):
-    from mudg.base.config import to_dict
-
-    fit.optimise(state, config, RunDir.open(tmp_path, fit.OUTPUT, to_dict(config), {}))
-    return state
 
 
 def darker_left(stored):
@@ -181,11 +165,10 @@ def darker_left(stored):
 def test_different_exposures_are_recovered(world, tmp_path):
     """The ratio of both cameras' maps comes near the injected one, and the fit explains the pictures better."""
     state, config = begin(world, darker_left, appearance__exposure="camera", iterations=240)
-    optimised(state, config, tmp_path / "learnt")
+    fit.optimise(state, config, RunDir.open(tmp_path / "learnt", fit.OUTPUT, to_dict(config), {}))
     grey = torch.full((3, 1, 1), 0.5)
-    front, left = (
-        state.appearance.colored(grey, f"{name}/0", "recorded").detach().flatten() for name in ("front", "left")
-    )
+    shown = lambda name: state.appearance.colored(grey, f"{name}/0", "recorded").detach().flatten()
+    front, left = shown("front"), shown("left")
     injected = torch.tensor([0.7, 0.7, 0.75]) * 0.5 + 6 / 255
     assert ((left - front) / (injected - 0.5) > 0.4).all()
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,6 +15,7 @@ import roundtrip
 import write_av2 as made
 from bad_logs import refused
 from PIL import Image
+from tiny_networks import hide
 
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.geometry import invert, transform_points
@@ -48,9 +48,8 @@ def test_round_trip(truth: Scene, drive: Path, tmp_path: Path) -> None:
     assert scene.id == "7fab2350"
     timed = ingest(drive.parent, tmp_path / "timed", sequence="7fab")
     still = tuple(track for track in truth.tracks if np.ptp(track.world_from_object[:, :3, 3], axis=0).max() < 1e-9)
-    roundtrip.assert_same_log(
-        replace_tracks(timed, still), replace_tracks(truth, still), labels=made.READ_BACK, dt_s=1e-6
-    )
+    both = (replace_tracks(scene, still) for scene in (timed, truth))
+    roundtrip.assert_same_log(*both, labels=made.READ_BACK, dt_s=1e-6)
 
 
 def replace_tracks(scene: Scene, keep: tuple[Track, ...]) -> Scene:
@@ -165,14 +164,7 @@ def test_optional_parts_and_unknown_categories(drive: Path, tmp_path: Path, caps
 
 
 def test_without_pyarrow_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = builtins.__import__
-
-    def without(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name.startswith("pyarrow"):
-            raise ImportError(name)
-        return plain(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    hide(monkeypatch, "pyarrow")
     caught = refused("pyarrow", read_sweep, tmp_path / "1.feather", np.eye(4), raises=ResourceError)
     assert "mudg[data]" in caught.remedy
 

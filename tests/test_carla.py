@@ -52,16 +52,7 @@ class Client:
             actor.attributes.add(id=name, value=str(value))
         self.ask("SpawnSensor", self.pb.SpawnSensorRequest(sensor=actor))
 
-    def measure(
-        self,
-        sensor: int,
-        x: float = 0.0,
-        y: float = 0.0,
-        z: float = 1.5,
-        yaw: float = 0.0,
-        others: Any = (),
-        time_s: float = 0.5,
-    ) -> Any:
+    def measure(self, sensor: int, x: float = 0.0, y: float = 0.0, yaw: float = 0.0, others: Any = ()) -> Any:
         self.frame += 1
         request = self.pb.RenderRequest()
         stamp = request.snapshot.timestamp
@@ -133,9 +124,8 @@ def test_an_object_stands_where_carlas_actor_stands_and_carries_its_id(runs: dic
 def test_lidars_measure_the_wall(runs: dict[str, Path], kind: str) -> None:
     client = Client(run=str(runs["wall"])).load()
     more = {} if kind.endswith("semantic") else {"dropoff_general_rate": 0, "dropoff_intensity_limit": 0}
-    client.spawn(
-        9, kind, channels=8, range=50, points_per_second=8000, rotation_frequency=10, upper_fov=5, lower_fov=-5, **more
-    )
+    beams = {"channels": 8, "range": 50, "points_per_second": 8000, "rotation_frequency": 10}
+    client.spawn(9, kind, **beams, upper_fov=5, lower_fov=-5, **more)
     measured = client.measure(9, x=1.0)
     sweep, width = (measured.semantic_lidar, 6) if kind.endswith("semantic") else (measured.lidar, 4)
     points = np.frombuffer(sweep.raw_data, np.float32).reshape(-1, width)

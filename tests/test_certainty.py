@@ -66,19 +66,14 @@ def photograph(time_s: float = 0.0, left_m: float = 0.0) -> StoredView:
     mask = np.ones(SIZE[::-1], bool)
     mask[-4:] = False
     pixel = torch.arange(700, 1400, 7)
-    return StoredView(
-        "front/000000", seen.view, "recorded", rgb, mask=mask, lidar=LidarPixels(pixel, torch.full((len(pixel),), 9.0))
-    )
+    lidar = LidarPixels(pixel, torch.full((len(pixel),), 9.0))
+    return StoredView("front/000000", seen.view, "recorded", rgb, mask=mask, lidar=lidar)
 
 
 def in_double(gaussians: Gaussians) -> Gaussians:
     values = {field.name: getattr(gaussians, field.name) for field in dataclasses.fields(gaussians)}
-    doubled = {
-        name: value.detach().double()
-        for name, value in values.items()
-        if torch.is_tensor(value) and value.is_floating_point()
-    }
-    return replace(gaussians, **doubled)
+    numbers = {n: v for n, v in values.items() if torch.is_tensor(v) and v.is_floating_point()}
+    return replace(gaussians, **{name: value.detach().double() for name, value in numbers.items()})
 
 
 def test_sums_are_those_of_every_gaussians_weight_in_double_precision():
@@ -106,9 +101,8 @@ def test_images_of_differences():
     assert color[-4:].abs().sum() == 0 and color.max() > 0.05
     assert int(lidar.sum()) == 100
     pixel = int(view.lidar.pixel[50])
-    assert depth.flatten()[pixel] == pytest.approx(
-        min(1.0, abs(float(render.depth.flatten()[pixel]) - 9.0) / 9.0), rel=1e-5
-    )
+    off = abs(float(render.depth.flatten()[pixel]) - 9.0) / 9.0
+    assert depth.flatten()[pixel] == pytest.approx(min(1.0, off), rel=1e-5)
 
 
 def test_certainty_of_known_sums():
@@ -158,11 +152,7 @@ def fitted(tmp_path_factory) -> Path:
 
 def test_a_fit_stores_it_and_a_render_shows_it(fitted):
     model, view = fit.load_model(fitted), view_at(0.3, camera(width=60, height=40), left_m=2.0)
-    assert (
-        model.certainty is not None
-        and model.certainty.dtype == torch.float16
-        and len(model.certainty) == len(model.table)
-    )
+    assert model.certainty.dtype == torch.float16 and len(model.certainty) == len(model.table)
     assert 0 < model.certainty.float().mean() < 1
     seen, plain = render_condition(model, view, RASTER), fit.render_view(model, view, RASTER)
     torch.testing.assert_close(seen.rgb, plain.rgb)
@@ -173,17 +163,12 @@ def test_a_fit_stores_it_and_a_render_shows_it(fitted):
     assert seen.certainty.max() > 0.02
     away = view_at(0.3, camera(width=60, height=40), yaw_rad=np.pi)  # where no camera ever looked
     assert render_condition(model, away, RASTER).certainty.mean() < 0.3 * seen.certainty.mean()
+    bare = render_condition(replace(model, classes=()), view, RASTER)
+    torch.testing.assert_close(bare.certainty, seen.certainty)
+    assert (bare.semantics == 255).all()
 
 
-def test_without_classes_the_channel_is_the_same(fitted):
-    model, view = fit.load_model(fitted), view_at(0.3, camera(width=60, height=40))
-    bare = replace(model, classes=())
-    seen = render_condition(bare, view, RASTER)
-    torch.testing.assert_close(seen.certainty, render_condition(model, view, RASTER).certainty)
-    assert (seen.semantics == 255).all()
-
-
-def test_older_fits_are_read_and_their_certainty_is_unknown(fitted, tmp_path):
+def test_older_fits_have_none_and_removing_an_object_keeps_that_of_the_rest(fitted, tmp_path):
     for name in ("model.json", "nodes.safetensors"):
         (tmp_path / name).write_bytes((fitted / name).read_bytes())
     tensors = store.read_tensors(fitted / "gaussians.safetensors")
@@ -192,9 +177,6 @@ def test_older_fits_are_read_and_their_certainty_is_unknown(fitted, tmp_path):
     model = fit.load_model(tmp_path)
     assert model.certainty is None
     assert render_condition(model, view_at(0.3, camera(width=60, height=40)), RASTER).certainty is None
-
-
-def test_removing_an_object_keeps_the_certainty_of_the_rest(fitted):
     model = fit.load_model(fitted)
     model.table.labels["certainty"] = torch.arange(len(model.table)).half()
     kept = model.without_nodes(model.node_names()[:1]) if model.node_names() else model

@@ -48,24 +48,16 @@ def image_of_wall(view, x_m):
     return np.broadcast_to(stripes(y)[None], (camera.height, camera.width, 3)).round().astype(np.uint8).copy()
 
 
-def test_warp_of_a_plane_is_exact():
-    """A striped wall 10 m ahead, seen from 1.5 m beside: the warped recorded image equals the true one."""
+def test_warp_of_a_plane_is_exact_and_moves_left_when_the_camera_does():
+    """A striped wall 10 m ahead, seen from 1.5 m beside: the warped recorded image equals the true one. At depth Z a
+    shift s to the left moves content f s / Z pixels to the right in the new image."""
     recorded, target = view_at(), view_at(y=1.5)
-    source = WarpSource(
-        recorded,
-        conditions.image_tensor(image_of_wall(recorded, 10.0)),
-        torch.full((32, 48), 10.0),
-        torch.zeros(32, 48) > 0,
-        torch.zeros(32, 48, dtype=torch.uint8),
-    )
+    image, depth = conditions.image_tensor(image_of_wall(recorded, 10.0)), torch.full((32, 48), 10.0)
+    source = WarpSource(recorded, image, depth, depth < 0, torch.zeros(32, 48, dtype=torch.uint8))
     rgb, _, found = conditions.warp(target, torch.full((32, 48), 10.0), source, source.depth, 0.08)
     truth = conditions.image_tensor(image_of_wall(target, 10.0))
     assert float(found.float().mean()) > 0.85
     assert float((rgb - truth).abs()[:, found].max()) < 0.01
-
-
-def test_warp_moves_left_when_the_camera_moves_left():
-    """At depth Z a shift s to the left moves content f s / Z pixels to the right in the new image."""
     recorded, target = view_at(), view_at(y=1.0)
     x, _, _ = conditions.carry(target, torch.full((1, 32, 48), 10.0), recorded)
     assert float((x[0, 0] - (torch.arange(48) + 0.5)).mean()) == pytest.approx(-40.0 * 1.0 / 10.0)
@@ -113,11 +105,18 @@ def test_condition_of_a_wall():
     assert torch.equal(condition.reference, conditions.image_tensor(recorded[1].rgb))
 
 
-def test_backdrop_of_the_recorded_view_is_the_image():
+def test_the_backdrop_and_the_published_condition():
     cloud = FusedCloud(wall(12.0, stripes), {})
     recorded = [Photo(view_at(), image_of_wall(view_at(), 12.0))]
     condition = build_conditions(cloud, [], [view_at()], recorded, RULES)[0]
     assert torch.allclose(condition.backdrop[0], conditions.image_tensor(recorded[0].rgb), atol=1e-5)
+    cloud = FusedCloud(wall(12.0, stripes, z_range=(-9, 1)), {})
+    condition = build_conditions(cloud, [], [view_at(y=1.0)], recorded, replace(RULES, published=True))[0]
+    hole = ~condition.valid
+    assert bool(hole.any())
+    assert float(condition.depth[hole].abs().max()) == 0
+    assert float((condition.color * hole).abs().max()) == 0
+    assert condition.warped is None
 
 
 @pytest.mark.parametrize("fine", [0, 2])
@@ -162,17 +161,6 @@ def test_moving_things_take_no_colour_from_another_time():
     assert torch.allclose(now.color[0][:, car[0], car[1]].amax((1, 2)), torch.tensor([1.0, 0.0, 0.0]), atol=1e-5)
 
 
-def test_published_condition_is_zero_where_nothing_was_seen():
-    cloud = FusedCloud(wall(12.0, stripes, z_range=(-9, 1)), {})
-    recorded = [Photo(view_at(), image_of_wall(view_at(), 12.0))]
-    condition = build_conditions(cloud, [], [view_at(y=1.0)], recorded, replace(RULES, published=True))[0]
-    hole = ~condition.valid
-    assert bool(hole.any())
-    assert float(condition.depth[hole].abs().max()) == 0
-    assert float((condition.color * hole).abs().max()) == 0
-    assert condition.warped is None
-
-
 def test_nothing_in_view_gives_a_far_grey_nothing_not_an_error():
     cloud = FusedCloud(PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), "world"), {})
     condition = build_conditions(cloud, [], [view_at()], [], RULES)[0]
@@ -182,7 +170,7 @@ def test_nothing_in_view_gives_a_far_grey_nothing_not_an_error():
         build_conditions(cloud, [], [], [], RULES)[0]
 
 
-def test_sizes_follow_the_rules_and_mixed_image_sizes_work():
+def test_sizes_follow_the_rules_and_a_fine_grid_gives_cleaner_colour():
     cloud = FusedCloud(wall(12.0, stripes), {})
     big = Camera("front", 96, 64, 80.0, 80.0, 48.0, 32.0)
     recorded = [Photo(view_at(camera=big), image_of_wall(view_at(camera=big), 12.0))]
@@ -191,12 +179,6 @@ def test_sizes_follow_the_rules_and_mixed_image_sizes_work():
     truth = conditions.image_tensor(image_of_wall(view_at(y=0.5), 12.0))
     warped = condition.warped[0, 0]
     assert float((condition.color[0] - truth).abs()[:, warped].mean()) < 0.02
-
-
-def test_fine_grid_gives_the_same_geometry_and_cleaner_colour():
-    cloud = FusedCloud(wall(12.0, stripes), {})
-    big = Camera("front", 96, 64, 80.0, 80.0, 48.0, 32.0)
-    recorded = [Photo(view_at(camera=big), image_of_wall(view_at(camera=big), 12.0))]
     target = view_at(y=0.5, camera=big)
     plain = build_conditions(cloud, [], [target], recorded, RULES)[0]
     small, fine = build_conditions(cloud, [], [target], recorded, replace(RULES, fine_width=96, fine_height=64))
@@ -233,7 +215,7 @@ def some_clip(frames=3, height=16, width=24):
     )
 
 
-def test_shards_give_back_what_was_packed(tmp_path):
+def test_shards_give_back_what_was_packed_and_a_missing_one_is_named(tmp_path):
     clip = some_clip()
     clips.write_shard(tmp_path, 3, clips.pack_clips([replace(clip, shift_m=1.5), clip]))
     assert clips.clips_in(tmp_path, 3) == 2
@@ -250,9 +232,6 @@ def test_shards_give_back_what_was_packed(tmp_path):
     for view, original in zip(first.condition.views, (clip.condition.views[0], clip.condition.views[2])):
         assert np.array_equal(view.world_from_cam, original.world_from_cam)
         assert replace(view.camera, name="front") == original.camera
-
-
-def test_missing_shard_is_named(tmp_path):
     with pytest.raises(InputError, match="city_0000007"):
         clips.read_clip(tmp_path, 7, 0, [0])
 

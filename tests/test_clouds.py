@@ -109,7 +109,7 @@ def test_kitti_rows(tmp_path: Path) -> None:
     refused("cut off", clouds.read_cloud, tmp_path / "a.bin")
 
 
-def test_missing_returns_are_left_out_and_half_missing_ones_refused(tmp_path: Path) -> None:
+def test_missing_returns_files_without_coordinates_and_other_kinds(tmp_path: Path) -> None:
     xyz = XYZ.copy()
     xyz[1] = np.nan
     (tmp_path / "a.npz").write_bytes(npz(xyz=xyz, level=LEVEL))
@@ -118,6 +118,10 @@ def test_missing_returns_are_left_out_and_half_missing_ones_refused(tmp_path: Pa
     xyz[0, 2] = np.inf
     (tmp_path / "a.npz").write_bytes(npz(xyz=xyz))
     refused("not finite", clouds.read_cloud, tmp_path / "a.npz")
+    (tmp_path / "a.pcd").write_bytes(pcd_header("ascii", 1, "a b", "1 1") + b"1 2\n")
+    assert "a, b" in refused("no coordinates", clouds.read_cloud, tmp_path / "a.pcd").got
+    (tmp_path / "a.las").write_bytes(b"LASF")
+    refused("format is not known", clouds.read_cloud, tmp_path / "a.las")
 
 
 ASCII = b"ply\nformat ascii 1.0\n"
@@ -157,13 +161,6 @@ def npy_lie() -> bytes:
 )
 def test_lies_are_refused(suffix: str, content: bytes, words: str) -> None:
     refused(words, clouds.READERS[suffix], content, "cloud")
-
-
-def test_files_without_coordinates_or_of_another_kind_are_named(tmp_path: Path) -> None:
-    (tmp_path / "a.pcd").write_bytes(pcd_header("ascii", 1, "a b", "1 1") + b"1 2\n")
-    assert "a, b" in refused("no coordinates", clouds.read_cloud, tmp_path / "a.pcd").got
-    (tmp_path / "a.las").write_bytes(b"LASF")
-    refused("format is not known", clouds.read_cloud, tmp_path / "a.las")
 
 
 def lzf_compress(data: bytes) -> bytes:

@@ -12,7 +12,6 @@ from toy_scene import CAR_SIZE_M, ToyStreet
 from mudg.base.geometry import CAM_FROM_EGO_AXES, box_corners, invert, project, transform_points, yaw_matrix
 from mudg.base.types import Camera, View
 from mudg.core.pictures import depth_colors
-from mudg.scene import contact_sheet as above
 from mudg.scene import contact_sheet as sheets
 
 VIEW = View(Camera("front", 96, 64, 70.0, 70.0, 48.0, 32.0), invert(CAM_FROM_EGO_AXES), 0.0)
@@ -68,25 +67,24 @@ def test_a_sheet_has_a_row_per_camera_and_a_view_from_above(tmp_path: Path) -> N
 def test_scenes_that_lack_things_get_a_sheet_too(tmp_path: Path, lacking: str) -> None:
     street = ToyStreet(car_start=(12, 0), times=[0.0] if lacking == "one frame" else [0.0, 0.1])
     scene = street.write(tmp_path / "scene", labels=False, width=60, height=30)
-    scene = scene if lacking == "one frame" else replace(scene, **{lacking: ()})
-    assert sheets.contact_sheet(scene).height > sheets.TOP_HEIGHT_PX
-
-
-def test_single_images_of_several_cameras_share_rows(tmp_path: Path) -> None:
-    scene = ToyStreet(car_start=(12, 0), times=[0.0]).write(tmp_path / "scene", labels=False, width=60, height=30)
-    names = ("a", "b", "c", "d")
-    cameras = {name: replace(scene.cameras["front"], name=name) for name in names}
-    frames = tuple(
-        replace(scene.frames[0], view=View(cameras[name], scene.frames[0].view.world_from_cam, 0.0)) for name in names
-    )
+    if lacking != "one frame":
+        assert sheets.contact_sheet(replace(scene, **{lacking: ()})).height > sheets.TOP_HEIGHT_PX
+        return
+    assert sheets.contact_sheet(scene).size == (sheets.WIDTH_PX, sheets.WIDTH_PX // 2 + sheets.TOP_HEIGHT_PX)
+    cameras = {name: replace(scene.cameras["front"], name=name) for name in "abcd"}  # single images share rows
+    pose = scene.frames[0].view.world_from_cam
+    frames = tuple(replace(scene.frames[0], view=View(camera, pose, 0.0)) for camera in cameras.values())
     many = replace(scene, cameras=cameras, frames=frames, split={})
     assert sheets.contact_sheet(many).size == (sheets.WIDTH_PX, 2 * sheets.TILE_WIDTH_PX // 2 + sheets.TOP_HEIGHT_PX)
-    assert sheets.contact_sheet(scene).size == (sheets.WIDTH_PX, sheets.TILE_WIDTH_PX // 2 + sheets.TOP_HEIGHT_PX)
 
 
 def test_boxes_have_the_colour_of_their_class_also_where_there_are_no_points(tmp_path: Path) -> None:
     scene = ToyStreet(car_start=(40, 0)).write(tmp_path / "scene", labels=False, width=60, height=30)
-    for label, color in (("bus", above.VEHICLE_COLOR), ("cyclist", above.PEOPLE_COLOR), ("barrier", above.OTHER_COLOR)):
+    for label, color in (
+        ("bus", sheets.VEHICLE_COLOR),
+        ("cyclist", sheets.PEOPLE_COLOR),
+        ("barrier", sheets.OTHER_COLOR),
+    ):
         tracks = tuple(replace(track, label=label) for track in scene.tracks)
         top = np.array(sheets.top_view(replace(scene, tracks=tracks, sweeps=()), 400, 300))[20:250]
         assert (top == color).all(2).sum() > 20, label

@@ -88,10 +88,12 @@ def test_a_converted_file_keeps_its_origin(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_other_networks_are_refused_and_nothing_is_written(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="incomplete or of another network"):
-        converted.convert_weights("inception", saved(tmp_path, "i3d"), tmp_path / "out")
-    with pytest.raises(InputError, match="not the weights of a DINOv2"):
-        converted.convert_weights("dinov2", saved(tmp_path, "clip"), tmp_path / "out")
+    for network, given, said in (
+        ("inception", "i3d", "incomplete or of another network"),
+        ("dinov2", "clip", "not the weights of a DINOv2"),
+    ):
+        with pytest.raises(InputError, match=said):
+            converted.convert_weights(network, saved(tmp_path, given), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

@@ -25,16 +25,8 @@ from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import RigidNode, StaticNode
 from mudg.gaussians.settings import FitConfig
 
-SETTINGS = DensifySettings(
-    start=10,
-    stop=100,
-    every=10,
-    static_gradient=1.0,
-    object_gradient=1.0,
-    split_above_m=0.5,
-    max_rows=1000,
-    growth=10.0,
-)
+THRESHOLDS = {"static_gradient": 1.0, "object_gradient": 1.0, "split_above_m": 0.5, "growth": 10.0}
+SETTINGS = DensifySettings(start=10, stop=100, every=10, max_rows=1000, **THRESHOLDS)
 
 
 def scene(static: int = 6, moving: int = 4, scale_m: float = 0.1, opacity: float = 0.5) -> SceneModel:
@@ -65,12 +57,20 @@ def stats_for(model: SceneModel, loud: list[int]) -> DensifyStats:
     return stats
 
 
-def test_nothing_happens_below_the_threshold():
+def test_useless_rows_go_and_nothing_happens_below_the_threshold():
     model = scene()
     before = {name: value.clone() for name, value in model.table.state().items()}
     report = densify(model, stats_for(model, []), 10, SETTINGS, 0)
     assert report == {"cloned": 0, "split": 0, "pruned": 0, "rows": 10}
     assert all(torch.equal(value, before[name]) for name, value in model.table.state().items())
+    with torch.no_grad():
+        model.table["logits"][1] = -8.0  # transparent
+        model.table["log_scales"][2] = math.log(50.0)  # huge
+        model.table["means"][7] = torch.tensor([9.0, 0, 0])  # outside its box
+        model.table["means"][3] = torch.tensor([90.0, 0, 0])  # static: may be anywhere
+    report = densify(model, stats_for(model, []), 10, SETTINGS, 0)
+    assert report["pruned"] == 3
+    assert model.table["sh_dc"][:, 0, 0].tolist() == [0, 3, 4, 5, 6, 8, 9]
 
 
 def test_small_rows_are_cloned_with_fresh_moments():
@@ -116,41 +116,23 @@ def test_splits_are_drawn_along_the_gaussians_own_axes():
     assert spread[2] < 0.01
 
 
-def test_useless_rows_go():
-    model = scene()
-    with torch.no_grad():
-        model.table["logits"][1] = -8.0  # transparent
-        model.table["log_scales"][2] = math.log(50.0)  # huge
-        model.table["means"][7] = torch.tensor([9.0, 0, 0])  # outside its box
-        model.table["means"][3] = torch.tensor([90.0, 0, 0])  # static: may be anywhere
-    report = densify(model, stats_for(model, []), 10, SETTINGS, 0)
-    assert report["pruned"] == 3
-    assert model.table["sh_dc"][:, 0, 0].tolist() == [0, 3, 4, 5, 6, 8, 9]
-
-
-def test_the_budget_takes_the_loudest_first():
+def test_the_budget_takes_the_loudest_first_and_thresholds_differ_by_node():
     model = scene(static=10, moving=0)
     stats = stats_for(model, [])
     stats.gradient += torch.arange(10.0) + 3
-    settings = DensifySettings(
-        start=1, stop=9, every=1, static_gradient=1.0, max_rows=12, growth=10.0, split_above_m=0.5
-    )
+    settings = DensifySettings(start=1, stop=9, every=1, max_rows=12, **THRESHOLDS)
     densify(model, stats, 1, settings, 0)
     assert sorted(model.table["sh_dc"][:, 0, 0].tolist())[-4:] == [8, 8, 9, 9]
     assert len(model.table) == 12
     assert densify(model, stats_for(model, [0, 1]), 2, settings, 0)["rows"] == 12
-
-
-def test_thresholds_differ_by_kind_of_node():
     model = scene()
-    settings = DensifySettings(
-        start=1, stop=9, every=1, static_gradient=5.0, object_gradient=1.0, max_rows=99, growth=10.0
-    )
+    settings = DensifySettings(start=1, stop=9, every=1, max_rows=99, **{**THRESHOLDS, "static_gradient": 5.0})
     densify(model, stats_for(model, [2, 7]), 1, settings, 0)
     assert model.counts() == [6, 5]
 
 
-def test_statistics_count_visible_rows_only_in_half_image_units():
+def test_statistics_count_visible_rows_and_objects_with_their_plain_gradient():
+    """Opposite contributions of single pixels cancel there; the background keeps the absolute gradient."""
     stats = DensifyStats.zeros(2)
     visible, gradient = torch.tensor([True, False]), torch.tensor([[0.3, 0.4], [1.0, 1.0]])
     trace = RasterTrace(torch.zeros(2, 2), torch.zeros(2, 2, dtype=torch.int32), visible, gradient)
@@ -161,45 +143,6 @@ def test_statistics_count_visible_rows_only_in_half_image_units():
     assert stats.gradient[1].item() == 0
     with pytest.raises(ValueError, match="without absolute gradients"):
         stats.observe(RasterTrace(trace.means2d, trace.radii, trace.visible), 200, 100)
-
-
-def test_opacity_reset_only_lowers_and_forgets():
-    model = scene()
-    with torch.no_grad():
-        model.table["logits"][0] = -6.0
-    model.table.moment1["logits"] += 1
-    reset_opacity(model, SETTINGS)
-    opacity = torch.sigmoid(model.table["logits"])
-    assert opacity.max().item() == pytest.approx(0.01, rel=1e-4)
-    assert opacity[0] < 0.005
-    assert (model.table.moment1["logits"] == 0).all()
-
-
-def test_needles_are_shortened_discs_are_not():
-    model = scene(static=2, moving=0)
-    with torch.no_grad():
-        model.table["log_scales"][0] = torch.log(torch.tensor([0.1, 5.0, 0.2]))  # a needle
-        model.table["log_scales"][1] = torch.log(torch.tensor([3.0, 0.01, 4.0]))  # a disc
-    shorten_needles(model.table, 4.0)
-    assert model.table["log_scales"].exp()[0].tolist() == pytest.approx([0.1, 0.8, 0.2], rel=1e-5)
-    assert model.table["log_scales"].exp()[1].tolist() == pytest.approx([3.0, 0.01, 4.0], rel=1e-5)
-
-
-def test_when_it_is_due():
-    due = [step for step in range(1, 130) if SETTINGS.due(step)]
-    assert due == list(range(10, 101, 10))
-    assert not any(SETTINGS.reset_due(step) for step in range(1, 130))
-
-
-def test_rotate_agrees_with_the_matrix():
-    quats = torch.tensor([[0.3, -0.5, 0.2, 0.9]])
-    vector = torch.tensor([[1.0, 2.0, -0.7]])
-    expected = geometry.matrix_from_quaternion(quats[0].numpy()) @ vector[0].numpy()
-    assert rotate(quats, vector)[0].tolist() == pytest.approx(expected.tolist(), abs=1e-6)
-
-
-def test_objects_count_with_their_plain_gradient():
-    """Opposite contributions of single pixels cancel there; the background keeps the absolute gradient."""
     stats = DensifyStats.zeros(3)
     means2d = torch.zeros(3, 2, requires_grad=True)
     means2d.grad = torch.tensor([[0.1, 0.0], [0.1, 0.0], [0.0, 0.2]])
@@ -211,7 +154,36 @@ def test_objects_count_with_their_plain_gradient():
     assert stats.gradient.tolist() == pytest.approx([60.0, 40.0, 30.0])
 
 
-def test_a_wrong_kind_of_densification_is_refused(tmp_path):
+def test_opacity_reset_only_lowers_and_needles_are_shortened():
+    model = scene()
+    with torch.no_grad():
+        model.table["logits"][0] = -6.0
+    model.table.moment1["logits"] += 1
+    reset_opacity(model, SETTINGS)
+    opacity = torch.sigmoid(model.table["logits"])
+    assert opacity.max().item() == pytest.approx(0.01, rel=1e-4)
+    assert opacity[0] < 0.005
+    assert (model.table.moment1["logits"] == 0).all()
+    model = scene(static=2, moving=0)
+    with torch.no_grad():
+        model.table["log_scales"][0] = torch.log(torch.tensor([0.1, 5.0, 0.2]))  # a needle
+        model.table["log_scales"][1] = torch.log(torch.tensor([3.0, 0.01, 4.0]))  # a disc
+    shorten_needles(model.table, 4.0)
+    assert model.table["log_scales"].exp()[0].tolist() == pytest.approx([0.1, 0.8, 0.2], rel=1e-5)
+    assert model.table["log_scales"].exp()[1].tolist() == pytest.approx([3.0, 0.01, 4.0], rel=1e-5)
+
+
+def test_when_it_is_due_and_a_wrong_kind_is_refused(tmp_path):
+    due = [step for step in range(1, 130) if SETTINGS.due(step)]
+    assert due == list(range(10, 101, 10))
+    assert not any(SETTINGS.reset_due(step) for step in range(1, 130))
     (tmp_path / "fit.yaml").write_text("densify: {kind: mcm}\n")
     with pytest.raises(UsageError, match="'gradient' or 'none'"):
         configuration.load(FitConfig, None, tmp_path / "fit.yaml")
+
+
+def test_rotate_agrees_with_the_matrix():
+    quats = torch.tensor([[0.3, -0.5, 0.2, 0.9]])
+    vector = torch.tensor([[1.0, 2.0, -0.7]])
+    expected = geometry.matrix_from_quaternion(quats[0].numpy()) @ vector[0].numpy()
+    assert rotate(quats, vector)[0].tolist() == pytest.approx(expected.tolist(), abs=1e-6)

@@ -108,13 +108,8 @@ def test_files_of_other_ages_give_the_same(published: tuple[Path, dict[str, Any]
     (folder / "CLIP" / "config.json").write_text(json.dumps({**told, "vision_config": inner}))
     renamed = {}
     for name, value in made["vae"].state_dict().items():
-        for new, old in (
-            (".to_q.", ".query."),
-            (".to_k.", ".key."),
-            (".to_v.", ".value."),
-            (".to_out.0.", ".proj_attn."),
-        ):
-            name = name.replace(new, old)
+        for new, old in (("to_q", "query"), ("to_k", "key"), ("to_v", "value"), ("to_out.0", "proj_attn")):
+            name = name.replace(f".{new}.", f".{old}.")
         renamed[name] = value
     file = folder / "marigold-depth-v1-0" / "vae" / "diffusion_pytorch_model.safetensors"
     save_file(renamed, file, metadata={"format": "pt"})
@@ -173,17 +168,15 @@ def json_edit(file: str, **values: object) -> Callable[[Path], None]:
     return change
 
 
+def without(file: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / file).unlink()
+
+
 BAD = {
-    "a missing file": (
-        lambda f: (f / "DepthLab" / "reference_unet.pth").unlink(),
-        r"missing[\s\S]*reference_unet\.pth",
-    ),
-    "no base": (
-        lambda f: (f / "marigold-depth-v1-0" / "model_index.json").unlink(),
-        r"is missing[\s\S]*marigold-depth-v1-0",
-    ),
+    "a missing file": (without("DepthLab/reference_unet.pth"), r"missing[\s\S]*reference_unet\.pth"),
+    "no base": (without("marigold-depth-v1-0/model_index.json"), r"is missing[\s\S]*marigold-depth-v1-0"),
     "two encoders": (lambda f: shutil.copytree(f / "CLIP", f / "CLIP2"), r"more than once[\s\S]*CLIP, CLIP2"),
-    "no encoder weights": (lambda f: (f / "CLIP" / "model.safetensors").unlink(), "pytorch_model.bin"),
+    "no encoder weights": (without("CLIP/model.safetensors"), "pytorch_model.bin"),
     "code": (edited("mapping_layer.pth", lambda s: s.update(x=Hostile())), r"was not loaded[\s\S]*mkdir"),
     "a missing tensor": (edited("denoising_unet.pth", lambda s: s.pop("conv_out.bias")), r"1 missing: conv_out\.bias"),
     "an unknown tensor": (
@@ -220,7 +213,9 @@ def test_what_is_not_depthlab_is_refused(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["from"]
 
 
-def test_a_converted_folder_that_changed_is_refused(converted: Path, tmp_path: Path) -> None:
+def test_a_converted_folder_that_changed_or_lacks_a_package_is_refused(
+    converted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = tmp_path / "copy"
     shutil.copytree(converted, folder)
     file = next((folder / "vae").iterdir())
@@ -230,31 +225,22 @@ def test_a_converted_folder_that_changed_is_refused(converted: Path, tmp_path: P
         load_depth_network(folder)
     file.write_bytes(content)
     told = json.loads((folder / "model.json").read_text())
-    wide = {**told["parts"]["vae"]["config"], "latent_channels": 8}
+    parts, wide = told["parts"], {**told["parts"]["vae"]["config"], "latent_channels": 8}
     for other, message in (
         ({"schema": 2}, "not a DepthLab model of this version"),
         ({"sampling": {"steps": 50}}, "the field 'processing_px' is missing"),
-        ({"parts": {**told["parts"], "vae": {}}}, "not whole"),
-        (
-            {"parts": {**told["parts"], "mapping_layer": {**told["parts"]["mapping_layer"], "config": {"a": 1}}}},
-            "as it is described",
-        ),
-        ({"parts": {**told["parts"], "vae": {**told["parts"]["vae"], "config": wide}}}, "do not fit the configuration"),
+        ({"parts": {**parts, "vae": {}}}, "not whole"),
+        ({"parts": {**parts, "mapping_layer": {**parts["mapping_layer"], "config": {"a": 1}}}}, "as it is described"),
+        ({"parts": {**parts, "vae": {**parts["vae"], "config": wide}}}, "do not fit the configuration"),
         ({"scheduler": {"_class_name": "LCMScheduler"}}, "LCMScheduler"),
     ):
         (folder / "model.json").write_text(json.dumps({**told, **other}))
         with pytest.raises(InputError, match=message):
             load_depth_network(folder)
-
-
-def test_packages_that_are_missing_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    told = {"kind": "depthlab", "schema": 1, "scheduler": {}}
-    told["parts"] = {name: {"config": {}, "files": {}} for name in depthlab.PARTS}
-    told["sampling"] = {"processing_px": 48, "steps": 5, "strength": 0.8, "normalize_scale": 1}
-    (tmp_path / "model.json").write_text(json.dumps(told))
+    (folder / "model.json").write_text(json.dumps(told))
     tiny_networks.hide(monkeypatch, "diffusers")
     with pytest.raises(ResourceError, match=r"mudg\[models\]"):
-        load_depth_network(tmp_path)
+        load_depth_network(folder)
 
 
 # --- what the networks are given ------------------------------------------------------------------
@@ -300,13 +286,9 @@ def test_what_is_prepared_spans_the_known_depth() -> None:
     assert torch.equal(same_size.image[..., :30, 50:], same_size.image[..., :30, 49:50].expand(-1, -1, -1, 6))
     assert np.array_equal(same_size.missing[0, 0, :30, :50].numpy() == 0, seen)
     assert np.array_equal(((same_size.image[0, :, :30, :50].permute(1, 2, 0) + 1) * 127.5).round().numpy(), given.rgb)
-
-
-def test_returns_in_the_sky_are_not_known_and_none_at_all_is_an_error() -> None:
-    given, _ = street()
-    bare = DepthInput(given.rgb, np.where(given.sky, np.float32(50), np.float32(np.nan)), given.filled, given.sky)
+    in_the_sky = np.where(given.sky, np.float32(50), np.float32(np.nan))  # is not known
     with pytest.raises(InputError, match="LiDAR"):
-        prepare(bare, SAMPLING, 2, 28)
+        prepare(DepthInput(given.rgb, in_the_sky, given.filled, given.sky), SAMPLING, 2, 28)
 
 
 @pytest.mark.parametrize(("height", "width"), [(48, 72), (90, 40), (10, 12)])
@@ -407,25 +389,25 @@ def test_denoising_is_that_of_a_twin_written_out(converted: Path, tmp_path: Path
     np.testing.assert_allclose(found.numpy(), expected.numpy(), atol=2e-5)
 
 
+def small_inputs() -> tuple[depthlab.Prepared, Tensor]:
+    inputs = prepare(street(24, 32, measured=0.4)[0], replace(SAMPLING, processing_px=32), 2, 28)
+    return inputs, torch.randn(1, 4, 12, 16, generator=torch.Generator().manual_seed(1))
+
+
 def test_what_the_reference_unet_hands_over_matters(converted: Path) -> None:
     """With another image and the same vector of CLIP the answer is another: it can only come through the attention."""
-    model = DepthLab.load(converted)
-    given, _ = street(24, 32, measured=0.4)
-    inputs = prepare(given, replace(SAMPLING, processing_px=32), 2, 28)
-    noise = torch.randn(1, 4, 12, 16, generator=torch.Generator().manual_seed(1))
+    model, (inputs, noise) = DepthLab.load(converted), small_inputs()
     mirrored = replace(inputs, image=inputs.image.flip(-1))
     assert float((model.predict(inputs, noise) - model.predict(mirrored, noise)).abs().mean()) > 1e-4
 
 
 @pytest.mark.slow
-def test_known_cells_follow_the_known_depth_until_the_last_step(converted: Path) -> None:
+def test_known_cells_follow_the_known_depth_and_all_steps_start_from_noise(converted: Path, tmp_path: Path) -> None:
     model = DepthLab.load(converted)
     parts = model._parts
     calls: list[tuple[Tensor, int]] = []
     parts.denoising_unet.register_forward_pre_hook(lambda _, args: calls.append((args[0], int(args[1]))))
-    given, _ = street(24, 32, measured=0.4)
-    inputs = prepare(given, replace(SAMPLING, processing_px=32), 2, 28)
-    noise = torch.randn(1, 4, 12, 16, generator=torch.Generator().manual_seed(1))
+    inputs, noise = small_inputs()
     model.predict(inputs, noise)
     assert [t for _, t in calls] == [799, 599, 399, 199]
     depth = parts.vae.encode(inputs.nearest.repeat(1, 3, 1, 1)).latent_dist.mode() * 0.18215
@@ -437,17 +419,11 @@ def test_known_cells_follow_the_known_depth_until_the_last_step(converted: Path)
         assert float(away[known].max()) < 1e-5
         assert t == 799 or float(away[~known].max()) > 1e-2
     assert torch.equal(calls[0][0][:, 4:], calls[-1][0][:, 4:])  # mask and known depth stay
-
-
-@pytest.mark.slow
-def test_all_steps_start_from_noise(converted: Path, tmp_path: Path) -> None:
     shutil.copytree(converted, tmp_path / "copy")
     whole = {"processing_px": 32, "steps": 3, "strength": 1, "normalize_scale": 1}
     model = DepthLab.load(describe(tmp_path / "copy", sampling=whole))
     seen: list[Tensor] = []
     model._parts.denoising_unet.register_forward_pre_hook(lambda _, args: seen.append(args[0][:, :4]))
-    inputs = prepare(street(24, 32)[0], replace(SAMPLING, processing_px=32), 2, 28)
-    noise = torch.randn(1, 4, 12, 16, generator=torch.Generator().manual_seed(1))
     model.predict(inputs, noise)
     assert len(seen) == 3 and torch.equal(seen[0], noise)
 

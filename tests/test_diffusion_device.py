@@ -106,11 +106,9 @@ def test_a_clip_of_the_small_model_is_the_same_on_a_device_and_crosses_once(smal
     noise = [sum(clip.latents[m].numel() for m in clip.latents)] * 3  # a draw at the start and one between steps
     assert sorted(crossed.to_device) == sorted([*(x.numel() for c in (condition, fine) for x in tensors_of(c)), *noise])
     names = ("rgb", "depth", "semantics", "confidence", "log_error")
-    back = [getattr(c, name).numel() for c in (clip, finished) for name in names] + [
-        z.numel() for z in clip.latents.values()
-    ]
-    fits = [4] * len(clip.depth_fits)
-    assert sorted(crossed.to_host) == sorted(back + fits)
+    back = [getattr(c, name).numel() for c in (clip, finished) for name in names]
+    latents, fits = [z.numel() for z in clip.latents.values()], [4] * len(clip.depth_fits)
+    assert sorted(crossed.to_host) == sorted(back + latents + fits)
 
 
 @pytest.mark.parametrize(
@@ -184,9 +182,8 @@ def test_learn_on_a_device_is_learn_and_resumes(clips, tmp_path):
     assert losses_of(tmp_path / "there") == pytest.approx(losses_of(tmp_path / "here"), rel=1e-5)
     a, b = (model_files.load(folder).state_dict() for folder in (here, made))
     assert max(far_apart(a[name], b[name]) for name in a if a[name].any()) < 2e-3  # kept in 16 bits
-    assert store.read_json(tmp_path / "there" / "metrics.json")["average"]["psnr"] == pytest.approx(
-        store.read_json(tmp_path / "here" / "metrics.json")["average"]["psnr"], abs=0.02
-    )
+    psnr = [store.read_json(tmp_path / name / "metrics.json")["average"]["psnr"] for name in ("there", "here")]
+    assert psnr[0] == pytest.approx(psnr[1], abs=0.02)
 
 
 @pytest.mark.slow
@@ -226,9 +223,8 @@ def labelled(street, out, config):
 @pytest.mark.slow
 def test_synthesize_on_a_device_writes_the_same_views(small, street, tmp_path):
     model_files.save(small, tmp_path / "model", "", {})
-    config = SynthesizeConfig(
-        shifts_m=(1.0, -1.0), model=str(tmp_path / "model"), steps=2, device="cpu", precision="float32", processes=1
-    )
+    how = {"steps": 2, "device": "cpu", "precision": "float32", "processes": 1}
+    config = SynthesizeConfig(shifts_m=(1.0, -1.0), model=str(tmp_path / "model"), **how)
     here = synthesized(street, tmp_path / "here", config)
     with pretend_device():
         elsewhere = replace(config, device="pretend", processes=0)
@@ -246,16 +242,14 @@ def test_synthesize_on_a_device_writes_the_same_views(small, street, tmp_path):
 
 
 def in_float16(folder):
-    return SynthesizeConfig(
-        shifts_m=(1.0,), model=str(write_tiny(folder)), steps=2, guidance=1.0, device="cpu", precision="float16"
-    )
+    how = {"steps": 2, "guidance": 1.0, "device": "cpu", "precision": "float16"}
+    return SynthesizeConfig(shifts_m=(1.0,), model=str(write_tiny(folder)), **how)
 
 
 def test_float16_is_refused_on_the_cpu_and_for_other_models(street, tmp_path):
     config, out = in_float16(tmp_path), tmp_path / "out"
-    with pytest.raises(
-        UsageError, match=r"float16 is for published-type models on CUDA devices(.|\n)*a published-type model on cpu"
-    ):
+    said = r"float16 is for published-type models on CUDA devices(.|\n)*a published-type model on cpu"
+    with pytest.raises(UsageError, match=said):
         synthesized(street, out, config)
     with pretend_device(), pytest.raises(UsageError, match="another model on pretend"):
         synthesized(street, out, replace(config, model="embedded-tiny", guidance=None, device="pretend"))
@@ -305,9 +299,8 @@ class Plain(torch.nn.Module):
 def test_pretrained_networks_compute_on_the_device_and_answer_on_the_cpu():
     rng = np.random.default_rng(0)
     rgb = rng.integers(0, 255, (20, 30, 3), np.uint8)
-    asked = DepthInput(
-        rgb, np.full((20, 30), np.nan, np.float32), np.ones((20, 30), np.float32), np.zeros((20, 30), bool)
-    )
+    ones = np.ones((20, 30), np.float32)
+    asked = DepthInput(rgb, np.nan * ones, ones, ones < 0)
     preparation = Preparation(20, 30, 1, True, (0.5,) * 3, (0.5,) * 3)
 
     def answers(place: Compute):
@@ -329,13 +322,8 @@ def test_pretrained_networks_compute_on_the_device_and_answer_on_the_cpu():
 def test_annotate_on_a_device_writes_the_same_labels(street, tmp_path):
     tiny_networks.segformer(tmp_path / "net")
     tiny_networks.depth_anything(tmp_path / "depth")
-    config = AnnotateConfig(
-        labeller="network",
-        weights=str(tmp_path / "net"),
-        depth_network=str(tmp_path / "depth"),
-        device="cpu",
-        processes=1,
-    )
+    networks = {"weights": str(tmp_path / "net"), "depth_network": str(tmp_path / "depth")}
+    config = AnnotateConfig(labeller="network", **networks, device="cpu", processes=1)
     scenes = [labelled(street, tmp_path / "here", config)]
     with pretend_device():
         scenes.append(labelled(street, tmp_path / "there", replace(config, device="pretend")))
@@ -365,7 +353,7 @@ def test_what_a_device_does_not_do_is_said(street, small, tmp_path, monkeypatch)
             check_config(SynthesizeConfig(model=str(tmp_path / "model"), **{name: True}), False)
 
 
-def test_several_processes_take_a_device_each(monkeypatch):
+def test_processes_take_a_device_each_and_the_number_format_follows_it(monkeypatch):
     taken = []
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
@@ -381,9 +369,6 @@ def test_several_processes_take_a_device_each(monkeypatch):
         parallel._ranks_on_device(3, 4, "cuda:0")
     with pytest.raises(UsageError, match="not implemented"):
         parallel._ranks_on_device(3, 4, "mps")
-
-
-def test_the_number_format_follows_the_device(monkeypatch):
     said: list[str] = []
     monkeypatch.setattr(log, "info_once", said.append)
     card, apple = torch.device("cuda", 0), torch.device("mps", 0)

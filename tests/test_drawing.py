@@ -35,9 +35,8 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A scene of three frames and its clouds."""
     root = tmp_path_factory.mktemp("drawing")
     city = CityConfig(n_frames=3, width=72, height=48, cameras=("front",), lidar_azimuth_step_deg=1.0)
-    scene = Ingest(
-        log="city", out=root / "scene", settings=IngestConfig(city=city, contact_sheet=False, test_every=0)
-    ).run()
+    settings = IngestConfig(city=city, contact_sheet=False, test_every=0)
+    scene = Ingest(log="city", out=root / "scene", settings=settings).run()
     return scene, Fuse(scene=scene, out=root / "fuse", settings=FuseConfig()).run()
 
 
@@ -52,20 +51,15 @@ def fits(prepared: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) 
     return {name: fitted(config, prepared, root / name) for name, config in (("usual", USUAL), ("smooth", SMOOTH))}
 
 
-def test_a_model_notes_how_it_was_drawn_if_not_as_usual(fits: dict[str, Path]) -> None:
+def test_a_model_notes_how_it_was_drawn_and_renders_draw_so(fits: dict[str, Path], prepared: tuple[Path, Path]) -> None:
     facts = {name: json.loads((folder / "model.json").read_text())["facts"] for name, folder in fits.items()}
     assert "drawing" not in facts["usual"]
     assert facts["smooth"]["drawing"] == {"antialias": True}
-
-
-def test_renders_draw_as_the_fit_did(fits: dict[str, Path], prepared: tuple[Path, Path]) -> None:
     model, view = fit.load_model(fits["smooth"]), read_scene(prepared[0]).frames[1].view
     assert raster_of(model) == RasterConfig(near_m=NEAR_M, antialias=True)
     gaussians = compose(model, view.time_s)
-    drawn = {
-        smooth: rasterize(gaussians, view, RasterConfig(near_m=NEAR_M, antialias=smooth)).alpha
-        for smooth in (False, True)
-    }
+    configs = {smooth: RasterConfig(near_m=NEAR_M, antialias=smooth) for smooth in (False, True)}
+    drawn = {smooth: rasterize(gaussians, view, config).alpha for smooth, config in configs.items()}
     as_noted = rasterize(gaussians, view, raster_of(model)).alpha
     assert torch.equal(as_noted, drawn[True])
     assert not torch.equal(drawn[True], drawn[False])  # else this test shows nothing

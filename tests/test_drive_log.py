@@ -67,8 +67,9 @@ def test_nearest_index_gives_ties_to_the_earlier() -> None:
     assert nearest_index(np.array([3.0]), np.array([-1.0, 9.0])).tolist() == [0, 0]
 
 
-def test_frames_are_counted_by_the_reference_and_take_what_lies_nearest(tmp_path: Path) -> None:
-    scene = write_log(made(tmp_path / "log"), tmp_path / "out", ImportOptions(frames=(2, 4), test_every=0))
+def test_frames_are_counted_by_the_reference_and_held_out_together(tmp_path: Path) -> None:
+    drive = made(tmp_path / "log")
+    scene = write_log(drive, tmp_path / "out", ImportOptions(frames=(2, 4), test_every=0))
     assert [f.id for f in scene.frames_of("a")] == ["a/000000", "a/000001"]
     assert np.allclose([f.view.time_s for f in scene.frames_of("a")], [0.0, 0.1])  # zero is the earliest record
     assert np.allclose([f.view.time_s for f in scene.frames_of("b")], [0.03, 0.13])
@@ -77,10 +78,7 @@ def test_frames_are_counted_by_the_reference_and_take_what_lies_nearest(tmp_path
     assert np.allclose(scene.ego.world_from_ego[0][:3, 3], 0)
     assert np.allclose(scene.ego.world_from_ego[0][:3, :3], np.eye(3))
     assert any("frames 2 to 3 of camera a" in note for note in scene.source.notes)
-
-
-def test_cameras_of_one_moment_are_held_out_together(tmp_path: Path) -> None:
-    scene = write_log(made(tmp_path / "log"), tmp_path / "out", ImportOptions(test_every=3))
+    scene = write_log(drive, tmp_path / "split", ImportOptions(test_every=3))
     assert sorted(i for i, s in scene.split.items() if s == "test") == ["a/000003", "b/000003", "c/000000"]
 
 
@@ -101,7 +99,7 @@ def test_missing_files_are_counted_per_sensor_or_left_out(tmp_path: Path) -> Non
     assert len(scene.frames_of("b")) == 5
 
 
-def test_ranges_beyond_the_log_and_cameras_without_images_are_refused(tmp_path: Path) -> None:
+def test_ranges_beyond_the_log_and_impossible_motion_are_refused(tmp_path: Path) -> None:
     drive = made(tmp_path / "log")
     caught = refused("no frame", write_log, drive, tmp_path / "out", ImportOptions(frames=(6, 9)), raises=UsageError)
     assert "0 to 5" in caught.expected
@@ -109,14 +107,14 @@ def test_ranges_beyond_the_log_and_cameras_without_images_are_refused(tmp_path: 
     assert refused("no images", write_log, without_c, tmp_path / "out", ImportOptions()).got == "c"
     twice = replace(drive, images=[*drive.images, drive.images[0]])
     refused("same time", write_log, twice, tmp_path / "out", ImportOptions())
-
-
-def test_impossible_motion_is_refused(tmp_path: Path) -> None:
-    drive = made(tmp_path / "log")
     fast = replace(drive, ego=EgoPath(drive.ego.times_s / 1000, drive.ego.world_from_ego))
     refused("impossibly fast", write_log, fast, tmp_path / "out", ImportOptions())
     lying = replace(drive, ego=EgoPath(drive.ego.times_s, drive.ego.world_from_ego @ UP))
     refused("upright", write_log, lying, tmp_path / "out", ImportOptions())
+    sliding = EgoPath(drive.ego.times_s, drive.ego.world_from_ego @ yaw_matrix(0.8))
+    common.check_motion(drive.ego, "log")
+    assert "46 degrees" in refused("where it looks", common.check_motion, sliding, "log").got
+    common.check_motion(EgoPath(drive.ego.times_s, drive.ego.world_from_ego @ yaw_matrix(np.pi)), "log")
 
 
 @pytest.mark.parametrize(
@@ -139,11 +137,17 @@ def tracks_of(*keys: tuple[float, float], max_gap_s: float = 1.0) -> tuple[list[
     return boxes.tracks()
 
 
-def test_tracks_are_sorted_and_split_at_gaps() -> None:
+def test_tracks_are_sorted_split_at_gaps_and_clipped_one_key_beyond_each_end() -> None:
     tracks, notes = tracks_of(*((t, t) for t in (2.0, 0.0, 0.5, 1.0, 5.0)), max_gap_s=1.1)
     assert [(t.id, t.times_s.tolist()) for t in tracks] == [("7", [0.0, 0.5, 1.0, 2.0]), ("7.1", [5.0])]
     assert notes == ["1 tracks are not seen for more than 1.1 s and were split there"]
     refused("two boxes", tracks_of, (1.0, 0.0), (1.0, 1.0))
+    track = tracks_of(*((0.5 * n, n) for n in range(9)))[0][0]
+    kept = clip_track(track, 1.2, 2.0)
+    assert kept.times_s.tolist() == [1.0, 1.5, 2.0]
+    assert clip_track(track, 1.2, 2.1).times_s.tolist() == [1.0, 1.5, 2.0, 2.5]
+    assert clip_track(track, 4.1, 5.0) is None
+    assert clip_track(track, -3.0, -0.1) is None
 
 
 def test_what_stands_needs_no_keys_in_between_and_what_left_its_place_does(tmp_path: Path) -> None:
@@ -185,7 +189,7 @@ def test_swapped_sides_are_refused_when_most_vehicles_have_them() -> None:
     assert "2 of 3" in refused("swapped", boxes(4.0, 2.0, 4.0).tracks).got
 
 
-def test_a_track_takes_its_commonest_label_and_sizes_are_checked() -> None:
+def test_a_track_takes_its_commonest_label_and_unknown_ones_keep_their_last_word() -> None:
     boxes = BoxTracks("table", {})
     for time_s, label in ((0.0, "van"), (0.1, "car"), (0.2, "car")):
         boxes.add("7", label, time_s, (4.0, 2.0, 1.5), np.eye(4))
@@ -193,18 +197,6 @@ def test_a_track_takes_its_commonest_label_and_sizes_are_checked() -> None:
     for bad in ((0.0, 2.0, 1.5), (4.0, float("nan"), 1.5), (4.0, 2.0, 1e6), (None, 2.0, 1.5)):
         caught = refused("box size", boxes.add, "8", "car", 0.0, bad, np.eye(4), where="table: row 3")
         assert caught.where == "table: row 3"
-
-
-def test_clip_keeps_one_key_beyond_each_end() -> None:
-    track = tracks_of(*((0.5 * n, n) for n in range(9)))[0][0]
-    kept = clip_track(track, 1.2, 2.0)
-    assert kept.times_s.tolist() == [1.0, 1.5, 2.0]
-    assert clip_track(track, 1.2, 2.1).times_s.tolist() == [1.0, 1.5, 2.0, 2.5]
-    assert clip_track(track, 4.1, 5.0) is None
-    assert clip_track(track, -3.0, -0.1) is None
-
-
-def test_unknown_categories_keep_their_last_word() -> None:
     boxes = BoxTracks("table", {"vehicle.car": "car"})
     assert boxes.label_of("vehicle.hover Craft") == "hover_craft"
     assert boxes.label_of("vehicle.car") == "car"
@@ -246,14 +238,6 @@ def test_boxes_without_returns_take_the_delay_of_their_neighbours_and_standing_o
     moved, kept = times.at_sweep_times()
     assert np.abs(moved.world_from_object[:, 0, 3] - (20 + 10.0 * track.times_s)).max() < 1e-4
     assert kept is standing
-
-
-def test_a_vehicle_that_slides_is_refused_and_one_that_reverses_is_not(tmp_path: Path) -> None:
-    drive = made(tmp_path / "log")
-    sliding = EgoPath(drive.ego.times_s, drive.ego.world_from_ego @ yaw_matrix(0.8))
-    common.check_motion(drive.ego, "log")
-    assert "46 degrees" in refused("where it looks", common.check_motion, sliding, "log").got
-    common.check_motion(EgoPath(drive.ego.times_s, drive.ego.world_from_ego @ yaw_matrix(np.pi)), "log")
 
 
 def test_tracks_reach_the_images_at_their_ends() -> None:

@@ -19,6 +19,7 @@ from mudg.city.logs import write_city
 from mudg.core import calibration as edges
 from mudg.formats.importers import IMPORTERS
 from mudg.formats.importers.common import ImportOptions
+from mudg.scene import check
 from mudg.scene.check import camera_alignment, describe
 from mudg.steps import doctor as diagnosis
 
@@ -111,12 +112,8 @@ def test_too_little_to_tell_is_said(tmp_path: Path) -> None:
 def test_doctor_tells_of_each_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ToyStreet().write(tmp_path / "scene", labels=False, width=60, height=30)
     doubtful = edges.EdgeAlignment(0.2, (1.0, -0.5), 0.2, 900, "doubtful")
-    from mudg.scene import check
-
-    for found, level, said in (
-        (doubtful, "warning", "+1.0 degrees"),
-        (replace(doubtful, verdict="right"), None, "agree"),
-    ):
+    right = replace(doubtful, verdict="right")
+    for found, level, said in ((doubtful, "warning", "+1.0 degrees"), (right, None, "agree")):
         monkeypatch.setattr(check, "camera_alignment", lambda _scene, found=found: {"front": found})
         report: dict[str, Any] = diagnosis.report_scene(tmp_path / "scene")
         assert said in report["text"]

@@ -75,7 +75,7 @@ def test_dinov2_against_a_twin_in_float64() -> None:
     assert (made - expected).abs().max() < 1e-5 * expected.abs().max()  # measured 6e-7
 
 
-def test_positions_are_resized_by_the_published_factor() -> None:
+def test_positions_are_resized_by_the_published_factor_and_sizes_name_the_network() -> None:
     """Bicubic interpolation nearly keeps straight lines: a ramp shows where it is read."""
     state = toy_vit.dino_state()
     ramp = torch.arange(37.0).view(37, 1).expand(37, 37).reshape(1, -1, 1)
@@ -89,9 +89,6 @@ def test_positions_are_resized_by_the_published_factor() -> None:
     # by the size they would lie elsewhere
     assert (expected - ((torch.arange(16) + 0.5) * 37 / 16 - 0.5)).abs().max() > 0.2
     assert torch.equal(network.positions(37, 37), state["pos_embed"])
-
-
-def test_sizes_name_the_network() -> None:
     assert dinov2.NAMES[384, 12] == "ViT-S/14"
     count = sum(torch.Size(shape).numel() for shape in dinov2.tensor_shapes(384, 12).values())
     assert count == 22_056_576 - 384  # the published ViT-S/14 without its mask token
@@ -158,7 +155,7 @@ def test_prepared_images_have_the_statistics_of_the_networks() -> None:
 # ---- distances -----------------------------------------------------------------------------------
 
 
-def test_polynomial_distance_by_hand_and_its_symmetries() -> None:
+def test_polynomial_distance_and_consistency_by_hand() -> None:
     a, b = np.array([[2.0, 0.0]]), np.array([[0.0, 2.0]])
     # Kernels: (4 / 2)^2 = 4 with itself, 0 across.
     assert feature_distances.polynomial_distance(a, b) == pytest.approx(100 * 8)
@@ -170,9 +167,6 @@ def test_polynomial_distance_by_hand_and_its_symmetries() -> None:
     assert feature_distances.polynomial_distance(2 * x, 2 * y) == pytest.approx(16 * found)
     moments = x.T @ x / 7 - y.T @ y / 9  # a kernel of degree 2 without constant compares second moments
     assert found == pytest.approx(100 * (moments**2).sum() / 25)
-
-
-def test_consistency_by_hand() -> None:
     rows = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
     # Neighbours at right angles: 0. With the first: 0 and max(0, -1).
     assert subject_consistency(rows) == 0
@@ -198,13 +192,8 @@ def test_the_scorer_computes_what_weights_and_features_allow(tmp_path: Path) -> 
     for name, moved in clips.items():
         rows = rng.standard_normal((6, 3)).astype(np.float32) + np.float32(moved)
         store.write_safetensors(tmp_path / "video" / f"{name}.safetensors", {"features": rows})
-    config = ScoreConfig(
-        dino_weights=str(tmp_path / "dino.safetensors"),
-        clip_weights=str(tmp_path / "clip.safetensors"),
-        video_features=str(tmp_path / "video"),
-        perceptual_views=0,
-        error_pictures=False,
-    )
+    weights = {f"{name}_weights": str(tmp_path / f"{name}.safetensors") for name in ("dino", "clip")}
+    config = ScoreConfig(**weights, video_features=str(tmp_path / "video"), perceptual_views=0, error_pictures=False)
     out = Score(scene=scene, views=methods, out=tmp_path / "score", settings=config).run()
     document = store.read_json(out / "metrics.json")
     values = {r["method"]: r["values"] for r in document["results"]}
@@ -232,21 +221,13 @@ def test_the_scorer_computes_what_weights_and_features_allow(tmp_path: Path) -> 
     assert len(list((out / "features").glob("*.safetensors"))) == 4
 
 
-def test_programs_are_not_read_as_video_features(tmp_path: Path) -> None:
-    scene = toy_views.write_scene(tmp_path / "scene")
-    views = toy_views.write_views(scene, tmp_path / "a", "a", (2.0,))
-    program = tmp_path / "extractor.pt"
-    program.write_bytes(b"PK")
-    settings = ScoreConfig(video_features=str(program), perceptual_views=0)
-    with pytest.raises(InputError, match="no such folder of features"):
-        Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=settings).run()
-
-
-def test_malformed_video_features_are_refused(tmp_path: Path) -> None:
+def test_programs_and_malformed_files_are_not_read_as_video_features(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene")
     views = toy_views.write_views(scene, tmp_path / "a", "a", (2.0,))
     file = tmp_path / "video" / "recorded" / "front.safetensors"
     store.write_safetensors(file, {"features": np.zeros((3, 2, 2), np.float32)})
-    config = ScoreConfig(video_features=str(tmp_path / "video"), perceptual_views=0)
-    with pytest.raises(InputError, match=r"front.safetensors"):
-        Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=config).run()
+    (tmp_path / "extractor.pt").write_bytes(b"PK")
+    for given, said in (("video", r"front.safetensors"), ("extractor.pt", "no such folder of features")):
+        config = ScoreConfig(video_features=str(tmp_path / given), perceptual_views=0)
+        with pytest.raises(InputError, match=said):
+            Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=config).run()

@@ -22,7 +22,7 @@ from toy_scene import ToyStreet
 from mudg import app
 from mudg.base import geometry
 from mudg.base.errors import InputError, MudgError, UsageError
-from mudg.base.types import View
+from mudg.base.types import PointCloud, View
 from mudg.baselines.bezier import BezierNode
 from mudg.baselines.pvg import VibrationNode, starting_columns
 from mudg.core.edit import HeightMap, Motion
@@ -34,6 +34,7 @@ from mudg.editing.runs import find_run
 from mudg.exporting import export
 from mudg.exporting import export as scenes
 from mudg.exporting.settings import ExportConfig, ImportConfig
+from mudg.formats.exporters import messages
 from mudg.formats.exporters.cameras import colmap_files, nerfstudio_files, rig_frames, sensors_from_rig
 from mudg.formats.splats import formats
 from mudg.formats.splats.cloud import SplatCloud
@@ -52,9 +53,8 @@ def turning(kind: type[RigidNode] = RigidNode) -> SceneModel:
     """The toy scene of the edits with a car that turns."""
     model = toy(kind)
     node = model.nodes[1]
-    keys = np.stack(
-        [pose @ geometry.yaw_matrix(0.5 * t) for t, pose in zip(node.times_s, node.world_from_object, strict=True)]
-    )
+    poses = zip(node.times_s, node.world_from_object, strict=True)
+    keys = np.stack([pose @ geometry.yaw_matrix(0.5 * t) for t, pose in poses])
     turned = kind("car-1", "car", SIZE, node.times_s, keys, None if kind is BezierNode else node.offsets)
     return replace(model, nodes=(model.nodes[0], turned))
 
@@ -76,14 +76,15 @@ def baked(model: SceneModel, name: str, time_s: float = T) -> SplatCloud:
     if name != "usda":
         return formats.read_cloud(content, f"x.{name}")[0]
     splats = slow.read_usd_splats(slow.parse_usda(content.decode())["World"]["scene"]["splats"])
-    columns = (
-        [s.place for s in splats],
-        [s.turn for s in splats],
-        np.log([s.size for s in splats]),
-        np.log([s.opacity / (1 - s.opacity) for s in splats]),
-        [s.sh for s in splats],
-    )
-    return SplatCloud(*(np.asarray(values, np.float32) for values in columns))
+    rows = [(s.place, s.turn, np.log(s.size), np.log(s.opacity / (1 - s.opacity)), s.sh) for s in splats]
+    return SplatCloud(*(np.asarray(values, np.float32) for values in zip(*rows, strict=True)))
+
+
+def with_columns(model: SceneModel, degree: int | None = None, **more: torch.Tensor) -> SceneModel:
+    """The model with other columns, and harmonics of a degree."""
+    columns = {key: value.detach() for key, value in model.table.columns.items()} | more
+    table = type(model.table)(columns, model.table.labels)
+    return replace(model, table=table, sh_degree=model.sh_degree if degree is None else degree)
 
 
 @pytest.mark.parametrize("name", LEAST_DB)
@@ -95,11 +96,9 @@ def test_what_comes_back_renders_as_the_fit_does(name: str) -> None:
 def test_harmonics_of_what_stands_come_back(name: str) -> None:
     """Axes are turned there and back, harmonics with them."""
     model = toy()
-    g = torch.Generator().manual_seed(3)
-    columns = {key: value.detach() for key, value in model.table.columns.items()}
-    rows = model.table.labels["node"] == 0
-    columns["sh_rest"] = torch.randn(len(model.table), 15, 3, generator=g) * 0.1 * rows[:, None, None]
-    bent = replace(model, table=type(model.table)(columns, model.table.labels), sh_degree=3)
+    g, rows = torch.Generator().manual_seed(3), model.table.labels["node"] == 0
+    harmonics = torch.randn(len(model.table), 15, 3, generator=g) * 0.1 * rows[:, None, None]
+    bent = with_columns(model, 3, sh_rest=harmonics)
     assert float(psnr(picture(bent), picture(model))) < 35  # they show
     assert db(bent, baked(bent, name)) >= LEAST_DB[name]
 
@@ -112,12 +111,10 @@ def test_nodes_of_every_kind_stand_where_the_model_puts_them(kind: type[RigidNod
             node = model.nodes[1]
             node.offsets["deform"].normal_(0, 0.2, generator=torch.Generator().manual_seed(1))
     if kind is BezierNode:
-        columns = {key: value.detach() for key, value in model.table.columns.items()}
-        columns["curve"] = torch.randn(len(model.table), 4, 3, generator=torch.Generator().manual_seed(1)) * 0.1
-        model = replace(model, table=type(model.table)(columns, model.table.labels))
-    columns = {key: value.detach() for key, value in model.table.columns.items()}
-    columns["sh_rest"] = torch.randn(len(model.table), 8, 3, generator=torch.Generator().manual_seed(2))
-    model = replace(model, table=type(model.table)(columns, model.table.labels), sh_degree=2)
+        curve = torch.randn(len(model.table), 4, 3, generator=torch.Generator().manual_seed(1)) * 0.1
+        model = with_columns(model, curve=curve)
+    harmonics = torch.randn(len(model.table), 8, 3, generator=torch.Generator().manual_seed(2))
+    model = with_columns(model, 2, sh_rest=harmonics)
     keys = model.nodes[1].times_s
     for time_s in (float(keys[3]), float((keys[3] + keys[4]) / 2)):
         scene = scenes.splat_scene(model, time_s)
@@ -130,11 +127,9 @@ def test_nodes_of_every_kind_stand_where_the_model_puts_them(kind: type[RigidNod
 
 def test_a_background_that_changes_with_time_is_taken_at_the_moment() -> None:
     model = toy().without_nodes(["car-1"])
-    columns = {key: value.detach() for key, value in model.table.columns.items()}
-    columns |= starting_columns(len(model.table), torch.linspace(-0.1, 0.1, len(model.table)), 0.2)
+    columns = starting_columns(len(model.table), torch.linspace(-0.1, 0.1, len(model.table)), 0.2)
     columns["velocity"] = torch.randn(len(model.table), 3, generator=torch.Generator().manual_seed(1)) * 5
-    node = VibrationNode("background", 0.5, 0.1)
-    moving = replace(model, table=type(model.table)(columns, model.table.labels), nodes=(node,))
+    moving = replace(with_columns(model, **columns), nodes=(VibrationNode("background", 0.5, 0.1),))
     assert db(moving, baked(moving, "ply", 0.7), 0.7) > 50
     assert db(moving, baked(moving, "ply", 0.2), 0.7) < 40
 
@@ -149,21 +144,13 @@ def test_the_sky_as_gaussians_looks_as_the_sky() -> None:
     assert scene.sky is None and scene.nodes[-1].name == "sky"
     alone = scenes.model_of_cloud(scene.nodes[-1].cloud, "sky")
     empty = replace(model, table=alone.table, nodes=alone.nodes, classes=())
+    columns = {k: v.detach()[:1] * 0 - 50 for k, v in alone.table.columns.items()}
+    nothing = type(alone.table)(columns, {"node": torch.zeros(1, dtype=torch.int32)})
     camera = toy_view().camera
     for yaw in (0.0, 2.0, 4.0):
         up = geometry.yaw_matrix(yaw) @ geometry.invert(geometry.CAM_FROM_EGO_AXES)
         view = View(camera, up, T)
-        truth = render_view(
-            replace(
-                empty,
-                table=type(alone.table)(
-                    {k: v.detach()[:1] * 0 - 50 for k, v in alone.table.columns.items()},
-                    {"node": torch.zeros(1, dtype=torch.int32)},
-                ),
-            ),
-            view,
-            RasterConfig(backend="cpu"),
-        ).rgb
+        truth = render_view(replace(empty, table=nothing), view, RasterConfig(backend="cpu")).rgb
         shown = render_view(replace(empty, sky=None), view, RasterConfig(backend="cpu")).rgb
         assert float(psnr(shown, truth)) > 28
 
@@ -231,9 +218,6 @@ def test_what_cannot_be_exported_is_refused(
     with pytest.raises(MudgError, match=said):
         Export(format=name, source=fit, out=tmp_path / out, settings=ExportConfig(**settings)).run()
     assert not (tmp_path / out).exists()
-
-
-def test_an_output_inside_the_fit_is_refused(fit: Path) -> None:
     with pytest.raises(UsageError, match="lies in"):
         Export(format="ply", source=fit, out=fit / "a.ply", settings=ExportConfig()).run()
 
@@ -244,9 +228,8 @@ def test_an_output_inside_the_fit_is_refused(fit: Path) -> None:
 @pytest.mark.parametrize("name", ["ply", "spz", "splat", "sog", "glb", "compressed-ply"])
 def test_a_file_becomes_an_object_that_scripts_insert(name: str, fit: Path, tmp_path: Path) -> None:
     car = toy_splats.cloud(60, 0, 3, spread=1.0)
-    scene = toy_splats.SplatScene(
-        "car", (toy_splats.SplatNode("car", car.moved(geometry.yaw_matrix(0.0, (30, 0, 5)))),)
-    )
+    node = toy_splats.SplatNode("car", car.moved(geometry.yaw_matrix(0.0, (30, 0, 5))))
+    scene = toy_splats.SplatScene("car", (node,))
     suffix = formats.FORMATS[name].suffixes[0]
     file = tmp_path / f"van{suffix}"
     turned = replace(scene, file_from_world=formats.file_from_world(name, "viewer"))
@@ -261,32 +244,25 @@ def test_a_file_becomes_an_object_that_scripts_insert(name: str, fit: Path, tmp_
     assert abs(np.ptp(means[:, 0]) / np.ptp(car.means[:, 1]) - scale) < 0.02 * scale  # what lay along y lies along x
     script = tmp_path / "edits.yaml"
     script.write_text("- insert: {asset: {file: a.safetensors}, id: van-9, path: [[0, 9, 2, 0]]}\n")
-    Export(
-        format="ply",
-        source=fit,
-        edits=script,
-        out=tmp_path / "inserted.ply",
-        settings=ExportConfig(time_s=T, nodes=("van-9",)),
-    ).run()
-    assert (tmp_path / "inserted.ply").is_file()
+    chosen, out = ExportConfig(time_s=T, nodes=("van-9",)), tmp_path / "inserted.ply"
+    Export(format="ply", source=fit, edits=script, out=out, settings=chosen).run()
+    assert out.is_file()
+
+
+def imported(file: Path, out: Path, **settings: object) -> Path:
+    return AssetImport(file=file, out=out, settings=ImportConfig(**settings)).run()
 
 
 def test_a_file_becomes_a_scene(tmp_path: Path) -> None:
     cloud = toy_splats.cloud(40, 2, classes=True)
     (tmp_path / "a.ply").write_bytes(formats.ply.to_bytes(cloud, classes=True))
-    AssetImport(file=tmp_path / "a.ply", out=tmp_path / "fit", settings=ImportConfig(kind="scene", axes="world")).run()
+    imported(tmp_path / "a.ply", tmp_path / "fit", kind="scene", axes="world")
     model = load_model(tmp_path / "fit")
     assert len(model.table) == 40 and model.sh_degree == 2 and model.nodes[0].kind == "static"
     again = scenes.splat_scene(model, 0.0).nodes[0].cloud
-    assert (
-        np.array_equal(again.sh, cloud.sh)
-        and cloud.class_ids is not None
-        and np.array_equal(again.class_ids, cloud.class_ids)
-    )
+    assert np.array_equal(again.sh, cloud.sh) and np.array_equal(again.class_ids, cloud.class_ids)
     with pytest.raises(UsageError, match="settings of objects"):
-        AssetImport(
-            file=tmp_path / "a.ply", out=tmp_path / "fit2", settings=ImportConfig(kind="scene", label="car")
-        ).run()
+        imported(tmp_path / "a.ply", tmp_path / "fit2", kind="scene", label="car")
 
 
 def test_a_street_of_a_file_lies_where_the_vehicle_begins(tmp_path: Path) -> None:
@@ -296,11 +272,7 @@ def test_a_street_of_a_file_lies_where_the_vehicle_begins(tmp_path: Path) -> Non
     means = np.concatenate([ground, wall]).astype(np.float32)
     cloud = replace(toy_splats.cloud(3300), means=means, logits=np.full(3300, 3, np.float32))
     (tmp_path / "a.ply").write_bytes(formats.ply.to_bytes(cloud))
-    AssetImport(
-        file=tmp_path / "a.ply",
-        out=tmp_path / "street",
-        settings=ImportConfig(kind="scene", axes="world", origin_m=(100, 0, 0)),
-    ).run()
+    imported(tmp_path / "a.ply", tmp_path / "street", kind="scene", axes="world", origin_m=(100, 0, 0))
     found = background_of(find_run(tmp_path / "street"), "street")
     assert abs(np.median(found.ground_xyz[:, 2]) - 7) < 0.02 and len(found.ground_xyz) > 500
     pose = geometry.yaw_matrix(0.5, (20, 5, 1))
@@ -312,44 +284,46 @@ def test_a_street_of_a_file_lies_where_the_vehicle_begins(tmp_path: Path) -> Non
 
 
 def test_what_cannot_be_imported_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such file"):
-        AssetImport(file=tmp_path / "no.ply", out=tmp_path / "a.safetensors", settings=ImportConfig()).run()
     (tmp_path / "a.obj").write_bytes(b"v 0 0 0")
-    with pytest.raises(InputError, match="no file of Gaussians"):
-        AssetImport(file=tmp_path / "a.obj", out=tmp_path / "a.safetensors", settings=ImportConfig()).run()
-    (tmp_path / "b.ply").write_bytes(
-        formats.ply.to_bytes(replace(toy_splats.cloud(5), logits=np.full(5, -9, np.float32)))
-    )
-    with pytest.raises(InputError, match="no solid Gaussians"):
-        AssetImport(file=tmp_path / "b.ply", out=tmp_path / "a.safetensors", settings=ImportConfig()).run()
-    with pytest.raises(UsageError, match="ends in .safetensors"):
-        AssetImport(file=tmp_path / "b.ply", out=tmp_path / "a.ply", settings=ImportConfig()).run()
-    assert (
-        app.main(["asset", "import", str(tmp_path / "b.ply"), "car-1", "--out", str(tmp_path / "a.safetensors")]) == 2
-    )
-    assert app.main(["asset", "export", str(tmp_path), "--out", str(tmp_path / "a.safetensors")]) == 2
+    faint = replace(toy_splats.cloud(5), logits=np.full(5, -9, np.float32))
+    (tmp_path / "b.ply").write_bytes(formats.ply.to_bytes(faint))
+    for file, out, error, said in (
+        ("no.ply", "a.safetensors", InputError, "no such file"),
+        ("a.obj", "a.safetensors", InputError, "no file of Gaussians"),
+        ("b.ply", "a.safetensors", InputError, "no solid Gaussians"),
+        ("b.ply", "a.ply", UsageError, "ends in .safetensors"),
+    ):
+        with pytest.raises(error, match=said):
+            imported(tmp_path / file, tmp_path / out)
+    for words in (["import", str(tmp_path / "b.ply"), "car-1"], ["export", str(tmp_path)]):
+        assert app.main(["asset", *words, "--out", str(tmp_path / "a.safetensors")]) == 2
     assert not (tmp_path / "a.safetensors").exists()
 
 
 # -- cameras ---------------------------------------------------------------------------------------
 
 
-def test_nerfstudio_cameras_look_where_ours_do(tmp_path: Path) -> None:
+def test_nerfstudio_cameras_look_where_ours_do_and_points_start_where_ours_are(tmp_path: Path) -> None:
     scene = ToyStreet(times=[0.0, 0.1]).write(tmp_path / "scene", width=24, height=12)
-    Export(format="nerfstudio", source=tmp_path / "scene", out=tmp_path / "out", settings=ExportConfig()).run()
+    step = Export(format="nerfstudio", source=tmp_path / "scene", out=tmp_path / "out", settings=ExportConfig())
+    step.run()
     told = json.loads((tmp_path / "out" / "transforms.json").read_text())
     assert len(told["frames"]) == 2
     for frame, ours in zip(told["frames"], scene.frames, strict=True):
-        assert (tmp_path / "out" / frame["file_path"]).read_bytes() == (
-            tmp_path / "scene" / ours.image.path
-        ).read_bytes()
+        picture = (tmp_path / "scene" / ours.image.path).read_bytes()
+        assert (tmp_path / "out" / frame["file_path"]).read_bytes() == picture
         pose = np.array(frame["transform_matrix"])
         point = ours.view.world_from_cam @ [0.4, 0.3, 5.0, 1.0]
         x, y, z, _ = np.linalg.inv(pose) @ point  # x right, y up, z back
         uv = frame["fl_x"] * x / -z + frame["cx"], frame["fl_y"] * -y / -z + frame["cy"]
         assert np.allclose(uv, geometry.project(ours.view, point[None, :3])[0][0])
-    again = Export(format="nerfstudio", source=tmp_path / "scene", out=tmp_path / "out", settings=ExportConfig()).run()
-    assert again == tmp_path / "out"  # verified and reused
+    assert step.run() == tmp_path / "out"  # verified and reused
+    xyz, rgb = np.array([[1, 2, 3], [4, 5, 6]], np.float32), np.array([[9, 8, 7], [6, 5, 4]], np.uint8)
+    points = PointCloud(xyz, rgb, "world")  # to start from
+    content = colmap_files(scene, points)["sparse/0/points3D.bin"]
+    assert struct.unpack_from("<QQ3d3BdQ", content) == (2, 1, 1.0, 2.0, 3.0, 9, 8, 7, 0.0, 0)
+    assert len(content) == 8 + 2 * 51
+    assert nerfstudio_files(scene, points)["points.ply"].endswith(struct.pack("<3f3B", 4, 5, 6, 6, 5, 4))
 
 
 def test_colmap_binaries_hold_the_poses_and_one_rig(tmp_path: Path) -> None:
@@ -410,28 +384,10 @@ def test_colmap_binaries_hold_the_poses_and_one_rig(tmp_path: Path) -> None:
     assert len(text["sparse/0/rigs.txt"].split()) == 4 + 10
 
 
-def test_starting_points_of_cameras(tmp_path: Path) -> None:
-    from mudg.base.types import PointCloud
-
-    scene = ToyStreet(times=[0.0]).write(tmp_path / "scene", width=24, height=12)
-    points = PointCloud(
-        np.array([[1, 2, 3], [4, 5, 6]], np.float32), np.array([[9, 8, 7], [6, 5, 4]], np.uint8), "world"
-    )
-    content = colmap_files(scene, points)["sparse/0/points3D.bin"]
-    assert (
-        struct.unpack_from("<QQ3d3BdQ", content) == (2, 1, 1.0, 2.0, 3.0, 9, 8, 7, 0.0, 0)
-        and len(content) == 8 + 2 * 51
-    )
-    files = nerfstudio_files(scene, points)
-    assert files["points.ply"].endswith(struct.pack("<3f3B", 4, 5, 6, 6, 5, 4))
-
-
 # -- messages --------------------------------------------------------------------------------------
 
 
 def test_messages_are_read_in_order_and_through_the_index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from mudg.formats.exporters import messages
-
     monkeypatch.setattr(messages, "CHUNK_BYTES", 20_000)
     street = ToyStreet(times=[0.5, 0.6, 0.7], car_start=(8.0, 1.0), car_velocity=(3.0, 0.0))
     scene = street.write(tmp_path / "scene", width=24, height=12)

@@ -136,15 +136,12 @@ def test_golden_bytes_of_a_transform(exported: tuple[Scene, Path]) -> None:
     assert messages.content(messages._tf("/tf", 0.5, "map", {"a": pose})) == bytes.fromhex(golden)
 
 
-def test_a_name_with_a_zero_byte_is_refused(exported: tuple[Scene, Path]) -> None:
+def test_names_are_those_that_ros_accepts(exported: tuple[Scene, Path]) -> None:
+    names = ros2.ros_names(["front", "CAM__front-left", "cam front left", "02", "", "ä"])
+    assert list(names.values()) == ["front", "CAM_front_left", "cam_front_left", "n02", "sensor", "sensor_2"]
     scene = replace(exported[0], tracks=(replace(exported[0].tracks[0], label="a\0b"),))
     with pytest.raises(InputError, match="zero byte"):
         ros2.Ros2Messages(log_of(scene))
-
-
-def test_names_are_those_that_ros_accepts() -> None:
-    names = ros2.ros_names(["front", "CAM__front-left", "cam front left", "02", "", "ä"])
-    assert list(names.values()) == ["front", "CAM_front_left", "cam_front_left", "n02", "sensor", "sensor_2"]
 
 
 def test_the_same_log_gives_the_same_bag_in_bounded_memory(exported: tuple[Scene, Path], tmp_path: Path) -> None:
@@ -160,16 +157,23 @@ def test_the_same_log_gives_the_same_bag_in_bounded_memory(exported: tuple[Scene
     assert (folder / "out" / "log_0.mcap").read_bytes() == first
 
 
-@pytest.mark.parametrize("name, out, package", [("mcap", "a.mcap", "mcap"), ("ros2", "bag", "rosbags")])
-def test_messages_name_their_extra_where_it_is_missing(
-    exported: tuple[Scene, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, out: str, package: str
+@pytest.mark.parametrize(
+    "name, out, package, extra",
+    [("mcap", "a.mcap", "mcap", "ros"), ("ros2", "bag", "rosbags", "ros"), ("rerun", "a.rrd", "rerun", "rerun")],
+)
+def test_a_missing_package_is_named_with_its_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, out: str, package: str, extra: str
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     for module in [key for key in sys.modules if key.startswith(f"{package}.")]:
         monkeypatch.delitem(sys.modules, module)
-    with pytest.raises(ResourceError, match=r"mudg\[ros\]"):
-        Export(format=name, source=exported[1] / "scene", out=tmp_path / out, settings=ExportConfig()).run()
+    street(tmp_path / "scene")
+    save_model(toy(), tmp_path / "fit")
+    source = tmp_path / ("fit" if name == "rerun" else "scene")
+    with pytest.raises(ResourceError, match=rf"mudg\[{extra}\]"):
+        Export(format=name, source=source, out=tmp_path / out, settings=ExportConfig()).run()
     assert not (tmp_path / out).exists()
+    assert app.main(["export", name, str(source), "--out", str(tmp_path / "a.txt")]) != 0
 
 
 def test_what_has_no_log_or_is_damaged_is_refused(tmp_path: Path) -> None:
@@ -188,28 +192,13 @@ def test_what_has_no_log_or_is_damaged_is_refused(tmp_path: Path) -> None:
 # -- rerun -----------------------------------------------------------------------------------------
 
 
-def test_rerun_names_its_extra_where_it_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    save_model(toy(), tmp_path / "fit")
-    with pytest.raises(ResourceError, match=r"mudg\[rerun\]"):
-        Export(format="rerun", source=tmp_path / "fit", out=tmp_path / "a.rrd", settings=ExportConfig()).run()
-    assert not (tmp_path / "a.rrd").exists()
-    assert app.main(["export", "rerun", str(tmp_path / "fit"), "--out", str(tmp_path / "a.mcap")]) != 0
-
-
 def test_a_recording_of_rerun_holds_log_and_gaussians(tmp_path: Path) -> None:
     pytest.importorskip("rerun")
     from rerun.chunk import RrdReader
 
-    scene = street(tmp_path / "scene")
+    scene, out = street(tmp_path / "scene"), tmp_path / "a.rrd"
     save_model(toy(), tmp_path / "fit")
-    Export(
-        format="rerun",
-        source=tmp_path / "fit",
-        scene=tmp_path / "scene",
-        out=tmp_path / "a.rrd",
-        settings=ExportConfig(),
-    ).run()
+    Export(format="rerun", source=tmp_path / "fit", scene=tmp_path / "scene", out=out, settings=ExportConfig()).run()
     columns: dict[tuple[str, str], list[Any]] = {}
     for chunk in RrdReader(tmp_path / "a.rrd").stream().to_chunks():
         batch = chunk.to_record_batch()
@@ -222,13 +211,7 @@ def test_a_recording_of_rerun_holds_log_and_gaussians(tmp_path: Path) -> None:
     assert np.allclose(np.squeeze(mounted), [f.view.center_world for f in scene.frames])
     assert len(columns["/world/gaussians/background", "Points3D:positions"][0]) == 640
     assert len(columns["/world/gaussians/background", "Points3D:radii"][0]) == 640
-    car = columns[
-        (
-            "/world/gaussians/car\\-1"
-            if ("/world/gaussians/car\\-1", "Points3D:positions") in columns
-            else "/world/gaussians/car-1"
-        ),
-        "Points3D:positions",
-    ]
-    assert len(car[0]) == 50 and len(columns["/world/objects/car-1", "Boxes3D:half_sizes"]) == 1
+    points = {path.replace("\\", ""): rows for (path, name), rows in columns.items() if name == "Points3D:positions"}
+    assert len(points["/world/gaussians/car-1"][0]) == 50
+    assert len(columns["/world/objects/car-1", "Boxes3D:half_sizes"]) == 1
     assert len(columns["/world/lidar/lidar", "Points3D:positions"]) == 3

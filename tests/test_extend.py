@@ -33,6 +33,7 @@ from mudg.sim import Instant, Session
 @pytest.fixture
 def installed(tmp_path: Path, repository: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of installed packages with one that offers the skeletons, as pip would leave it."""
+    assert plugins("importer") == {}  # nothing is offered where no package offers it
     folder = tmp_path / "site"
     shutil.copytree(repository / "docs" / "examples" / "extend", folder)
     info = folder / "my_package-1.2.dist-info"
@@ -49,10 +50,6 @@ def installed(tmp_path: Path, repository: Path, monkeypatch: pytest.MonkeyPatch)
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return roundtrip.small_log(tmp_path_factory.mktemp("truth") / "city")
-
-
-def test_nothing_is_offered_where_no_package_offers_it() -> None:
-    assert plugins("importer") == {}
 
 
 def test_an_importer_of_another_package_reads_a_recording(installed: Path, truth: Scene, tmp_path: Path) -> None:
@@ -85,15 +82,13 @@ def test_a_metric_becomes_a_column_of_the_scores(
     """Views that are 20 grey values darker, and brighter, than the truth: what a squared error cannot tell apart."""
     monkeypatch.setitem(METRICS, "brightness_bias", importlib.import_module("my_metric").ROW)
     scene = toy_views.write_scene(tmp_path / "scene")
-    views = {
-        name: toy_views.write_views(
-            scene, tmp_path / name, name, (0.0,), lambda _, seen, by=by: replace(seen, rgb=seen.rgb + by / 255)
-        )
-        for name, by in (("darker", -20), ("brighter", 20))
-    }
+    views, offsets = {}, {"darker": -20, "brighter": 20}
+    for name, by in offsets.items():
+        change = lambda _, seen, by=by: replace(seen, rgb=seen.rgb + by / 255)
+        views[name] = toy_views.write_views(scene, tmp_path / name, name, (0.0,), change)
     out = mudg.score(scene, views=views, out=tmp_path / "score", perceptual_views=0)
     values = {row["method"]: row["values"] for row in store.read_json(out / "metrics.json")["results"]}
-    for name, by in (("darker", -20), ("brighter", 20)):
+    for name, by in offsets.items():
         assert values[name]["brightness_bias"] == pytest.approx(by / 255, abs=1e-6)
     assert values["darker"]["psnr"] == pytest.approx(values["brighter"]["psnr"])
     assert "brightness_bias" in (out / "metrics.md").read_text()

@@ -190,15 +190,24 @@ def test_a_worker_that_dies_while_it_is_sent_work_ends_the_work_of_all() -> None
         list(run_in_processes(die, [(Deadly(50_000_000),)] * 4, 2))
 
 
+SHORT_OF_MEMORY = """
+import resource, sys
+sys.path[:0] = sys.argv[1:]
+import test_failures
+from mudg.base import failures
+from mudg.base.processes import run_in_processes
+if __name__ == "__main__":
+    resource.setrlimit(resource.RLIMIT_AS, (500 << 20, 8 << 30))
+    try:
+        list(run_in_processes(test_failures.die, [("",)] * 2, 2))
+    except Exception as error:
+        sys.exit(55 if failures.in_words(error) else 1)
+"""
+
+
 @pytest.mark.slow
 def test_workers_without_memory_to_start_end_the_work(tmp_path: Path) -> None:
-    script = (
-        "import sys; sys.path[:0] = sys.argv[1:]\nimport test_failures as t\nfrom mudg.base.processes import"
-        " run_in_processes\nimport resource\nfrom mudg.base import failures\nif __name__ == '__main__':\n   "
-        " resource.setrlimit(resource.RLIMIT_AS, (500 << 20, 8 << 30))\n    try:\n        list(run_in_processes(t.die,"
-        " [('',)] * 2, 2))\n    except Exception as error:\n        sys.exit(55 if failures.in_words(error) else 1)\n"
-    )
-    (tmp_path / "parent.py").write_text(script)
+    (tmp_path / "parent.py").write_text(SHORT_OF_MEMORY)
     places = [str(Path(__file__).parent), *(path for path in sys.path if path)]
     command = [sys.executable, str(tmp_path / "parent.py"), *places]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)

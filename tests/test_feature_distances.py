@@ -68,14 +68,11 @@ def test_rotating_everything_changes_nothing(name: str) -> None:
     assert ALL[name](a @ turn, b @ turn) == pytest.approx(ALL[name](a, b), rel=1e-9)
 
 
-def test_frechet_of_known_gaussians() -> None:
+def test_frechet_of_known_gaussians_scales_and_moves_as_it_must() -> None:
     one, two = np.diag([4.0, 9.0, 1.0]), np.diag([1.0, 16.0, 1.0])
     a, b = exactly(np.array([1.0, 0, 0]), one, 50), exactly(np.array([0.0, 2, 0]), two, 70)
     # Commuting covariances: |m|^2 + the squared differences of the standard deviations.
     assert distances.frechet_distance(a, b) == pytest.approx(5.0 + 1.0 + 1.0, rel=1e-12)
-
-
-def test_frechet_scales_and_moves_as_it_must() -> None:
     a, b = rows(20, 7, "a"), rows(31, 7, "b")
     value = distances.frechet_distance(a, b)
     assert distances.frechet_distance(a + 5, b + 5) == pytest.approx(value, rel=1e-9)
@@ -87,9 +84,8 @@ def test_frechet_scales_and_moves_as_it_must() -> None:
 def test_frechet_agrees_with_the_matrix_root(n: int, m: int) -> None:
     a, b = rows(n, 12, "a"), rows(m, 12, "b")
     # The root of a singular product is known to half of the digits only; ours needs no root.
-    assert distances.frechet_distance(a, b) == pytest.approx(
-        frechet_by_sqrtm(a, b), rel=1e-9 if min(n, m) > 12 else 1e-5
-    )
+    digits = 1e-9 if min(n, m) > 12 else 1e-5
+    assert distances.frechet_distance(a, b) == pytest.approx(frechet_by_sqrtm(a, b), rel=digits)
 
 
 def test_frechet_of_few_rows_is_mostly_bias_and_the_extrapolation_takes_most_of_it() -> None:
@@ -98,9 +94,6 @@ def test_frechet_of_few_rows_is_mostly_bias_and_the_extrapolation_takes_most_of_
     biased = distances.frechet_distance(a, b)
     assert distances.frechet_distance(a[:60], b[:60]) > 3 * biased > 3.0
     assert abs(distances.frechet_at_infinity(a, b, seeds.numpy_rng(0, 0, "sizes"))) < biased / 3
-
-
-def test_frechet_at_infinity_of_a_plain_shift_is_the_shift() -> None:
     a = seeds.numpy_rng(0, 0, "shift").standard_normal((400, 3))
     found = distances.frechet_at_infinity(a, a + [10.0, 0, 0], seeds.numpy_rng(0, 1, "sizes"))
     assert found == pytest.approx(100.0, rel=0.02)
@@ -116,14 +109,11 @@ def kernel_by_loops(a: np.ndarray, b: np.ndarray) -> float:
     return own_a + own_b - 2 * sum(k(x, y) for x in a for y in b) / (n * m)
 
 
-def test_kernel_distance_against_loops_and_by_hand() -> None:
+def test_kernel_distance_against_loops_by_hand_and_of_one_law() -> None:
     a, b = rows(7, 4, "a"), rows(5, 4, "b")
     assert distances.kernel_distance(a, b) == pytest.approx(kernel_by_loops(a, b), rel=1e-12)
     # d = 1: k(1,1) = 8, k(0,0) = 1, k(0,1) = 1 -> 8 + 1 - 2.
     assert distances.kernel_distance([[1.0], [1.0]], [[0.0], [0.0]]) == pytest.approx(7.0, rel=1e-12)
-
-
-def test_kernel_distance_of_one_law_is_0_on_average() -> None:
     found = []
     for draw in range(300):
         rng = seeds.numpy_rng(0, draw, "law")
@@ -144,6 +134,9 @@ def test_kernel_error_agrees_with_the_spread_of_fresh_samples_and_grows_with_blo
     assert np.mean(found) == pytest.approx(np.std(fresh), rel=0.4)
     rng = seeds.numpy_rng(0, 0, "blocks")
     a, b = (np.repeat(rng.standard_normal((12, 4)), 5, 0) + shift for shift in (0.8, 0.0))  # five equal frames each
+    for wrong in ((range(60), range(4)), (range(60), [1] * 60)):
+        with pytest.raises(InputError, match="blocks do not fit"):
+            distances.kernel_distance_error(a, b, wrong, rng)
     blocks = np.repeat(np.arange(12), 5)
     apart = distances.kernel_distance_error(a, b, (range(60), range(60)), seeds.numpy_rng(0, 0, "boot"))
     assert distances.kernel_distance_error(a, b, (blocks, blocks), seeds.numpy_rng(0, 0, "boot")) > 1.5 * apart
@@ -178,20 +171,13 @@ def test_cmmd_by_hand() -> None:
 @pytest.mark.parametrize("name", ALL)
 def test_what_cannot_be_compared_is_refused(name: str) -> None:
     a = rows(5, 4, "a")
-    with pytest.raises(InputError, match="differ in width"):
-        ALL[name](a, a[:, :3])
-    with pytest.raises(InputError, match="wrong shape"):
-        ALL[name](a[:0], a)
-    with pytest.raises(InputError, match="wrong shape"):
-        ALL[name](a, a[0])
     spoilt = a.copy()
     spoilt[3, 1] = np.nan
-    with pytest.raises(InputError, match="real images, row 3"):
-        ALL[name](a, spoilt)
-
-
-def test_blocks_must_fit() -> None:
-    a, rng = rows(5, 4, "a"), seeds.numpy_rng(0, 0, "boot")
-    for blocks in ((range(5), range(4)), (range(5), [1] * 5)):
-        with pytest.raises(InputError, match="blocks do not fit"):
-            distances.kernel_distance_error(a, a, blocks, rng)
+    for one, other, said in (
+        (a, a[:, :3], "differ in width"),
+        (a[:0], a, "wrong shape"),
+        (a, a[0], "wrong shape"),
+        (a, spoilt, "real images, row 3"),
+    ):
+        with pytest.raises(InputError, match=said):
+            ALL[name](one, other)

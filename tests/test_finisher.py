@@ -82,35 +82,25 @@ def test_tiles_equal_the_whole_image(blocks, size, tile_px):
 
 
 @torch.no_grad()
-def test_the_whole_image_is_one_pass():
+def test_the_whole_image_is_one_pass_and_memory_that_of_a_tile(monkeypatch):
     finisher, given, made = random_finisher(), some_pixels(32, 48), some_made(16, 24)
     enlarged = made.enlarged((32, 48), (0, 32), (0, 48))
     once = finisher(enlarged, given, 2, torch.full((2,), 2.0))
     whole = finish_in_tiles(finisher, made, given)
     assert torch.allclose(whole.rgb, once.rgb, atol=1e-6)
     assert torch.equal(whole.ids[:, 0], once.shares.argmax(1).to(torch.uint8))
-
-
-@torch.no_grad()
-def test_the_margin_is_not_wider_than_needed(monkeypatch):
-    """With a smaller one, seams would show: what the test above compares does depend on it."""
-    finisher, given, made = random_finisher(), some_pixels(93, 131), some_made(24, 32)
-    whole = finish_in_tiles(finisher, made, given, 1000)
-    monkeypatch.setattr(Finisher, "margin_px", 4)
-    assert float((finish_in_tiles(finisher, made, given, 40).rgb - whole.rgb).abs().max()) > 1e-3
-
-
-@torch.no_grad()
-def test_memory_is_that_of_a_tile(monkeypatch):
-    finisher, seen = random_finisher(), []
-    forward = finisher.forward
-    monkeypatch.setattr(
-        finisher, "forward", lambda made, given, *rest: (seen.append(given.color.shape), forward(made, given, *rest))[1]
-    )
+    forward, seen = finisher.forward, []
+    noted = lambda made, given, *rest: (seen.append(given.color.shape), forward(made, given, *rest))[1]
+    monkeypatch.setattr(finisher, "forward", noted)
     finish_in_tiles(finisher, some_made(24, 32), some_pixels(150, 202), 40)
     longest = 40 + 2 * finisher.margin_px + 2 * network.STRIDE_PX
     assert len(seen) == 4 * 6
     assert all(max(shape[-2:]) <= longest for shape in seen)
+    # with a smaller margin, seams would show: what the test above compares does depend on it
+    given, made = some_pixels(93, 131), some_made(24, 32)
+    whole = finish_in_tiles(finisher, made, given, 1000)
+    monkeypatch.setattr(Finisher, "margin_px", 4)
+    assert float((finish_in_tiles(finisher, made, given, 40).rgb - whole.rgb).abs().max()) > 1e-3
 
 
 def test_enlarging_is_what_interpolation_does():
@@ -131,7 +121,7 @@ def test_enlarging_is_what_interpolation_does():
 
 
 @torch.no_grad()
-def test_it_starts_as_fixed_shares_of_its_sources():
+def test_it_starts_as_fixed_shares_of_its_sources_and_an_unknown_class_takes_none():
     """Logits 2, 0, -2, 0: three quarters of the generated clip, a tenth of what was warped and of the render."""
     finisher, given, made = Finisher((8, 16), (1, 1)), some_pixels(32, 48), some_made(32, 48)
     draw_weights(finisher, 5, "finisher")
@@ -146,6 +136,12 @@ def test_it_starts_as_fixed_shares_of_its_sources():
     assert torch.allclose(done.depth_code, depth, atol=1e-5)
     assert torch.equal(done.shares.argmax(1, keepdim=True), made.ids.long())
     assert torch.allclose(done.log_error, made.log_error)
+    finisher, given, made = Finisher((8, 16), (1, 1)), some_pixels(16, 16), some_made(16, 16)
+    unknown = torch.full_like(given.ids, 255)
+    done = finisher(made, replace(given, ids=unknown, backdrop_ids=unknown, render_ids=unknown), 2, torch.ones(2))
+    share = float(torch.tensor([2.0, 0, -2, 0]).softmax(0)[0])
+    assert torch.allclose(done.shares.sum(1), torch.full((2, 16, 16), share), atol=1e-5)
+    assert bool(torch.isfinite(network.class_scores(done)).all())
 
 
 @torch.no_grad()
@@ -168,27 +164,6 @@ def test_it_can_copy_each_source(source):
         assert torch.allclose(done.depth_code, depths[depth_source], atol=1e-5)
 
 
-@torch.no_grad()
-def test_an_unknown_class_takes_no_share():
-    finisher, given, made = Finisher((8, 16), (1, 1)), some_pixels(16, 16), some_made(16, 16)
-    unknown = torch.full_like(given.ids, 255)
-    done = finisher(made, replace(given, ids=unknown, backdrop_ids=unknown, render_ids=unknown), 2, torch.ones(2))
-    share = float(torch.tensor([2.0, 0, -2, 0]).softmax(0)[0])
-    assert torch.allclose(done.shares.sum(1), torch.full((2, 16, 16), share), atol=1e-5)
-    assert bool(torch.isfinite(network.class_scores(done)).all())
-
-
-def test_a_finisher_needs_renders_and_a_refiner():
-    for change in (
-        {"renders": False},
-        {"refine_widths": (), "refine_blocks": ()},
-        {"finish_blocks": ()},
-        {"finish_widths": (8,)},
-    ):
-        with pytest.raises(UsageError):
-            replace(FINISHING, **change)
-
-
 # clips --------------------------------------------------------------------------------------------
 
 
@@ -206,6 +181,10 @@ def test_clips_are_finished_at_any_size():
     assert torch.equal(done.rgb, again.rgb)
     with pytest.raises(UsageError, match="no finisher"):
         randomised(TINY).finish(clip, fine)
+    bare = {"refine_widths": (), "refine_blocks": ()}
+    for change in ({"renders": False}, bare, {"finish_blocks": ()}, {"finish_widths": (8,)}):
+        with pytest.raises(UsageError):
+            replace(FINISHING, **change)
 
 
 def test_the_finisher_starts_from_the_stated_error_not_from_the_confidence():
@@ -231,16 +210,12 @@ def gradients(model, clips):
     return loss, {name: None if p.grad is None else p.grad.clone() for name, p in model.named_parameters()}
 
 
-def test_patches_teach_the_finisher_alone():
+def test_patches_teach_the_finisher_alone_also_several_scales_together():
     model, plain = randomised(FINISHING), [made_up_clip(0), made_up_clip(1)]
     without, before = gradients(model, plain)
     with_them, after = gradients(model, [with_patch(clip) for clip in plain])
-    assert {name for name in with_them.terms if name not in without.terms} == {
-        "fine_rgb",
-        "fine_depth",
-        "fine_semantics",
-        "fine_error",
-    }
+    added = {name for name in with_them.terms if name not in without.terms}
+    assert added == {"fine_rgb", "fine_depth", "fine_semantics", "fine_error"}
     for name, gradient in after.items():
         if name.startswith("finisher."):
             assert before[name] is None
@@ -248,16 +223,9 @@ def test_patches_teach_the_finisher_alone():
         elif gradient is not None:
             assert torch.equal(gradient, before[name]), name
     assert all(bool(torch.isfinite(torch.tensor(value))) for value in with_them.terms.values())
-
-
-def test_patches_of_several_scales_and_of_some_clips_only_are_learnt_from_together():
     model = randomised(FINISHING)
-    clips = [
-        with_patch(made_up_clip(0), side=12, scale=2),
-        made_up_clip(1),
-        with_patch(made_up_clip(2), 4, 20, side=8, scale=3),
-    ]
-    loss, found = gradients(model, clips)
+    several = with_patch(made_up_clip(2), 4, 20, side=8, scale=3)
+    loss, found = gradients(model, [with_patch(made_up_clip(0), side=12, scale=2), made_up_clip(1), several])
     assert "fine_rgb" in loss.terms
     assert all(found[name] is not None for name in found if name.startswith("finisher."))
 
@@ -274,9 +242,8 @@ def test_a_patch_is_finished_from_its_own_part_of_its_own_clip(monkeypatch, row,
     clips = [made_up_clip(0, 192, 128), with_patch(made_up_clip(1, 192, 128), row, column, side, scale=2)]
     frames, (height, width) = 4, (128, 192)
     ramp = torch.stack(torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij"))
-    of_clips = torch.stack(
-        [torch.cat([ramp, torch.full((1, height, width), float(n))]) for n in range(2)]
-    ).repeat_interleave(frames, 0)
+    numbered = [torch.cat([ramp, torch.full((1, height, width), float(n))]) for n in range(2)]
+    of_clips = torch.stack(numbered).repeat_interleave(frames, 0)
 
     def refined(latents, pixels, frames):
         # latents and condition are of one place
@@ -314,11 +281,8 @@ def test_refining_the_surroundings_of_a_patch_is_as_good_as_refining_its_image(r
     model, frames, generator = model_files.load("embedded"), 4, torch.Generator().manual_seed(row)
     clip = with_patch(made_up_clip(3, 192, 128), row, column, side, scale=2)
     clip = replace(clip, fine=replace(clip.fine, clip=replace(clip.fine.clip, rgb=clip.fine.clip.rgb * 0.9)))
-    encoded, truth, settings = (
-        model.encode_condition([clip.condition]),
-        model.encode_truth([clip]),
-        LossSettings(None, 1.0, 0.2),
-    )
+    encoded, truth = model.encode_condition([clip.condition]), model.encode_truth([clip])
+    settings = LossSettings(None, 1.0, 0.2)
     stated = {m: z + 0.2 * torch.randn(z.shape, generator=generator) for m, z in truth.latents.items()}
     with torch.no_grad():
         terms = model._finisher_terms(stated, encoded, [clip], settings)

@@ -10,6 +10,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -32,11 +33,10 @@ from mudg.gaussians.appearance import Appearance
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.schedule import FiniteCheck
-from mudg.gaussians.settings import FitConfig
+from mudg.gaussians.settings import METHODS, FitConfig
 from mudg.scene.clouds import read_fused, write_fused
 from mudg.scene.observations import ObservationWriter
 from mudg.scene.read import read_scene
-from mudg.steps.fit import Fit
 from mudg.steps.settings import run_preset
 
 SIZE = (60, 40)
@@ -83,9 +83,6 @@ def test_it_learns(world, learnt, tmp_path):
     files = ("model.json", "gaussians.safetensors", "nodes.safetensors", "log.jsonl", "preview/000150.png", "run.yaml")
     assert all((end / name).is_file() for name in (*files, "manifest.json"))
     assert not (end / "steps").exists()
-
-
-def test_the_moving_car_is_where_its_track_says(learnt):
     model = fit.load_model(learnt)
     cam = camera(width=SIZE[0], height=SIZE[1])
     for time_s in (0.0, 1.4):
@@ -153,6 +150,8 @@ def test_the_kinds_of_densification_differ_and_none_keeps_the_rows(world, tmp_pa
     start = len(fit.load_model(fit_to(world, tmp_path / "start", settings(iterations=1)).run()).table)
     assert rows["none"] == start
     assert start < rows["gradient"] <= 1600
+    logged = [json.loads(line).get("rows", 0) for line in (made["gradient"] / "log.jsonl").read_text().splitlines()]
+    assert 1500 < max(logged) <= 1600
 
 
 def test_the_opacity_weight_makes_gaussians_fainter_and_is_logged(world, tmp_path):
@@ -198,35 +197,16 @@ def test_tensorboard_shows_the_log_and_changes_nothing(world, tmp_path, monkeypa
     assert left == [f"events.out.tfevents.{len(numbers)}", "mine.txt"], "files of the run went, that of the user stays"
 
 
-def test_densification_grows_within_its_cap(world, tmp_path):
-    folder = fit_to(world, tmp_path / "fit", settings(iterations=60, densify__max_gaussians=1600)).run()
-    rows = [
-        line["rows"]
-        for line in map(store.parse_json, (folder / "log.jsonl").read_text().splitlines(), ["log"] * 99)
-        if "rows" in line
-    ]
-    assert max(rows) > 1500
-    assert max(rows) <= 1600
-    assert len(fit.load_model(folder).table) > 0
-
-
 def test_virtual_views_do_not_feed_densification(world, monkeypatch, tmp_path):
-    kinds = []
-    observe = fit.DensifyStats.observe
-    rasterize = fit.rasterize
+    kinds, rasterize = [], fit.rasterize
 
     def spy(gaussians, view, config, absgrad=False, **rest):
         kinds.append((view.camera.width, absgrad))
         return rasterize(gaussians, view, config, absgrad=absgrad, **rest)
 
     monkeypatch.setattr(fit, "rasterize", spy)
-    monkeypatch.setattr(fit.DensifyStats, "observe", observe)
-    fit_to(
-        world,
-        tmp_path / "fit",
-        settings("mudg_s", virtual__probability=0.5, virtual__start=0.0, checkpoint_every=999),
-        observations=(world["virtual"],),
-    ).run()
+    config = settings("mudg_s", virtual__probability=0.5, virtual__start=0.0, checkpoint_every=999)
+    fit_to(world, tmp_path / "fit", config, observations=(world["virtual"],)).run()
     assert {absgrad for width, absgrad in kinds if width == 30} == {False}
     assert any(absgrad for width, absgrad in kinds if width == SIZE[0])
 
@@ -241,18 +221,10 @@ def test_perfect_virtual_views_help_off_the_path(world, learnt, tmp_path):
 
 
 def test_a_non_finite_loss_is_named_and_changes_nothing(world, tmp_path, monkeypatch):
-    sky_map = fit.losses.sky_map
-    calls = {"count": 0}
-
-    def poisoned(alpha, sky):
-        calls["count"] += 1
-        return sky_map(alpha, sky) * (float("nan") if calls["count"] == 5 else 1.0)
-
-    stepped = []
-    adam_step = fit.adam_step
-    monkeypatch.setattr(
-        fit, "adam_step", lambda model, step, *rest: (stepped.append(step), adam_step(model, step, *rest))
-    )
+    sky_map, adam_step, stepped = fit.losses.sky_map, fit.adam_step, []
+    poisoned = lambda alpha, sky: sky_map(alpha, sky) * (float("nan") if len(stepped) == 4 else 1.0)
+    noted = lambda model, step, *rest: (stepped.append(step), adam_step(model, step, *rest))
+    monkeypatch.setattr(fit, "adam_step", noted)
     monkeypatch.setattr(fit.losses, "sky_map", poisoned)
     with pytest.raises(NumericsError, match=r"'sky' is not finite[\s\S]*front/00000\d, step 5"):
         fit_to(world, tmp_path / "fit", settings()).run()
@@ -280,12 +252,17 @@ def test_a_non_finite_gradient_is_named_and_never_reaches_the_parameters(world, 
     assert model.table["log_scales"].grad is None
 
 
-def test_mudg_s_without_virtual_views_is_a_usage_error(world, tmp_path):
-    with pytest.raises(UsageError, match="virtual observations"):
-        fit_to(world, tmp_path / "fit", settings("mudg_s")).run()
+def test_a_fit_without_views_or_a_camera_that_is_there_is_refused(world, tmp_path):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="no finished virtual views"):
-        fit_to(world, tmp_path / "fit", settings("mudg_s"), observations=(tmp_path / "empty",)).run()
+    for config, views, error, said in (
+        (settings("mudg_s"), (), UsageError, "virtual observations"),
+        (settings("mudg_s"), (tmp_path / "empty",), InputError, "no finished virtual views"),
+        (settings(cameras=("rear",)), (), UsageError, "no camera named 'rear'"),
+    ):
+        with pytest.raises(error, match=said):
+            fit_to(world, tmp_path / "fit", config, observations=views).run()
+    with pytest.raises(InputError, match="no fitted scene"):
+        fit.load_model(tmp_path)
 
 
 def test_views_of_several_folders_are_those_of_one_folder_with_all(world, tmp_path):
@@ -293,12 +270,8 @@ def test_views_of_several_folders_are_those_of_one_folder_with_all(world, tmp_pa
     for name in names:
         shutil.copytree(world["virtual"] / name, tmp_path / f"of {name}" / name)
     several = [tmp_path / f"of {name}" if number else world["virtual"] / name for number, name in enumerate(names)]
-    step = fit_to(
-        world,
-        tmp_path / "whole",
-        settings("mudg_s", iterations=4, virtual__start=0.0),
-        observations=(world["virtual"],),
-    )
+    config = settings("mudg_s", iterations=4, virtual__start=0.0)
+    step = fit_to(world, tmp_path / "whole", config, observations=(world["virtual"],))
     together = replace(step, out=tmp_path / "together").run()
     apart = replace(step, out=tmp_path / "apart", observations=tuple(several)).run()
     assert fitted_bytes(apart) == fitted_bytes(together)
@@ -313,15 +286,8 @@ def test_a_generated_view_of_which_no_pixel_counts_is_no_number(world, tmp_path)
     view = view_at(0.9, camera(width=30, height=20), left_m=2.0)
     with ObservationWriter(tmp_path / "virtual" / "front_shift+2.0", "front_shift+2.0", "mudg_r") as writer:
         writer.add(replace(truth(view), kind="virtual", mask=torch.zeros(1, 20, 30, dtype=torch.bool)))
-    config = settings(
-        "mudg_s",
-        iterations=2,
-        virtual__probability=1.0,
-        virtual__start=0.0,
-        virtual__stop=1.0,
-        virtual__beside=False,
-        virtual__gaussians=0,
-    )
+    always = {"virtual__probability": 1.0, "virtual__start": 0.0, "virtual__stop": 1.0}
+    config = settings("mudg_s", iterations=2, **always, virtual__beside=False, virtual__gaussians=0)
     folder = fit_to(world, tmp_path / "fit", config, observations=(tmp_path / "virtual",)).run()
     last = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()][-1]
     assert last["view"].startswith("front_shift") and "psnr" not in last and "loss_virtual_color" in last
@@ -339,13 +305,6 @@ def test_recorded_observations_are_refused_as_virtual_views(world, tmp_path):
     assert not (tmp_path / "fit").exists()
 
 
-def test_unknown_camera_and_no_fit(world, tmp_path):
-    with pytest.raises(UsageError, match="no camera named 'rear'"):
-        fit_to(world, tmp_path / "fit", settings(cameras=("rear",))).run()
-    with pytest.raises(InputError, match="no fitted scene"):
-        fit.load_model(tmp_path)
-
-
 # ---- odd scenes ----------------------------------------------------------------------------------
 
 
@@ -354,12 +313,8 @@ def test_scenes_without_tracks_or_labels_or_with_one_frame_work(tmp_path, method
     write_scene(tmp_path / "scene", frames=1, width=SIZE[0], height=SIZE[1], labels=False, tracks=False)
     cloud = fused_cloud(1, semantics=False)
     write_fused(tmp_path / "fuse", type(cloud)(cloud.static, {}), {})
-    folder = Fit(
-        scene=tmp_path / "scene",
-        fused=tmp_path / "fuse",
-        out=tmp_path / "fit",
-        settings=settings(method, iterations=60),
-    ).run()
+    paths = {name: tmp_path / name for name in ("scene", "fuse")}
+    folder = fit_to(paths, tmp_path / "fit", settings(method, iterations=60)).run()
     model, view = fit.load_model(folder), view_at(0.0, camera(width=SIZE[0], height=SIZE[1]))
     seen, exact = fit.render_view(model, view, RasterConfig()), truth(view)
     assert seen.semantics is None
@@ -369,7 +324,7 @@ def test_scenes_without_tracks_or_labels_or_with_one_frame_work(tmp_path, method
     assert metrics.psnr(seen.rgb, exact.rgb, ground) > metrics.psnr(plain, exact.rgb, ground) + 0.7
 
 
-def test_view_order_is_a_function_of_seed_and_step_and_fair():
+def test_view_order_is_a_function_of_seed_and_step_and_fair_and_virtual_views_take_nothing_from_it():
     views = fit_views.ViewSet("abcd", "xy")  # anything in order
     drawn = [views.choose(7, step, 0.0)[0] for step in range(40)]
     assert drawn == [views.choose(7, step, 0.0)[0] for step in range(40)]
@@ -377,9 +332,6 @@ def test_view_order_is_a_function_of_seed_and_step_and_fair():
     virtual = [views.choose(7, step, 0.3) for step in range(400)]
     assert all(len(views) == 1 for views in virtual)
     assert 0.2 < sum(v in "xy" for (v,) in virtual) / 400 < 0.4
-
-
-def test_virtual_views_beside_recorded_ones_take_nothing_from_them():
     views = fit_views.ViewSet("abcd", "xy")
     alone = [views.choose(7, step, 0.3) for step in range(200)]
     beside = [views.choose(7, step, 0.3, beside=True) for step in range(200)]
@@ -403,15 +355,12 @@ def test_fused_points_give_depth_beside_the_path(world):
 
 def test_options_of_virtual_views_change_the_fit_and_stay_finite(world, tmp_path):
     usual = settings("mudg_s", iterations=30, densify__max_gaussians=2500, virtual__start=0.0, virtual__probability=0.6)
-    folders = [
-        fit_to(
-            world,
-            tmp_path / str(n),
-            replace(usual, virtual=replace(usual.virtual, **changes)),
-            observations=(world["virtual"],),
-        ).run()
-        for n, changes in enumerate(({}, {"lidar_weight": 0.0}, {"ssim_weight": 0.0}))
+    changes = ({}, {"lidar_weight": 0.0}, {"ssim_weight": 0.0})
+    configs = [replace(usual, virtual=replace(usual.virtual, **change)) for change in changes]
+    fits = [
+        fit_to(world, tmp_path / str(n), config, observations=(world["virtual"],)) for n, config in enumerate(configs)
     ]
+    folders = [step.run() for step in fits]
     assert len({fitted_bytes(folder)["gaussians.safetensors"] for folder in folders}) == len(folders)
     for folder in folders:
         assert all(torch.isfinite(value).all() for value in fit.load_model(folder).table.columns.values())
@@ -429,7 +378,7 @@ def test_virtual_views_of_the_published_fit_have_the_published_terms_alone(world
     assert {"color", "lidar", "sky"} <= seen[False] and "semantics" not in seen[False]
 
 
-def test_lidar_pixels_agree_with_exact_depth(world):
+def test_lidar_pixels_agree_with_exact_depth_and_leave_out_what_lies_behind(world):
     scene = read_scene(world["scene"])
     frame = scene.frames_of("front")[2]
     lidar = fit_views._SweepCache(scene).pixels_of(frame.view)
@@ -439,9 +388,6 @@ def test_lidar_pixels_agree_with_exact_depth(world):
     assert len(torch.unique(lidar.pixel)) == len(lidar.pixel)
     assert relative.median() < 0.03
     assert (relative < 0.2).float().mean() > 0.85
-
-
-def test_a_point_behind_a_nearer_one_is_no_depth_of_this_camera():
     view = View(camera(width=SIZE[0], height=SIZE[1]), geometry.invert(geometry.CAM_FROM_EGO_AXES), 0.0)
     points = np.array([[5.0, 0.0, 0.0], [20.0, 0.02, 0.0], [20.0, -6.0, 0.0]], np.float32)
     assert sorted(fit_views.lidar_pixels(view, points, 0.6).depth_m.tolist()) == [5.0, 20.0]
@@ -458,13 +404,9 @@ def test_what_only_virtual_views_see():
     column = np.arange(cam.width) + 0.5
     witness = np.where(np.abs((column - cam.cx) / cam.fx * 3) < 0.45, 3.0, 6.0).astype(np.float32)
     recorded = fit_trust._Witness(ahead, np.repeat(witness[None], cam.height, 0))
-    shown = fit_views.StoredView(
-        "side",
-        side,
-        "virtual",
-        np.zeros((cam.height, cam.width, 3), np.uint8),
-        depth=np.full((cam.height, cam.width), 6.0, np.float32),
-    )
+    shape = (cam.height, cam.width)
+    black, depth = np.zeros((*shape, 3), np.uint8), np.full(shape, 6.0, np.float32)
+    shown = fit_views.StoredView("side", side, "virtual", black, depth=depth)
     unseen = fit_trust._unseen(shown, [recorded], [])[cam.height // 2]
     wall_y = 1.5 - (column - cam.cx) / cam.fx * 6
     in_image = np.abs(wall_y) < 0.95 * cam.cx / cam.fx * 6
@@ -496,10 +438,6 @@ def test_learning_rates_follow_the_length_of_the_run():
 
 
 def test_the_methods_that_can_be_fitted_are_those_of_the_configuration():
-    from typing import get_args, get_type_hints
-
-    from mudg.gaussians.settings import METHODS
-
     fitted = {name: row for name, row in METHODS.items() if row.made_by == "render"}
     assert set(fitted) == set(get_args(get_type_hints(FitConfig)["method"]))
     for row in fitted.values():

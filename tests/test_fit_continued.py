@@ -46,9 +46,8 @@ def go_on(world: dict[str, Path], out: Path, config: FitConfig | None = None, **
 def psnr_beside(folder: Path) -> float:
     model = fit.load_model(folder)
     views = [view_at(time_s, camera(width=SIZE[0], height=SIZE[1]), left_m=2.0) for time_s in (0.3, 0.9)]
-    return float(
-        np.mean([metrics.psnr(fit.render_view(model, view, RasterConfig()).rgb, truth(view).rgb) for view in views])
-    )
+    drawn = [(fit.render_view(model, view, RasterConfig()).rgb, truth(view).rgb) for view in views]
+    return float(np.mean([metrics.psnr(*pair) for pair in drawn]))
 
 
 def test_it_starts_from_the_finished_scene_and_learns_from_virtual_views_at_once(world, tmp_path, monkeypatch):
@@ -71,11 +70,8 @@ def test_it_starts_from_the_finished_scene_and_learns_from_virtual_views_at_once
     assert store.read_json(one / "run.json")["summary"]["steps"] == 1
 
 
-def test_few_more_steps_help_beside_the_path(world, tmp_path):
+def test_few_more_steps_help_beside_the_path_and_are_the_second_half_of_a_run(world, tmp_path, monkeypatch):
     assert psnr_beside(go_on(world, tmp_path / "fit", settings(iterations=40))) > psnr_beside(world["plain"]) + 0.3
-
-
-def test_the_steps_are_the_second_half_of_a_run(monkeypatch):
     config = continued.whole_run(settings(iterations=500))
     assert (config.iterations, continued.begun_at(config.iterations)) == (1000, 500)
     assert config.virtual.probability == FitConfig().virtual.continued_probability
@@ -92,14 +88,11 @@ def test_a_resumed_run_equals_an_uninterrupted_one(world, tmp_path):
     assert fitted_bytes(go_on(world, parts)) == fitted_bytes(whole)
 
 
-def test_another_start_is_another_fit(world, tmp_path):
+def test_another_start_is_another_fit_and_one_without_virtual_views_goes_on_too(world, tmp_path):
     go_on(world, tmp_path / "fit", settings(iterations=2))
     with pytest.raises(UsageError, match="another configuration"):
         go_on(world, tmp_path / "fit", settings(iterations=2), start_from=None)
-
-
-def test_a_fit_without_virtual_views_goes_on_too(world, tmp_path):
-    made = go_on(world, tmp_path / "fit", settings("street_gaussians", iterations=4), observations=())
+    made = go_on(world, tmp_path / "plain", settings("street_gaussians", iterations=4), observations=())
     assert fit.load_model(made).facts["method"] == "street_gaussians"
 
 

@@ -44,7 +44,6 @@ from mudg.gaussians.schedule import FiniteCheck
 from mudg.gaussians.settings import VirtualConfig
 from mudg.scene.observations import read_observations
 from mudg.scoring import score
-from mudg.steps.fit import Fit
 from mudg.steps.render import RenderViews, Score
 from mudg.steps.settings import RunConfig, with_device
 
@@ -86,29 +85,20 @@ def twins():
 
 
 def tensors_of(folder: Path) -> dict[str, torch.Tensor]:
-    names = [folder / name for name in (*FILES, "appearance.safetensors")]
-    return {
-        f"{path.stem}/{key}": value
-        for path in names
-        if path.is_file()
-        for key, value in store.read_tensors(path).items()
-    }
+    paths = [folder / name for name in (*FILES, "appearance.safetensors") if (folder / name).is_file()]
+    return {f"{path.stem}/{key}": value for path in paths for key, value in store.read_tensors(path).items()}
 
 
 def assert_same_fit(mine: Path, theirs: Path) -> None:
     one, other = tensors_of(mine), tensors_of(theirs)
     assert one.keys() == other.keys()
     for name, value in one.items():
-        assert value.shape == other[name].shape, name
-        torch.testing.assert_close(
-            value, other[name], atol=1e-5, rtol=1e-5, msg=lambda text, name=name: f"{name}: {text}"
-        )
+        told = lambda text, name=name: f"{name}: {text}"
+        torch.testing.assert_close(value, other[name], atol=1e-5, rtol=1e-5, msg=told)
 
 
 def fitted(world: dict[str, Path], out: Path, config: MethodConfig, **more: Path) -> Path:
-    return Fit(
-        scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=out, settings=config, **more
-    ).run()
+    return fit_to(world, out, config, observations=(world["virtual"],), **more).run()
 
 
 CASES = {
@@ -189,16 +179,8 @@ class Steps:
 @pytest.mark.parametrize("method", [pytest.param("street_gaussians", marks=pytest.mark.slow), "mudg_s"])
 def test_a_step_copies_a_view_there_and_one_row_of_numbers_back(world, tmp_path, monkeypatch, method):
     steps, pixels = Steps(), {SIZE[0] * SIZE[1], 30 * 20}
-    config = settings(
-        method,
-        "pretend",
-        densify__kind="none",
-        iterations=5,
-        start__gaussians=60,
-        poses__learn=True,
-        poses__rounds=0,
-        virtual__gaussians=0,
-    )
+    few = {"iterations": 5, "start__gaussians": 60, "virtual__gaussians": 0}
+    config = settings(method, "pretend", densify__kind="none", **few, poses__learn=True, poses__rounds=0)
     monkeypatch.setattr(fit, "densify_schedule", lambda *_given: None)
     monkeypatch.setattr(fit, "add_certainty", lambda state, config: None)
     with pretend_device(), transfers() as seen:
@@ -209,9 +191,8 @@ def test_a_step_copies_a_view_there_and_one_row_of_numbers_back(world, tmp_path,
         there = [copy for copy in copied if copy.way == "there"]
         large = [copy for copy in there if copy.values > NUMBERS]
         assert {copy.where.partition(":")[0] for copy in large} == {"gaussians/views.py"}, step
-        assert all(
-            copy.values in {n * count for n in pixels for count in (1, 3)} or copy.values < 1000 for copy in large
-        )
+        images = {n * count for n in pixels for count in (1, 3)}
+        assert all(copy.values in images or copy.values < 1000 for copy in large)
         back = [copy for copy in copied if copy.way == "back"]
         assert not [copy for copy in copied if copy.way == "wait"], step
         if step > 1:  # at first the tracks' offsets come back and the rows of every node are counted
@@ -309,9 +290,8 @@ def test_objects_stand_on_another_device_where_they_do_here(plain_fit):
     with pretend_device() as there:
         moved = model.to(there)
         for time_s in (0.0, 0.25, 0.4, 9.0):
-            torch.testing.assert_close(
-                compose(moved, time_s).means.cpu(), compose(model, time_s).means, atol=1e-6, rtol=1e-6
-            )
+            there, here = (compose(one, time_s).means.cpu() for one in (moved, model))
+            torch.testing.assert_close(there, here, atol=1e-6, rtol=1e-6)
         far = moved.dynamic_object("walker")
         with transfers() as seen:
             first = far.pose_matrix(0.25)
@@ -324,7 +304,7 @@ def test_objects_stand_on_another_device_where_they_do_here(plain_fit):
         torch.testing.assert_close(compose(moved, 0.25).means.cpu(), compose(model, 0.25).means, atol=1e-6, rtol=1e-6)
 
 
-def test_the_sky_is_drawn_there_without_a_copy():
+def test_the_sky_and_colors_of_cameras_are_there_without_a_copy():
     sky = SkyNode.uniform(8)
     sky.table["panorama"].detach().copy_(torch.rand(1, 3, 8, 16, generator=torch.Generator().manual_seed(0)))
     for yaw_rad in (0.0, 2.0):
@@ -336,9 +316,6 @@ def test_the_sky_is_drawn_there_without_a_copy():
                 made = moved.coarse_picture(view)
             assert not seen
             torch.testing.assert_close(made.cpu(), here, atol=1e-5, rtol=1e-5)
-
-
-def test_colors_of_cameras_are_mapped_there():
     colors = CameraColors("front", {"rear": ColorMap((1.1, 0.9, 1.3), (0.02, -0.01, 0.1))})
     rgb = torch.rand(3, 5, 4, generator=torch.Generator().manual_seed(0))
     with pretend_device() as there:
@@ -370,9 +347,8 @@ def test_perceptual_distances_are_those_of_the_cpu(tmp_path, kind):
 def test_auto_draws_with_cuda_only_if_gsplat_can(monkeypatch):
     said: list[str] = []
     monkeypatch.setattr(place.log, "info_once", said.append)
-    monkeypatch.setattr(
-        place, "choose_device", lambda wanted, purpose: torch.device({"auto": "cuda:0"}.get(wanted, wanted))
-    )
+    cuda = lambda wanted, purpose: torch.device({"auto": "cuda:0"}.get(wanted, wanted))
+    monkeypatch.setattr(place, "choose_device", cuda)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(place, "available", lambda backend: "the package gsplat is not installed")
     assert place.drawing_device("auto", "fit") == CPU
@@ -393,22 +369,18 @@ def test_a_backend_that_does_not_draw_on_the_device_is_refused(world, tmp_path):
     assert not (tmp_path / "fit").exists()  # refused before anything is written
 
 
-def test_every_step_of_a_run_follows_its_device_unless_it_has_its_own():
+def test_steps_and_benchmarks_follow_the_device_of_a_run_unless_they_have_their_own(monkeypatch):
     made = with_device(RunConfig(device="cuda:1", fit=MethodConfig(device="cpu")))
     assert (made.fit.device, made.render.device, made.score.device) == ("cpu", "cuda:1", "cuda:1")
     assert made.fuse == RunConfig().fuse
     assert with_device(RunConfig()) == RunConfig()
     assert result_settings(made) == result_settings(RunConfig())
     assert "device" not in json.dumps(result_settings(made))
-
-
-def test_benchmarks_hand_their_device_to_every_step(monkeypatch):
     config = BenchConfig(device="cuda:1", methods=("street_gaussians",), variant=("wide=width_px:64",))
     fits = [row.fit for row in rows.shift_rows(config)] + [row.fit for row in rows.real_rows(config) if row.varied]
     assert len(fits) == 3
-    assert {
-        fitted.device for fitted in (*fits, rows.usual_fit(config), bench_poses.fit_settings(config, "learnt"))
-    } == {"cuda:1"}
+    every = (*fits, rows.usual_fit(config), bench_poses.fit_settings(config, "learnt"))
+    assert {one.device for one in every} == {"cuda:1"}
     monkeypatch.setattr(chain, "drawing_device", lambda wanted, purpose: PRETEND if wanted == "cuda:1" else CPU)
     assert chain.at_once(config) == 1
     assert chain.at_once(replace(config, processes=3)) == 3
@@ -421,32 +393,23 @@ def test_benchmarks_hand_their_device_to_every_step(monkeypatch):
 @pytest.mark.slow
 def test_render_and_score_on_another_device(world, plain_fit, tmp_path, monkeypatch):
     drawn = RenderConfig(cameras=("front",), shifts_m=(0.0,), video=False, raster="torch", device="cpu")
+    step = RenderViews(scene=world["scene"], model=plain_fit, out=tmp_path / "here", settings=drawn)
     with twins():
-        here = RenderViews(scene=world["scene"], model=plain_fit, out=tmp_path / "here", settings=drawn).run()
+        here = step.run()
+    step = replace(step, settings=replace(drawn, device="pretend"))
     with pretend_device():
-        there = RenderViews(
-            scene=world["scene"], model=plain_fit, out=tmp_path / "there", settings=replace(drawn, device="pretend")
-        ).run()
-        assert (
-            RenderViews(
-                scene=world["scene"], model=plain_fit, out=here, settings=replace(drawn, device="pretend")
-            ).run()
-            == here
-        )  # a result is one on any device
+        there = replace(step, out=tmp_path / "there").run()
+        assert step.run() == here  # a result is one on any device
     mine, theirs = (read_observations(folder / "front_recorded") for folder in (there, here))
     for index in range(len(mine)):
         torch.testing.assert_close(mine[index].rgb, theirs[index].rgb, atol=1 / 254, rtol=0)
     config = ScoreConfig(baseline=False, perceptual_views=2, error_pictures=False, device="cpu")
     monkeypatch.setattr(score, "computed_ahead", lambda compute, count, threads: map(compute, range(count)))
+    scored = Score(scene=world["scene"], views={"fit": here}, out=tmp_path / "score_here", settings=config)
     with twins():
-        Score(scene=world["scene"], views={"fit": here}, out=tmp_path / "score_here", settings=config).run()
+        scored.run()
     with pretend_device(), transfers() as seen:
-        Score(
-            scene=world["scene"],
-            views={"fit": here},
-            out=tmp_path / "score_there",
-            settings=replace(config, device="pretend"),
-        ).run()
+        replace(scored, out=tmp_path / "score_there", settings=replace(config, device="pretend")).run()
     assert {copy.where.partition(":")[0] for copy in seen if copy.values > NUMBERS} == {"networks/featnets.py"}
     found = [store.read_json(tmp_path / name / "metrics.json") for name in ("score_here", "score_there")]
     values = [document["by_distance"][0]["values"] for document in found]

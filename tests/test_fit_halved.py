@@ -63,11 +63,6 @@ def test_a_measured_point_lies_in_the_pixel_that_shows_it(width: int) -> None:
     assert torch.equal(half.lidar.depth_m, torch.from_numpy(points[:, 2]))
 
 
-def test_views_that_would_be_tiny_stay() -> None:
-    small = stored(300, 2 * LEAST_PX - 1)
-    assert halved(small) is small
-
-
 @pytest.mark.parametrize("keep", [True, False])
 def test_only_virtual_views_of_the_first_steps_are_halved(keep: bool) -> None:
     sizes, virtual, recorded = HalvedViews(8, keep), stored(), stored(kind="recorded")
@@ -77,10 +72,12 @@ def test_only_virtual_views_of_the_first_steps_are_halved(keep: bool) -> None:
     assert sizes.sized(recorded, 1) is recorded
 
 
-def test_large_views_are_halved_at_every_step_unless_none_are(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_views_are_halved_at_every_step_and_tiny_ones_never(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mudg.gaussians.views.WHOLE_PIXELS", WIDTH * HEIGHT - 1)
     view = stored()
     for until, side in ((10.0, WIDTH // 2), (0.0, WIDTH)):
         sizes = HalvedViews(until, keep=True)
         assert [sizes.sized(view, step).rgb.shape[1] for step in (1, 11)] == [side, side]
     assert HalvedViews(10.0, keep=True).sized(stored(WIDTH - 1), 11).rgb.shape[1] == WIDTH - 1
+    small = stored(300, 2 * LEAST_PX - 1)
+    assert halved(small) is small

@@ -107,11 +107,8 @@ def test_a_drifted_track_is_found_again(fitted, node):
     assert geometry.all_rigid(node.corrected_keys())
 
 
-def test_poses_that_are_not_learnt_stay(fitted):
+def test_rounds_are_spread_over_the_run_and_poses_that_are_not_learnt_stay(fitted):
     assert fit_poses.refine_poses(fitted.model, fitted.views.recorded, RASTER) == 0.0
-
-
-def test_rounds_are_spread_over_the_run():
     config = fit_config(
         method="street_gaussians", iterations=200, poses__learn=True, poses__rounds=4, poses__start=0.25
     )

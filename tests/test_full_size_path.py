@@ -18,10 +18,7 @@ from mudg.diffusion import published
 from mudg.scene.observations import list_observation_sets, read_observations
 from mudg.steps.settings import PRESETS
 
-TOY = (
-    "import sys; from toy_published import TINY; from mudg.diffusion import convert; convert.PublishedConfig"
-    " = lambda: TINY\n"
-)
+TOY = "from toy_published import TINY; from mudg.diffusion import convert; convert.PublishedConfig = lambda: TINY\n"
 """Before `convert` alone: checkpoints hold the toy network. Everything else is told by the model's folder."""
 MAIN = "from mudg.app import main; import sys; sys.exit(main(sys.argv[1:]))"
 OWN = {"synthesize.model", "fit.iterations", "fit.virtual.lpips_weights"}
@@ -30,40 +27,29 @@ OWN = {"synthesize.model", "fit.iterations", "fit.virtual.lpips_weights"}
 
 @pytest.fixture
 def mudg(tmp_path):
-    """A function that runs one command line below a folder, and returns its exit code and what it said."""
+    """A function that runs one command line below a folder, to a good end."""
     tests = str(Path(__file__).parent)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([tests, *(path for path in sys.path if path)])}
 
     def run(line, before=""):
-        done = subprocess.run(
-            [sys.executable, "-c", before + MAIN, *line.split()],
-            cwd=tmp_path,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=1800,
-        )
-        return done.returncode, done.stderr + done.stdout
+        words = [sys.executable, "-c", before + MAIN, *line.split()]
+        how = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True, "timeout": 1800}
+        done = subprocess.run(words, **how)
+        assert done.returncode == 0, done.stderr + done.stdout
 
     return run
-
-
-def done(result):
-    code, words = result
-    assert code == 0, words
 
 
 @pytest.mark.slow
 def test_from_a_published_checkpoint_to_a_table_of_the_paper(mudg, tmp_path):
     torch.save({"state_dict": tiny_checkpoint()}, tmp_path / "512-mdm-checkpoint.ckpt")
-    store.write_safetensors(
-        tmp_path / "lpips.safetensors", {name: value.numpy() for name, value in lpips_state().items()}
-    )
+    lpips = {name: value.numpy() for name, value in lpips_state().items()}
+    store.write_safetensors(tmp_path / "lpips.safetensors", lpips)
     city = "--city.n-frames 6 --city.width 64 --city.height 48 --city.cameras front --city.lidar-azimuth-step-deg 1"
-    done(mudg(f"ingest city log/scene {city}"))
-    done(mudg("fuse log/scene --out log/fuse"))
+    mudg(f"ingest city log/scene {city}")
+    mudg("fuse log/scene --out log/fuse")
 
-    done(mudg("convert 512-mdm-checkpoint.ckpt --to models/start --dtype bfloat16", TOY))
+    mudg("convert 512-mdm-checkpoint.ckpt --to models/start --dtype bfloat16", TOY)
     start = published.load(tmp_path / "models" / "start")
     assert (start.config.width, start.config.height) == (512, 320) and start.config.net == TINY.net
 
@@ -72,25 +58,17 @@ def test_from_a_published_checkpoint_to_a_table_of_the_paper(mudg, tmp_path):
         " --score.every 100 --optimizer.batch-frames 4 --optimizer.full-window-share 1 --optimizer.lr 1e-5"
         " --compute.workers 0 --precision float32"
     )
-    done(mudg(f"learn --start models/start --data.width 32 --data.height 32 {training} --out one"))
-    done(
-        mudg(
-            f"learn --start one/model --data.width 36 --data.height 32 --frozen temporal_transformers {training}"
-            " --out two"
-        )
-    )
+    mudg(f"learn --start models/start --data.width 32 --data.height 32 {training} --out one")
+    frozen = "--data.width 36 --data.height 32 --frozen temporal_transformers"
+    mudg(f"learn --start one/model {frozen} {training} --out two")
     one, two = (published.load(tmp_path / name / "model") for name in ("one", "two"))
     assert ((one.config.width, one.config.height), (two.config.width, two.config.height)) == ((32, 32), (36, 32))
     before, after = (model.trained_part().state_dict() for model in (one, two))
     unchanged = {name for name in before if torch.equal(before[name], after[name])}
     assert unchanged == two.temporal_parameters("transformers")
 
-    done(
-        mudg(
-            "synthesize log/scene --fused log/fuse --model two/model --steps 50 --overlap 2 --shifts-m 2 --no-full-size"
-            " --out virtual"
-        )
-    )
+    sampling = "--model two/model --steps 50 --overlap 2 --shifts-m 2 --no-full-size"
+    mudg(f"synthesize log/scene --fused log/fuse {sampling} --out virtual")
     (views,) = list_observation_sets(tmp_path / "virtual").values()
     seen = read_observations(views)
     assert len(seen) == 6
@@ -99,20 +77,14 @@ def test_from_a_published_checkpoint_to_a_table_of_the_paper(mudg, tmp_path):
         assert bool(torch.isfinite(frame.rgb).all()) and float(frame.rgb.std()) > 0.01
     assert [bool(seen[n].mask.any()) for n in range(6)] == [False] + [True] * 5  # frame 0 shows the recorded pose
 
-    done(
-        mudg(
-            "fit log/scene --fused log/fuse --observations virtual --method mudg_s --iterations 10 --start.gaussians"
-            " 500 --out fit"
-        )
-    )
+    guided = "--observations virtual --method mudg_s --iterations 10 --start.gaussians 500"
+    mudg(f"fit log/scene --fused log/fuse {guided} --out fit")
     assert store.read_json(tmp_path / "fit" / "run.json")["summary"]["steps"] == 10
 
-    done(
-        mudg(
-            "bench paper city:development --table mudg3 --preset paper --model two/model --fit.virtual.lpips-weights"
-            " lpips.safetensors --iterations 10 --logs 1 --frames 0:5 --resolution 64x48 --no-videos --processes 1"
-            " --out table"
-        )
+    mudg(
+        "bench paper city:development --table mudg3 --preset paper --model two/model --fit.virtual.lpips-weights"
+        " lpips.safetensors --iterations 10 --logs 1 --frames 0:5 --resolution 64x48 --no-videos --processes 1"
+        " --out table"
     )
     document = store.read_json(tmp_path / "table" / "bench.json")
     for row in ("street_gaussians", "only_I", "only_I_D", "only_I_S", "mudg_s"):

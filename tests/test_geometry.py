@@ -54,19 +54,24 @@ def test_slerp_moves_at_constant_rate_between_both_ends(a: np.ndarray, b: np.nda
     np.testing.assert_allclose(geometry.matrix_from_quaternion(geometry.slerp(q0, q1, 1.0)), b[:3, :3], atol=1e-7)
 
 
-def test_slerp_takes_the_shorter_arc() -> None:
+def test_slerp_takes_the_shorter_arc_and_a_zero_quaternion_is_refused() -> None:
     q = np.array([np.cos(0.1), np.sin(0.1), 0, 0])
     np.testing.assert_allclose(geometry.slerp([1, 0, 0, 0], -q, 0.5), [np.cos(0.05), np.sin(0.05), 0, 0], atol=1e-12)
+    with pytest.raises(InputError):
+        geometry.matrix_from_quaternion([0, 0, 0, 0])
 
 
-def test_known_pixel_and_axes() -> None:
-    # camera looking along world x: right is -y, down is -z
+def test_known_pixel_and_axes_and_a_resized_camera_keeps_the_rays() -> None:
     world_from_cam = geometry.invert(geometry.CAM_FROM_EGO_AXES)
     view = View(CAMERA, world_from_cam, 0.0)
     uv, z = geometry.project(view, np.array([[10.0, 0, 0], [10, -1, 0], [10, 0, -1], [-5, 0, 0]]))
     np.testing.assert_allclose(z, [10, 10, 10, -5])
     np.testing.assert_allclose(uv[:3], [[241, 158.5], [281, 158.5], [241, 199.5]])
     assert np.isnan(uv[3]).all()
+    small = CAMERA.resized(240, 80)
+    big, little = View(CAMERA, np.eye(4), 0.0), View(small, np.eye(4), 0.0)
+    points = np.array([[1.0, -2, 9], [-3, 1, 20]])
+    np.testing.assert_allclose(geometry.project(big, points)[0] * [0.5, 0.25], geometry.project(little, points)[0])
 
 
 @given(poses, st.lists(st.tuples(st.floats(0, 480), st.floats(0, 320), st.floats(0.5, 80)), min_size=1, max_size=20))
@@ -77,13 +82,6 @@ def test_unproject_inverts_project(pose: np.ndarray, pixels: list[tuple[float, f
     uv, z = geometry.project(view, geometry.unproject(view, uvz[:, :2], uvz[:, 2]))
     np.testing.assert_allclose(uv, uvz[:, :2], atol=1e-6)
     np.testing.assert_allclose(z, uvz[:, 2], atol=1e-8)
-
-
-def test_resized_camera_keeps_the_rays() -> None:
-    small = CAMERA.resized(240, 80)
-    big, little = View(CAMERA, np.eye(4), 0.0), View(small, np.eye(4), 0.0)
-    points = np.array([[1.0, -2, 9], [-3, 1, 20]])
-    np.testing.assert_allclose(geometry.project(big, points)[0] * [0.5, 0.25], geometry.project(little, points)[0])
 
 
 def test_pose_at_is_exact_at_keys_interpolates_both_neighbours_and_never_extrapolates() -> None:
@@ -111,11 +109,6 @@ def test_rigid_problem_names_the_fault(matrix: np.ndarray, word: str) -> None:
     assert word in str(geometry.rigid_problem(matrix))
     if matrix.shape == (4, 4):
         assert geometry.all_rigid(np.stack([np.eye(4)] * 3)) and not geometry.all_rigid(np.stack([np.eye(4), matrix]))
-
-
-def test_zero_quaternion_is_refused() -> None:
-    with pytest.raises(InputError):
-        geometry.matrix_from_quaternion([0, 0, 0, 0])
 
 
 def test_hull_of_a_box_is_cut_at_the_near_plane_and_none_beside_the_image() -> None:

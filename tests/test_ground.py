@@ -37,11 +37,13 @@ def test_ground_plane_is_found_among_walls_and_noise(slope: tuple[float, float, 
     assert plane is not None and np.abs(plane - slope).max() < 0.02
 
 
-def test_no_ground_is_no_plane() -> None:
+def test_no_ground_is_no_plane_and_no_path_or_returns_no_map() -> None:
     assert fit_ground(np.zeros((0, 3), np.float32), np.zeros((1, 3))) is None
     cliff = np.random.default_rng(0).uniform(0, 30, (4000, 3))
     cliff[:, 2] = 1.5 * cliff[:, 0]
     assert fit_ground(cliff, np.array([[15.0, 15, 0]])) is None
+    xyz, path = street(np.random.default_rng(9))
+    assert map_ground(xyz[:0], path, path[0]) is None and map_ground(xyz, path[:0], path[0]) is None
 
 
 def test_ground_is_found_at_the_end_of_a_long_drive() -> None:
@@ -52,14 +54,11 @@ def test_ground_is_found_at_the_end_of_a_long_drive() -> None:
     assert near is not None and long == pytest.approx(near)
 
 
-def test_distance_to_path_goes_on_beyond_its_ends() -> None:
+def test_distance_to_path_goes_on_beyond_its_ends_and_along_the_heading_of_what_stood() -> None:
     path = np.c_[np.arange(0, 10, 0.5), np.zeros(20), np.zeros(20)]
     points = np.array([[5.0, 3, 9], [40, -4, 0], [-30, 2, 0]])
     assert np.abs(distance_to_path(points, path) - [3, 4, 2]).max() < 0.3
     assert distance_to_path(points, path[:1])[1] == pytest.approx(np.hypot(40, 4))
-
-
-def test_a_vehicle_that_stood_has_the_direction_of_its_heading() -> None:
     pose = yaw_matrix(np.pi / 2, (3.0, 4.0, 1.0))
     path = driven_path(np.stack([pose, pose]))
     assert distance_to_path(np.array([[3.0, 59, 0], [8, 5, 0]]), path) == pytest.approx([0, 5], abs=0.3)
@@ -114,8 +113,3 @@ def test_the_order_of_returns_changes_nothing() -> None:
     one, other = (map_ground(points, path, path[0]) for points in (xyz, shuffled))
     assert one is not None and other is not None and (one.reachable == other.reachable).mean() > 0.999
     assert above_plane(one.plane, path) == pytest.approx(above_plane(other.plane, path), abs=1e-3)
-
-
-def test_no_path_or_no_returns_is_no_map() -> None:
-    xyz, path = street(np.random.default_rng(9))
-    assert map_ground(xyz[:0], path, path[0]) is None and map_ground(xyz, path[:0], path[0]) is None

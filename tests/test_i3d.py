@@ -16,7 +16,6 @@ from mudg.base.errors import InputError
 from mudg.editing.settings import ScoreConfig
 from mudg.networks import i3d
 from mudg.scene.read import read_scene
-from mudg.scoring import sets as distributions
 from mudg.scoring import sets as videos
 from mudg.scoring import tables as score_tables
 from mudg.steps.render import Score
@@ -40,15 +39,8 @@ def state() -> dict[str, torch.Tensor]:
 
 def renamed(name: str) -> str:
     """The other layout's name, written out once more."""
-    for theirs, ours in (
-        ("b1a", "branch_1.0"),
-        ("b1b", "branch_1.1"),
-        ("b2a", "branch_2.0"),
-        ("b2b", "branch_2.1"),
-        ("b3b", "branch_3.1"),
-        ("b0", "branch_0"),
-    ):
-        name = name.replace(f".{theirs}.", f".{ours}.")
+    for theirs, ours in (("b1a", "1.0"), ("b1b", "1.1"), ("b2a", "2.0"), ("b2b", "2.1"), ("b3b", "3.1"), ("b0", "0")):
+        name = name.replace(f".{theirs}.", f".branch_{ours}.")
     name = name.replace(".bn.", ".batch3d.").replace("Mixed", "mixed")
     return name.replace("Conv3d_", "conv3d_").replace("logits", "conv3d_0c_1x1")
 
@@ -114,32 +106,33 @@ class Means(torch.nn.Module):
         return torch.nn.functional.pad(clips.mean((3, 4)).flatten(1), (0, 400 - 48))
 
 
-def test_clips_floor_and_reasons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert [videos.clip_count(n) for n in (0, 15, 16, 23, 24, 40)] == [0, 0, 1, 1, 2, 4]
+@pytest.fixture
+def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file for ``Means``; toy scenes have 40 frames."""
     monkeypatch.setattr(i3d, "I3DFeatures", Means)
     monkeypatch.setattr(toy_views, "FRAMES", 40)
-    weights = tmp_path / "weights.safetensors"
-    store.write_safetensors(weights, {"any": np.zeros(1, np.float32)})
+    store.write_safetensors(tmp_path / "weights.safetensors", {"any": np.zeros(1, np.float32)})
+    return tmp_path / "weights.safetensors"
+
+
+def test_clips_floor_and_reasons(weights: Path, tmp_path: Path) -> None:
+    assert [videos.clip_count(n) for n in (0, 15, 16, 23, 24, 40)] == [0, 0, 1, 1, 2, 4]
     scene = read_scene(toy_views.write_scene(tmp_path / "scene"))
     found = videos.videos_of(ScoreConfig(fvd_weights=str(weights), device="cpu"), scene, tmp_path)
-    same = distributions.ImageSet(40, toy_views.colors)
-    backwards = distributions.ImageSet(40, lambda n: toy_views.colors(39 - n))
-    sets = distributions.TrajectorySets("front_shift+2.0", "front", 48, 32, {"a": same, "b": backwards}, None)
+    same = videos.ImageSet(40, toy_views.colors)
+    backwards = videos.ImageSet(40, lambda n: toy_views.colors(39 - n))
+    sets = videos.TrajectorySets("front_shift+2.0", "front", 48, 32, {"a": same, "b": backwards}, None)
     values = found.of(sets)
     assert values["a"] == {"values": {"fvd": pytest.approx(0.0, abs=1e-5)}, "n": 4, "n_reference": 4}
     assert values["b"]["values"]["fvd"] > 1e-3
     (floor,) = found.record()["floors"]
     assert (floor["n"], floor["n_reference"]) == (2, 2)
-    sets = {"a": distributions.ImageSet(20, toy_views.colors)}
-    short = distributions.TrajectorySets("x", "front", 48, 32, sets, None)
+    sets = {"a": videos.ImageSet(20, toy_views.colors)}
+    short = videos.TrajectorySets("x", "front", 48, 32, sets, None)
     assert found.of(short) == {"a": score_tables.TOO_FEW}
 
 
-def test_the_scorer_writes_fvd_with_its_sizes_and_floor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(i3d, "I3DFeatures", Means)
-    monkeypatch.setattr(toy_views, "FRAMES", 40)
-    weights = tmp_path / "weights.safetensors"
-    store.write_safetensors(weights, {"any": np.zeros(1, np.float32)})
+def test_the_scorer_writes_fvd_with_its_sizes_and_floor(weights: Path, tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene")
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0, 2.0))
     config = ScoreConfig(fvd_weights=str(weights), perceptual_views=0, error_pictures=False)

@@ -61,20 +61,17 @@ def test_the_earliest_error_wins_and_names_its_item(workers: int) -> None:
     assert len(started) < 2000
 
 
-def test_nanoseconds_of_the_epoch_keep_their_digits() -> None:
+def test_units_of_time_keep_their_digits_and_unsorted_times_are_refused() -> None:
     start = 1_532_402_927_647_951_001
     times = common.seconds([start, start + 100_000_001], "ns", "log", start)
     assert times.tolist() == [0.0, 0.100000001]
+    assert "record 2" in refused("do not increase", common.seconds, [0.0, 0.1, 0.1, 0.3], "s", "sweeps").where
 
 
 @pytest.mark.parametrize(("unit", "likely"), [("ns", "us"), ("s", "us")])
 def test_a_confused_unit_is_named(unit: common.TimeUnit, likely: str) -> None:
     caught = refused("another unit", common.seconds, [10**15 + 100_000 * n for n in range(5)], unit, "camera front")
     assert likely in caught.remedy
-
-
-def test_unsorted_times_are_refused_with_their_place() -> None:
-    assert "record 2" in refused("do not increase", common.seconds, [0.0, 0.1, 0.1, 0.3], "s", "sweeps").where
 
 
 def test_poses_are_cleaned_or_refused_in_words() -> None:
@@ -105,9 +102,8 @@ def smooth_picture(camera: Camera, lens: images.Lens | None = None) -> np.ndarra
     for _ in range(60 if lens is not None else 0):
         xy += seen - lens(xy)
     values = [np.sin(3 * xy[:, 0]), np.cos(4 * xy[:, 1]), xy[:, 0] * xy[:, 1]]
-    return (
-        np.rint(127 + 100 * np.stack(values, -1).clip(-1, 1)).astype(np.uint8).reshape(camera.height, camera.width, 3)
-    )
+    shades = np.rint(127 + 100 * np.stack(values, -1).clip(-1, 1)).astype(np.uint8)
+    return shades.reshape(camera.height, camera.width, 3)
 
 
 @pytest.mark.parametrize(
@@ -144,14 +140,11 @@ def test_a_lens_that_no_pinhole_fits_is_refused(lens: images.Lens) -> None:
         images.fit_images(Camera("f", 96, 64, 50.0, 50.0, 48.0, 32.0), ImportOptions(), lens)
 
 
-def test_images_that_fit_are_kept_byte_for_byte() -> None:
+def test_resizing_averages_exact_areas_and_images_that_fit_are_kept() -> None:
     fit = images.fit_images(CAMERA, ImportOptions())
     assert fit.camera is CAMERA and fit.note == ""
     content = b"not even decoded"
     assert fit.image(content) is content
-
-
-def test_resizing_averages_exact_areas_and_scales_the_camera() -> None:
     rgb = np.random.default_rng(0).integers(0, 256, (64, 96, 3), np.uint8)
     fit = images.fit_images(CAMERA, ImportOptions(resolution=36))
     assert (fit.camera.width, fit.camera.height) == (36, 24)
@@ -177,7 +170,7 @@ def test_a_file_stays_of_its_kind_and_labels_are_never_mixed() -> None:
     refused("camera's size", fit.ids, ids[:10])
 
 
-def test_sizes_asked_for() -> None:
+def test_sizes_and_frame_numbers_in_words() -> None:
     assert parse_resolution("") is None
     assert parse_resolution("960") == 960
     assert parse_resolution("960x640") == (960, 640)
@@ -186,15 +179,6 @@ def test_sizes_asked_for() -> None:
     refused("never enlarged", images.resized, 640, 480, (960, 640), raises=UsageError)
     for text in ("8", "x640", "960x", "-5", "wide"):
         refused("image size", parse_resolution, text, raises=UsageError)
-
-
-def test_frame_numbers_in_words() -> None:
-    for numbers, words in (
-        ([], "none"),
-        ([3], "3"),
-        ([1, 5], "1, 5"),
-        (range(16), "0 to 15"),
-        ([1, 2, 4, 5, 6], "1, 2, 4 to 6"),
-    ):
-        assert number_ranges(list(numbers)) == words
+    said = {"none": [], "3": [3], "1, 5": [1, 5], "0 to 15": range(16), "1, 2, 4 to 6": [1, 2, 4, 5, 6]}
+    assert all(number_ranges(list(numbers)) == words for words, numbers in said.items())
     assert number_ranges(list(range(0, 40, 2))) == "0, 2, 4, 6, 8, 10, 12, 14, ... (20 in all)"

@@ -74,9 +74,6 @@ def test_taps_have_their_widths_and_do_not_depend_on_the_batch(network: inceptio
     assert float((found["2048"][0] - found["2048"][1]).abs().max()) > 1e-3
     weight = network.get_buffer("fc/weight")
     assert torch.allclose(found["logits_unbiased"], found["2048"] @ weight.T, atol=1e-4)
-
-
-def test_other_sizes_are_refused(network: inception.InceptionFeatures) -> None:
     with pytest.raises(InputError, match="images of one size"):
         network(torch.zeros(1, 3, 224, 224))
 
@@ -128,18 +125,11 @@ def test_the_order_of_branches_and_the_pools_of_earlier_blocks(network, state, n
         return y
 
     if name == "Mixed_5c":
-        branches = [
-            ("branch1x1",),
-            ("branch5x5_1", "branch5x5_2"),
-            ("branch3x3dbl_1", "branch3x3dbl_2", "branch3x3dbl_3"),
-        ]
+        lengths = {"branch5x5": 2, "branch3x3dbl": 3}
     else:
-        branches = [
-            ("branch1x1",),
-            tuple(f"branch7x7_{n}" for n in (1, 2, 3)),
-            tuple(f"branch7x7dbl_{n}" for n in (1, 2, 3, 4, 5)),
-        ]
-    chains = [chain(one, *branch) for branch in branches]
+        lengths = {"branch7x7": 3, "branch7x7dbl": 5}
+    branches = [[f"{branch}_{n + 1}" for n in range(count)] for branch, count in lengths.items()]
+    chains = [chain(one, *branch) for branch in (["branch1x1"], *branches)]
     expected = np.concatenate([*chains, chain(neighbours(one, pool), "branch_pool")])
     found = network.block(name, torch.from_numpy(one).float()[None])[0].numpy()
     assert np.abs(found - expected).max() < 1e-4 * np.abs(expected).max()
@@ -148,18 +138,13 @@ def test_the_order_of_branches_and_the_pools_of_earlier_blocks(network, state, n
 def test_reducing_blocks_pass_maxima_on_as_their_last_channels(network) -> None:
     for name, width in (("Mixed_6a", 288), ("Mixed_7a", 768)):
         x = torch.rand(1, width, 9, 9, generator=torch.Generator().manual_seed(3))
-        found = network.block(name, x)[0, -width:]
-        expected = torch.stack(
-            [
-                torch.stack([x[0, :, 2 * i : 2 * i + 3, 2 * j : 2 * j + 3].amax((1, 2)) for j in range(4)], -1)
-                for i in range(4)
-            ],
-            -2,
-        )
-        assert torch.equal(found, expected)
+        largest = network.block(name, x)[0, -width:]
+        for i, j in np.ndindex(4, 4):
+            window = x[0, :, 2 * i : 2 * i + 3, 2 * j : 2 * j + 3]
+            assert torch.equal(largest[:, i, j], window.amax((1, 2)))
 
 
-def test_norms_have_the_small_epsilon_of_tensorflow(state) -> None:
+def test_norms_have_the_small_epsilon_of_tensorflow_and_float64_agrees(state) -> None:
     changed = dict(state)
     name = "Mixed_7b.branch1x1"
     changed[f"{name}.bn.running_var"] = torch.zeros(320)
@@ -168,24 +153,18 @@ def test_norms_have_the_small_epsilon_of_tensorflow(state) -> None:
     changed[f"{name}.conv.weight"] = torch.full((320, 1280, 1, 1), 1 / 1280)
     found = inception.InceptionFeatures(changed).block("Mixed_7b", torch.ones(1, 1280, 2, 2))[0, :320]
     assert torch.allclose(found, torch.full_like(found, 1 / math.sqrt(0.001)), rtol=1e-4)
-
-
-def test_float64_agrees(state) -> None:
     image = inception.prepared(picture(), "tf1")[None]
     single = inception.InceptionFeatures(state)(image)["2048"]
     double = inception.InceptionFeatures(state).double()(image.double())["2048"]
     assert float((single - double).abs().max() / double.abs().max()) < 1e-5
 
 
-def test_counts_of_batches_are_left_alone(network, state) -> None:
+def test_counts_of_batches_are_left_alone_and_other_weights_refused(network, state) -> None:
     counted = inception.InceptionFeatures({**state, "Mixed_5b.branch1x1.bn.num_batches_tracked": torch.tensor(7)})
     x = torch.rand(1, 192, 5, 5, generator=torch.Generator().manual_seed(4))
     assert torch.equal(counted.block("Mixed_5b", x), network.block("Mixed_5b", x))
     with pytest.raises(InputError, match="num_batches_seen"):  # of another name it is a tensor of another network
         inception.InceptionFeatures({**state, "Mixed_5b.branch1x1.bn.num_batches_seen": torch.tensor(7)})
-
-
-def test_other_weights_are_refused_and_named(state) -> None:
     missing = {name: value for name, value in state.items() if name != "Mixed_6e.branch7x7_3.bn.running_mean"}
     refused(r"mine: Mixed_6e.branch7x7_3.bn.running_mean", inception.InceptionFeatures, missing, "mine")
     refused("another network", inception.InceptionFeatures, {**state, "fc.weight": torch.zeros(1000, 2048)})
@@ -204,11 +183,16 @@ def test_plain_images_keep_their_value_under_every_rule(rule: inception.ResizeRu
         assert torch.allclose(found, torch.full_like(found, expected), atol=1e-4)
 
 
-def test_rules_differ() -> None:
+def test_rules_differ_and_pytorch_fid_samples_at_pixel_centres() -> None:
     made = {rule: inception.prepared(picture(400, 640), rule) for rule in inception.RULES}
     for rule, other in (("tf1", "pytorch-fid"), ("clean", "tm"), ("tm", "pytorch-fid"), ("clean", "tf1")):
         assert float((made[rule] - made[other]).abs().max()) > 0.01
     assert 0 < float((made["neurad"] - made["clean"]).abs().max()) < 2 / 128  # rounding after each pass
+    image = np.zeros((2, 2, 3), np.uint8)
+    image[:, 1] = 255
+    row = (inception.prepared(image, "pytorch-fid")[0, 0] + 1) / 2
+    centres = (torch.arange(299) + 0.5) * 2 / 299 - 0.5
+    assert torch.allclose(row, centres.clamp(0, 1), atol=1e-5)
 
 
 @pytest.mark.parametrize(("height", "width"), [(37, 50), (299, 299), (400, 640)])
@@ -235,11 +219,3 @@ def test_antialiasing_rules_are_pillows_on_floats(rule: inception.ResizeRule, he
     planes = [np.asarray(one.resize((299, 299), method)) for one in images]
     found = inception.prepared(image, rule).numpy() * 128 + 128
     assert np.abs(found - np.clip(np.stack(planes), 0, 255)).max() < 0.01
-
-
-def test_pytorch_fid_samples_at_pixel_centres() -> None:
-    image = np.zeros((2, 2, 3), np.uint8)
-    image[:, 1] = 255
-    row = (inception.prepared(image, "pytorch-fid")[0, 0] + 1) / 2
-    centres = (torch.arange(299) + 0.5) * 2 / 299 - 0.5
-    assert torch.allclose(row, centres.clamp(0, 1), atol=1e-5)

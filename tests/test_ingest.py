@@ -47,9 +47,16 @@ def test_a_kitti_folder_is_recognised_and_equals_a_direct_import(tmp_path: Path)
     assert summary.pop("alignment").keys() == {"front"}
     assert summary == {"frames": 6, "sweeps": 6, "tracks": 1, "held_out": 1}
     assert (tmp_path / "out" / "contact_sheet.jpg").read_bytes()[:2] == b"\xff\xd8"
+    small = read_scene(run(drive, tmp_path / "small", resolution="31"))
+    a, b = direct.cameras["front"], small.cameras["front"]
+    assert max(b.width, b.height) == 31
+    assert b == a.resized(b.width, b.height)
+    assert read_image(small, small.frames[0]).shape == (b.height, b.width, 3)
+    assert (small.frames[3].view.world_from_cam == direct.frames[3].view.world_from_cam).all()
+    assert any("resized" in note for note in small.source.notes)
 
 
-def test_flags_reach_the_importer(tmp_path: Path) -> None:
+def test_flags_reach_the_importer_and_what_is_odd_is_said(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
     scene = read_scene(run(drive, tmp_path / "out", frames="1:6", test_every=2, untwist="no"))
     assert len(scene.frames) == 5
@@ -57,26 +64,14 @@ def test_flags_reach_the_importer(tmp_path: Path) -> None:
     assert not read_points(scene, scene.sweeps[0]).dt_s.any()
 
 
-def test_images_are_resized_with_their_camera_and_points_stay_on_them(tmp_path: Path) -> None:
-    drive = made.write_raw_drive(tmp_path / "day")
-    full = IMPORTERS["kitti"](drive, tmp_path / "full", ImportOptions())
-    small = read_scene(run(drive, tmp_path / "small", resolution="31"))
-    a, b = full.cameras["front"], small.cameras["front"]
-    assert max(b.width, b.height) == 31
-    assert b == a.resized(b.width, b.height)
-    assert read_image(small, small.frames[0]).shape == (b.height, b.width, 3)
-    assert (small.frames[3].view.world_from_cam == full.frames[3].view.world_from_cam).all()
-    assert any("resized" in note for note in small.source.notes)
-
-
 def test_the_number_of_workers_changes_nothing_and_is_no_other_configuration(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
     out = run(drive, tmp_path / "one", workers=1)
-    listed = store.read_json(out / "manifest.json")["files"]
-    again = store.read_json(run(drive, tmp_path / "three", workers=3) / "manifest.json")["files"]
-    assert {n: f for n, f in listed.items() if not n.startswith("run.")} == {
-        n: f for n, f in again.items() if not n.startswith("run.")
-    }
+    one, three = (
+        {n: f for n, f in store.read_json(folder / "manifest.json")["files"].items() if not n.startswith("run.")}
+        for folder in (out, run(drive, tmp_path / "three", workers=3))
+    )
+    assert one == three
     made_ns = (out / "scene.json").stat().st_mtime_ns
     run(drive, out, workers=2)
     assert (out / "scene.json").stat().st_mtime_ns == made_ns
@@ -238,13 +233,11 @@ def test_a_scene_is_checked_and_copied(tmp_path: Path) -> None:
         for name in frame.labels:
             one, other = read_label(copy, frame, name), read_label(scene, frame, name)
             assert np.array_equal(one, other, equal_nan=name == "depth")
-    for index, config in enumerate(
-        (IngestConfig(frames="0:2"), IngestConfig(cameras=("front",)), IngestConfig(resolution="60"))
-    ):
+    for change in ({"frames": "0:2"}, {"cameras": ("front",)}, {"resolution": "60"}):
         with pytest.raises(UsageError, match="does not apply to a scene"):
-            Ingest(log=source, out=tmp_path / f"refused{index}", settings=config).run()
+            run(source, tmp_path / "refused", **change)
         with pytest.raises(UsageError, match="settings of its own"):
-            Ingest(log="city", out=tmp_path / f"city{index}", settings=config).run()
+            run("city", tmp_path / "city", **change)
 
 
 @needs_native
@@ -256,6 +249,4 @@ def test_the_city_is_made_with_the_split_asked_for_and_always_the_same(tmp_path:
     assert [i for i, s in one.split.items() if s == "test"] == ["front/000002", "front/000004"]
     assert set(one.frames[0].labels) >= {"depth", "semantics", "sky"}
     listed = [store.read_json(Path(s.root) / "manifest.json")["files"] for s in (one, two)]
-    for name in listed[0]:
-        if not name.startswith("run."):
-            assert listed[0][name] == listed[1][name], name
+    assert all(listed[1][name] == file for name, file in listed[0].items() if not name.startswith("run."))

@@ -8,6 +8,7 @@ import os
 import shutil
 import sys
 import threading
+import tracemalloc
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -28,7 +29,6 @@ from mudg.gaussians.nodes import SkyNode
 from mudg.gaussians.start import StartPoints
 from mudg.gaussians.views import LidarPixels, StoredView, TrainView, ViewSet
 from mudg.scene.read import read_scene
-from mudg.steps.fit import Fit
 
 SIZE, FRAMES = (60, 40), 6
 ODD = (7, 5)
@@ -98,7 +98,8 @@ def open_in(folder: Path) -> list[str]:
     return [target for target in targets if target.startswith(str(folder))]
 
 
-def test_every_combination_of_fields_comes_back_to_the_bit(tmp_path):
+def test_every_combination_of_fields_and_number_types_comes_back_to_the_bit(tmp_path):
+    """A label image may hold other numbers than usual; nothing may be cut off."""
     combinations = [c for n in range(len(OPTIONAL) + 1) for c in itertools.combinations(OPTIONAL, n)]
     views = [a_view(seed, given) for seed, given in enumerate(combinations)]
     read = filed(tmp_path, views)
@@ -109,10 +110,6 @@ def test_every_combination_of_fields_comes_back_to_the_bit(tmp_path):
     assert list(fit_views.heads_of(read)) == list(fit_views.heads_of(views))
     assert list(tmp_path.iterdir()) == []
     read.close()
-
-
-def test_other_number_types_come_back_as_they_are(tmp_path):
-    """A label image may hold other numbers than usual; nothing may be cut off."""
     usual = a_view(5)
     views = [replace(usual, depth=usual.depth.astype(np.float64)), replace(usual, depth=usual.depth.astype(np.float16))]
     for found, wanted in zip(filed(tmp_path, views), views, strict=True):
@@ -175,20 +172,17 @@ def test_views_grow_on_their_device(tmp_path):
         for step, (view,) in enumerate(ahead, start=1):
             wanted = views.choose(0, step, 0.0)[0].as_tensors()
             given = [getattr(view, f.name) for f in fields(view) if isinstance(getattr(view, f.name), torch.Tensor)]
-            assert len(given) == 6 and all(
-                tensor.device == there for tensor in (*given, view.lidar.pixel, view.lidar.depth_m)
-            )
-            assert torch.equal(view.rgb.cpu(), wanted.rgb) and torch.equal(view.mask.cpu(), wanted.mask)
-            assert torch.equal(view.channels.cpu(), wanted.channels) and torch.equal(
-                view.lidar.pixel.cpu(), wanted.lidar.pixel
-            )
+            every = (*given, view.lidar.pixel, view.lidar.depth_m)
+            assert len(given) == 6 and all(tensor.device == there for tensor in every)
+            assert torch.equal(view.lidar.pixel.cpu(), wanted.lidar.pixel)
+            for name in ("rgb", "mask", "channels"):
+                assert torch.equal(getattr(view, name).cpu(), getattr(wanted, name))
 
 
 def test_an_error_of_a_thread_is_raised_at_its_step_in_words(tmp_path):
     views = ViewSet(filed(tmp_path, [a_view(seed) for seed in range(6)]), ())
-    views.recorded._file._file.truncate(
-        2 * views.recorded._slots[0].size
-    )  # the file was written from the last view to the first
+    # the file was written from the last view to the first
+    views.recorded._file._file.truncate(2 * views.recorded._slots[0].size)
     seen, before = [], threads_at_work()
 
     def go_through() -> None:
@@ -220,25 +214,13 @@ def test_ctrl_c_ends_the_threads(tmp_path):
     assert len(read) < 20  # what had not begun was dropped
 
 
-def test_a_failing_load_gives_its_space_back(tmp_path):
-    def loaded():
-        yield 0, a_view(0)
-        raise ResourceError("the disk broke")
-
-    with pytest.raises(ResourceError, match="the disk broke"):
-        kept.keep(loaded(), 2, tmp_path)
-    assert open_in(tmp_path) == [] and list(tmp_path.iterdir()) == []
-
-
 def test_a_full_disk_is_said_before_anything_is_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        kept.shutil, "disk_usage", lambda folder: shutil._ntuple_diskusage(100 << 30, 97 << 30, 3 << 30)
-    )
+    room = shutil._ntuple_diskusage(100 << 30, 97 << 30, 3 << 30)
+    monkeypatch.setattr(kept.shutil, "disk_usage", lambda folder: room)
     assert kept.scratch_folder(9, kept.IN_MEMORY_BYTES, tmp_path) is None
     assert kept.scratch_folder(9, 2 << 30, tmp_path) == tmp_path
-    with pytest.raises(
-        ResourceError, match=r"too little room[\s\S]*4.0 GiB free for 9 views[\s\S]*3.0 GiB[\s\S]*--width-px"
-    ):
+    said = r"too little room[\s\S]*4.0 GiB free for 9 views[\s\S]*3.0 GiB[\s\S]*--width-px"
+    with pytest.raises(ResourceError, match=said):
         kept.scratch_folder(9, 4 << 30, tmp_path)
 
 
@@ -308,15 +290,19 @@ def test_a_wrong_frame_is_named_by_the_thread_that_reads_it(world, tmp_path):
     (scene / "manifest.json").unlink(missing_ok=True)
     image = scene / fit_views.training_frames(read_scene(scene), ())[2].image.path
     image.write_bytes(image.read_bytes()[:200])
-    before = threads_at_work()
+    before, config = threads_at_work(), replace(settings(), method="street_gaussians")
     with pytest.raises(fit_views.InputError, match=image.name):
-        Fit(
-            scene=scene,
-            fused=world["fuse"],
-            out=tmp_path / "fit",
-            settings=replace(settings(), method="street_gaussians"),
-        ).run()
+        fit_to({**world, "scene": scene}, tmp_path / "fit", config).run()
     assert threads_at_work() == before
+
+    def loaded():
+        yield 0, a_view(0)
+        raise ResourceError("the disk broke")
+
+    (tmp_path / "scratch").mkdir()
+    with pytest.raises(ResourceError, match="the disk broke"):
+        kept.keep(loaded(), 2, tmp_path / "scratch")
+    assert open_in(tmp_path) == [] and list((tmp_path / "scratch").iterdir()) == []
 
 
 def test_ctrl_c_while_frames_are_read_ends_the_threads(world, tmp_path, monkeypatch):
@@ -385,12 +371,10 @@ def test_points_of_unseen_surfaces_are_bounded(world, monkeypatch):
 
 def test_few_points_of_unseen_surfaces_still_cover_them():
     """10,000 points on a square of 10 m: 100 of them are spread over all of it and are as large as their distance."""
-    grid = (
-        np.stack(np.meshgrid(np.arange(0, 10, 0.1), np.arange(0, 10, 0.1), [0.0]), -1).reshape(-1, 3).astype(np.float32)
-    )
-    points = StartPoints(
-        grid, np.zeros((len(grid), 3), np.uint8), np.zeros(len(grid), np.uint8), np.full(len(grid), 0.05, np.float32)
-    )
+    axis = np.arange(0, 10, 0.1)
+    grid = np.stack(np.meshgrid(axis, axis, [0.0]), -1).reshape(-1, 3).astype(np.float32)
+    black, sizes = np.zeros((len(grid), 3), np.uint8), np.full(len(grid), 0.05, np.float32)
+    points = StartPoints(grid, black, black[:, 0], sizes)
     few = trust._spread(points, 100, np.random.default_rng(0))
     all_of_them = trust._spread(points, len(grid), np.random.default_rng(0))
     assert 40 <= len(few) <= 100
@@ -402,13 +386,9 @@ def test_few_points_of_unseen_surfaces_still_cover_them():
 @pytest.mark.skipif(sys.platform != "linux", reason="reads the peak of resident memory as Linux gives it")
 def test_views_of_a_pass_are_not_held(tmp_path):
     """Reading all views one after the other takes the memory of one, not of all."""
-    import tracemalloc
-
     shape = (200, 300)
-    large = StoredView(
-        "v", view_at(0.0, camera(300, 200)), "recorded", np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8)
-    )
-
+    rgb = np.zeros((*shape, 3), np.uint8)
+    large = StoredView("v", view_at(0.0, camera(300, 200)), "recorded", rgb, rgb[..., 0].copy())
     read = kept.keep(((index, large) for index in range(40)), 40, tmp_path)
     tracemalloc.start()
     total = sum(int(view.rgb.sum()) for view in read)

@@ -31,7 +31,7 @@ def worst(a: np.ndarray, b: np.ndarray) -> float:
 # --- calibration ----------------------------------------------------------------------------------
 
 
-def test_camera_projects_as_the_projection_matrix_does_with_pixel_centres_at_half(tmp_path: Path) -> None:
+def test_camera_projects_as_the_projection_matrix_does_and_day_calibration_equals_it(tmp_path: Path) -> None:
     made.write_calibration_text(tmp_path / "calib.txt")
     calibration = read_calibration_text(tmp_path / "calib.txt")
     camera = calibration.camera(2, "front", made.WIDTH, made.HEIGHT)
@@ -42,9 +42,6 @@ def test_camera_projects_as_the_projection_matrix_does_with_pixel_centres_at_hal
     homogeneous = np.c_[rect0, np.ones(3)] @ made.projection(2).T
     assert worst(uv - 0.5, homogeneous[:, :2] / homogeneous[:, 2:]) < 1e-9
     assert worst(z, homogeneous[:, 2]) < 1e-9
-
-
-def test_day_calibration_equals_object_calibration(tmp_path: Path) -> None:
     made.write_calibration_text(tmp_path / "calib.txt")
     made.write_calibration_day(tmp_path / "day")
     one, other = read_calibration_text(tmp_path / "calib.txt"), read_calibration_day(tmp_path / "day")
@@ -69,7 +66,8 @@ def test_rounded_rotation_becomes_exact_and_a_scaled_one_is_refused(tmp_path: Pa
 
 
 def test_raw_drive_poses_images_times_and_calibration(tmp_path: Path) -> None:
-    scene = ingest(made.write_raw_drive(tmp_path / "2011_09_26"), tmp_path / "out")
+    folder = made.write_raw_drive(tmp_path / "2011_09_26")
+    scene = ingest(folder, tmp_path / "out")
     assert [frame.id for frame in scene.frames] == [f"front/{n:06d}" for n in range(6)]
     assert worst(scene.ego.world_from_ego, np.stack([made.world_from_imu(0.1 * n) for n in range(6)])) < 2e-5
     assert worst([f.view.time_s for f in scene.frames], np.arange(6) * 0.1) < 1e-6
@@ -82,6 +80,11 @@ def test_raw_drive_poses_images_times_and_calibration(tmp_path: Path) -> None:
     assert scene.split["front/000004"] == "test"
     assert sorted(scene.split.values()).count("test") == 1
     assert "CC BY-NC-SA" in scene.source.licence
+    scene = ingest(folder, tmp_path / "part", frames=(2, 5))
+    assert len(scene.frames) == 3
+    moved = invert(made.world_from_imu(0.2)) @ made.world_from_imu(0.4)
+    assert worst((invert(scene.ego.world_from_ego[0]) @ scene.ego.world_from_ego[2]), moved) < 2e-5
+    assert any("source frames 2 to 4" in note for note in scene.source.notes)
 
 
 def test_raw_scans_are_untwisted_to_where_the_posts_are(tmp_path: Path) -> None:
@@ -114,14 +117,6 @@ def test_tracklets_become_the_cars_exact_path(tmp_path: Path, twisted: bool) -> 
     assert worst(track.world_from_object[:, :3, :3], truth[:, :3, :3]) < 5e-3
 
 
-def test_frame_range_keeps_places_and_says_which_frames(tmp_path: Path) -> None:
-    scene = ingest(made.write_raw_drive(tmp_path / "day"), tmp_path / "out", frames=(2, 5))
-    assert len(scene.frames) == 3
-    moved = invert(made.world_from_imu(0.2)) @ made.world_from_imu(0.4)
-    assert worst((invert(scene.ego.world_from_ego[0]) @ scene.ego.world_from_ego[2]), moved) < 2e-5
-    assert any("source frames 2 to 4" in note for note in scene.source.notes)
-
-
 def test_camera_times_outside_the_pose_packets_go_on_as_the_motion_did(tmp_path: Path) -> None:
     folder = made.write_raw_drive(tmp_path / "day")
     late = "\n".join(made.clock_line(0.1 * n + 0.03) for n in range(6)) + "\n"
@@ -132,9 +127,6 @@ def test_camera_times_outside_the_pose_packets_go_on_as_the_motion_did(tmp_path:
     expected = made.world_from_velo(0.53) @ invert(cam_from_rect0 @ made.RECT0_FROM_VELO)
     assert last.time_s == pytest.approx(0.53, abs=1e-6)
     assert worst(last.world_from_cam, expected) < 3e-3
-
-
-def test_timestamps_keep_nanoseconds_across_a_minute(tmp_path: Path) -> None:
     path = tmp_path / "timestamps.txt"
     path.write_text("2011-09-26 13:02:59.964389445\n2011-09-26 13:03:00.067891234\n")
     first, second = read_timestamps(path, [0, 1], 1).values()
@@ -212,19 +204,16 @@ def test_track_with_a_gap_is_split_where_it_is_long(tmp_path: Path) -> None:
     assert any("0.55 s and were split" in note for note in scene.source.notes)
 
 
-def test_holdout_split_takes_all_cameras_of_a_moment_and_never_the_first() -> None:
+def test_frame_ranges_and_the_holdout_split() -> None:
+    assert parse_frame_range("") is None
+    assert parse_frame_range("10:26") == (10, 26)
+    for wrong in ("5", "7:7", "9:2", "a:b", "-1:4"):
+        refused("frame range", parse_frame_range, wrong, raises=UsageError)
     moments = [[f"{camera}/{n:06d}" for camera in ("front", "left")] for n in range(10)]
     split = holdout_split(moments, 4)
     held_out = {frame_id for frame_id, part in split.items() if part == "test"}
     assert held_out == {f"{camera}/{n:06d}" for camera in ("front", "left") for n in (4, 8)}
     assert set(holdout_split(moments, 0).values()) == {"train"}
-
-
-def test_frame_range_words() -> None:
-    assert parse_frame_range("") is None
-    assert parse_frame_range("10:26") == (10, 26)
-    for wrong in ("5", "7:7", "9:2", "a:b", "-1:4"):
-        refused("frame range", parse_frame_range, wrong, raises=UsageError)
 
 
 # --- real pieces ----------------------------------------------------------------------------------
@@ -338,26 +327,20 @@ def test_a_time_that_is_missing_for_a_recorded_file_is_named(tmp_path: Path) -> 
     assert [sweep.time_s for sweep in scene.sweeps] == pytest.approx([0.0, 0.1, 0.3, 0.4, 0.5])
 
 
-def test_an_empty_line_of_a_pose_file_is_a_missing_pose(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["poses", "packets"])
+def test_an_empty_line_of_poses_or_packets_is_a_missing_one(kind: str, tmp_path: Path) -> None:
     """Line k is frame k: what lies behind the empty line stays where it was."""
-    folder = made.write_odometry(tmp_path, made.Drive(tuple(range(8))))
-    empty_lines(tmp_path / "poses" / "07.txt", 3)
-    refused("pose file lacks frames", ingest, folder, tmp_path / "refused")
-    scene = ingest(folder, tmp_path / "out", skip_missing=True)
-    first = invert(made.world_from_velo(0.0))
+    drive = made.Drive(tuple(range(8)))
+    if kind == "poses":
+        folder, sequence, first = made.write_odometry(tmp_path, drive), "", invert(made.world_from_velo(0.0))
+        empty_lines(tmp_path / "poses" / "07.txt", 3)
+        refused("pose file lacks frames", ingest, folder, tmp_path / "refused")
+    else:
+        folder, sequence, first = made.write_tracking(tmp_path, drive=drive), "0003", invert(made.world_from_imu(0.0))
+        empty_lines(folder / "oxts" / "0003.txt", 3)
+    scene = ingest(folder, tmp_path / "out", sequence=sequence, skip_missing=True)
     for sweep in scene.sweeps:
         exact = first @ made.world_from_velo(sweep.time_s)
         # frame 3 lies between its neighbours: 1.6 m of the arc
         assert worst(sweep.world_from_lidar[:3, 3], exact[:3, 3]) < 0.03
-    at_gap = [round(sweep.time_s, 6) for sweep in scene.sweeps]
-    assert at_gap == [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]
-
-
-def test_an_empty_line_of_a_packet_file_is_a_missing_packet(tmp_path: Path) -> None:
-    folder = made.write_tracking(tmp_path, drive=made.Drive(tuple(range(8))))
-    empty_lines(folder / "oxts" / "0003.txt", 3)
-    scene = ingest(folder, tmp_path / "out", sequence="0003", skip_missing=True)
-    first = invert(made.world_from_imu(0.0))
-    for sweep in scene.sweeps:
-        exact = first @ made.world_from_velo(sweep.time_s)
-        assert worst(sweep.world_from_lidar[:3, 3], exact[:3, 3]) < 0.03
+    assert [sweep.time_s for sweep in scene.sweeps] == pytest.approx(np.arange(8) * 0.1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -63,7 +64,7 @@ def test_several_images_are_compared_with_features_of_the_truth_that_are_made_on
     assert len(made) == 2 * 6 * (len(pairs) + 1)  # six bands
 
 
-def test_bands_are_not_the_whole_without_what_lies_around_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bands_need_what_lies_around_them_and_nothing_has_no_distance(monkeypatch: pytest.MonkeyPatch) -> None:
     """The test above would notice a border that is too thin."""
     pair, distance = pair_of(136, 40, masked=False), small_distance()
     whole = distance(pair)
@@ -71,9 +72,6 @@ def test_bands_are_not_the_whole_without_what_lies_around_them(monkeypatch: pyte
     monkeypatch.setattr(featnets, "BAND_PIXELS", 24 * 40)
     monkeypatch.setattr(CodecFeatures, "reach_rows", 16)
     assert distance(pair) != pytest.approx(whole, rel=2e-6)
-
-
-def test_nothing_that_counts_has_no_distance(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(featnets, "WHOLE_PIXELS", 0)
     pair = pair_of(40, 24, masked=False)
     empty = Pair(pair.rgb, None, None, pair.truth_rgb, None, None, None, mask=torch.zeros(1, 40, 24, dtype=torch.bool))
@@ -82,7 +80,7 @@ def test_nothing_that_counts_has_no_distance(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_a_view_that_cannot_fit_is_refused_before_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
     camera = Camera("front", 1_000_000, 562_500, 8e5, 8e5, 5e5, 2.8e5)
-    path = Trajectory("front", (View(camera, torch.eye(4, dtype=torch.float64).numpy(), 0.0),), None)
+    path = Trajectory("front", (View(camera, np.eye(4), 0.0),), None)
     monkeypatch.setattr(render.memory, "free_bytes", lambda: 64 << 30)
     with pytest.raises(ResourceError, match="1000000 x 562500 pixels needs more memory") as refused:
         render._require_memory([path])
@@ -112,10 +110,8 @@ def test_trajectories_are_made_one_after_another_where_memory_lasts_for_one(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     camera = Camera("front", 3840, 2160, 2000.0, 2000.0, 1920.0, 1080.0)
-    paths = [
-        Trajectory(f"front_shift+{n}.0", (View(camera, torch.eye(4, dtype=torch.float64).numpy(), 0.0),) * 3, None)
-        for n in (2, 3)
-    ]
+    views = (View(camera, np.eye(4), 0.0),) * 3
+    paths = [Trajectory(f"front_shift+{n}.0", views, None) for n in (2, 3)]
     monkeypatch.setattr(synthesize.native, "default_threads", lambda: 2)
     said: list[str] = []
     monkeypatch.setattr(synthesize.log, "info", said.append)
@@ -131,7 +127,7 @@ def test_trajectories_are_made_one_after_another_where_memory_lasts_for_one(
 def test_tiles_of_a_condition_are_those_of_the_whole() -> None:
     noise = torch.Generator().manual_seed(3)
     camera = Camera("front", 44, 36, 40.0, 40.0, 22.0, 18.0)
-    views = tuple(View(camera, torch.eye(4, dtype=torch.float64).numpy(), 0.1 * t) for t in range(2))
+    views = tuple(View(camera, np.eye(4), 0.1 * t) for t in range(2))
     one = lambda *shape: torch.rand(*shape, generator=noise)
     planes = (one(2, 3, 36, 44), one(2, 1, 36, 44), one(2, 1, 36, 44) > 0.5, one(3, 36, 44))
     whole = Condition(views, *planes, backdrop=one(2, 3, 36, 44))

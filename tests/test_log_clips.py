@@ -220,9 +220,8 @@ def test_annotated_depth_is_learned_with_its_confidence(annotated, tmp_path, pub
     assert torch.allclose(clip.depth[measured], sweep.depth[measured], rtol=1e-3)
     assert bool((clip.depth_weight[measured] == 1).all())
     for number, view in enumerate(clip.condition.views):
-        _, _, exact = street.image(
-            View(view.camera, view.world_from_cam, opened.frame(window.frames[number]).view.time_s)
-        )
+        time_s = opened.frame(window.frames[number]).view.time_s
+        _, _, exact = street.image(View(view.camera, view.world_from_cam, time_s))
         guessed = torch.from_numpy(np.isfinite(exact)) & ~measured[number, 0]
         guessed[-6:], guessed[:, -1] = False, False  # where nothing is known
         assert torch.allclose(clip.depth[number, 0][guessed], 2 * torch.from_numpy(exact).float()[guessed], rtol=1e-3)
@@ -232,9 +231,8 @@ def test_annotated_depth_is_learned_with_its_confidence(annotated, tmp_path, pub
         assert bool(bonnet.any()) and not bool(clip.depth_weight[number, 0][bonnet].any())
         sky = torch.from_numpy(~np.isfinite(exact)) & ~measured[number, 0]
         assert bool((clip.depth[number, 0][sky & (column > 0.1)] == clips.FAR_M).all())
-    turned = next(
-        v for n in range(20) if not torch.equal((v := clips.vary(clip, np.random.default_rng(n))).depth, clip.depth)
-    )
+    varied = (clips.vary(clip, np.random.default_rng(n)) for n in range(20))
+    turned = next(one for one in varied if not torch.equal(one.depth, clip.depth))
     assert torch.equal(turned.depth_weight, clip.depth_weight.flip(-1))
 
 

@@ -45,7 +45,7 @@ def test_gradients_agree_with_finite_differences(name):
     check_gradient(*GRADIENTS[name])
 
 
-def test_ssim_agrees_with_an_independent_gaussian_filter():
+def test_ssim_agrees_with_an_independent_gaussian_filter_and_photometric_sums_it():
     """scipy's truncated Gaussian of radius 5 is the same 11-tap window; zero padding = mode constant."""
     x, y = image(1, (1, 20, 24)), image(2, (1, 20, 24))
 
@@ -57,9 +57,6 @@ def test_ssim_agrees_with_an_independent_gaussian_filter():
     expected = (2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))
     assert torch.allclose(losses.ssim_map(x, y), expected, atol=1e-12)
     assert torch.allclose(losses.ssim_map(x, x), torch.ones_like(x), atol=1e-12)
-
-
-def test_photometric_is_the_weighted_sum_of_its_parts():
     x, y = image(1), image(2)
     expected = 0.7 * (x - y).abs().mean() + 0.3 * (1 - losses.ssim_map(x, y).mean())
     assert float(losses.photometric(x, y, 0.3)) == pytest.approx(float(expected), abs=1e-14)
@@ -74,36 +71,27 @@ def test_masked_pixels_change_nothing_and_get_no_gradient():
     assert (x.grad[:, :4] != 0).all()
 
 
-def test_weighted_mean_known_value_and_empty_weight():
+def test_means_weighted_confident_and_trimmed():
     values = torch.tensor([1.0, 2.0, 6.0], requires_grad=True)
     assert losses.weighted_mean(values, torch.tensor([1.0, 0.0, 3.0])).item() == pytest.approx(19 / 4)
     nothing = losses.weighted_mean(values, torch.zeros(3))
     nothing.backward()
     assert nothing.item() == 0.0
     assert (values.grad == 0).all()
-
-
-def test_confident_mean_of_little_confidence_is_little():
     values = torch.tensor([[1.0, 2.0], [4.0, 8.0]])
     assert losses.confident_mean(values, torch.tensor([[1.0, 0.0], [0.5, 0.0]])).item() == pytest.approx(3.0 / 4)
     assert losses.confident_mean(values, torch.ones(2, 2)).item() == values.mean().item()
-
-
-def test_trimmed_mean_leaves_the_largest_out():
     values = torch.tensor([5.0, 1.0, 2.0, 100.0, 3.0])
     assert float(losses.trimmed_mean(values, 0.8)) == pytest.approx((1 + 2 + 3 + 5) / 4)
     assert float(losses.trimmed_mean(values, 1.0)) == pytest.approx(111 / 5)
     assert float(losses.trimmed_mean(values[:0], 0.95)) == 0.0
 
 
-def test_sparse_depth_reads_the_right_pixels():
+def test_depth_losses_at_known_values():
     depth = torch.arange(1.0, 13.0, dtype=torch.float64).view(1, 3, 4)
     places = torch.tensor([1 * 4 + 2, 2 * 4 + 3])
     loss = losses.sparse_depth(depth, places, torch.tensor([7.0, 10.0]).double(), keep=1.0)
     assert float(loss) == pytest.approx((0 / 7 + 2 / 10) / 2)
-
-
-def test_dense_depth_is_the_log_ratio_far_from_zero_and_symmetric():
     two = torch.full((1, 1, 1), 20.0, dtype=torch.float64)
     forty = 2 * two
     expected = math.log(2) - 0.05  # Huber: delta * (|x| - delta / 2), divided by delta = 0.1
@@ -112,16 +100,13 @@ def test_dense_depth_is_the_log_ratio_far_from_zero_and_symmetric():
     assert float(losses.dense_depth_map(two, two)) == 0.0
 
 
-def test_sky_loss_known_values_and_bounds():
+def test_sky_semantics_and_objects_at_known_values():
     alpha = torch.tensor([[[0.25, 0.25, 1.0, 0.0]]], dtype=torch.float64)
     sky = torch.tensor([[[True, False, True, False]]])
     values = losses.sky_map(alpha, sky)[0, 0]
     assert values[0] == pytest.approx(-math.log(0.75))
     assert values[1] == pytest.approx(-math.log(0.25))
     assert values[2:].tolist() == pytest.approx([-math.log(1e-3)] * 2)
-
-
-def test_semantics_ignore_unlabelled_pixels():
     logits = torch.zeros(4, 1, 2, dtype=torch.float64)
     logits[2, 0, 0] = math.log(3)
     values = losses.semantic_map(logits, torch.tensor([[2, 255]]))
@@ -129,14 +114,8 @@ def test_semantics_ignore_unlabelled_pixels():
     assert values[0, 1] == 0.0
     with pytest.raises(InputError, match="sizes differ"):
         losses.semantic_map(logits, torch.zeros(2, 2, dtype=torch.long))
-
-
-def test_object_regulariser():
     values = losses.object_map(torch.tensor([[[0.5, 0.999, 0.5]]], dtype=torch.float64), INSIDE)[0, 0]
     assert values[[0, 2]].tolist() == pytest.approx([math.log(2)] * 2) and values[1] < 0.01
-
-
-def test_shapes_must_agree():
     with pytest.raises(InputError, match="shapes differ"):
         losses.l1_map(torch.zeros(3, 2, 2), torch.zeros(1, 2, 2))
 
@@ -160,7 +139,7 @@ def test_filter_bank_zero_for_equal_images_and_gradient():
     check_gradient(lambda p: losses.feature_distance(bank(p), target, weight), x)
 
 
-def test_slopes_are_those_of_a_convolution():
+def test_feature_distance_and_slopes_are_those_of_plain_formulas():
     smooth, slope = torch.tensor([1.0, 2, 1]).double() / 4, torch.tensor([-1.0, 0, 1]).double() / 2
     kernels = torch.stack([torch.outer(smooth, slope), torch.outer(slope, smooth)])[:, None]
     plane, upstream = image(5, (1, 14, 19))[None].requires_grad_(), image(6, (2, 12, 17))[None]
@@ -168,9 +147,6 @@ def test_slopes_are_those_of_a_convolution():
     assert torch.allclose(found, wanted, atol=1e-14)
     (of_wanted,), (of_found,) = (torch.autograd.grad(out, plane, upstream) for out in (wanted, found))
     assert torch.allclose(of_found, of_wanted, atol=1e-14)
-
-
-def test_feature_distance_is_the_confident_mean_of_the_difference():
     mine, theirs = image(7, (4, 9, 11)).requires_grad_(), image(8, (4, 9, 11))
     theirs[:, 2, 3] = mine.detach()[:, 2, 3]  # no slope there
     weight = image(9, (1, 9, 11))
@@ -214,6 +190,11 @@ def test_pixel_terms_at_known_values():
     apart = losses.depth_code_error(code + 0.1, code, weight, log_per_code=2.0)
     assert float(apart) == pytest.approx(5 * float(weight.mean()) * (math.expm1(0.2) - 0.0025), rel=1e-4)
     assert float(losses.class_error(scores, torch.full_like(ids, 255), None)) == 0
+    error = torch.full((1, 3, 4, 4), 0.3, requires_grad=True)
+    log_error = torch.full((1, 1, 4, 4), -1.0, requires_grad=True)
+    losses.stated_error(log_error, error).backward()
+    assert error.grad is None or float(error.grad.abs().sum()) == 0
+    assert float(log_error.grad.sum()) != 0
 
 
 def test_latent_terms_at_known_values():
@@ -228,11 +209,3 @@ def test_latent_terms_at_known_values():
     assert float(losses.share_cross_entropy(stated, shares, None)) == pytest.approx(math.log(3) / 2, rel=1e-6)
     weighted = losses.share_cross_entropy(stated, shares, torch.tensor([2.0, 1.0, 1.0]))
     assert float(weighted) == pytest.approx(math.log(3), rel=1e-6)
-
-
-def test_the_stated_error_does_not_move_the_colour():
-    error = torch.full((1, 3, 4, 4), 0.3, requires_grad=True)
-    log_error = torch.full((1, 1, 4, 4), -1.0, requires_grad=True)
-    losses.stated_error(log_error, error).backward()
-    assert error.grad is None or float(error.grad.abs().sum()) == 0
-    assert float(log_error.grad.sum()) != 0

@@ -1,14 +1,26 @@
-"""Completion of sparse depth: exact where the answer is known, honest about where it is not."""
+"""Completion of sparse depth, and alignment of generated depth to measured depth: exact where the answer is known,
+honest about where it is not."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
+import torch
 from scipy import ndimage, sparse
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera, View
-from mudg.core.depth import CompletionRules, beyond_reach, complete_depth, conjugate_gradients, ray_elevation
+from mudg.core.depth import (
+    CompletionRules,
+    align_depth,
+    beyond_reach,
+    complete_depth,
+    conjugate_gradients,
+    fit_depth,
+    ray_elevation,
+)
 
 HEIGHT, WIDTH, FOCAL = 60, 90, 80.0
 CAMERA = Camera("c", WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
@@ -42,7 +54,7 @@ def relative_error(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.abs(found / truth - 1)
 
 
-def test_it_beats_the_nearest_measurement_by_more_than_half() -> None:
+def test_it_beats_the_nearest_measurement_and_its_error_falls_with_confidence() -> None:
     rgb, depth, sky = street()
     measured = sampled(depth)
     dense = complete_depth(rgb, measured, sky)
@@ -51,6 +63,12 @@ def test_it_beats_the_nearest_measurement_by_more_than_half() -> None:
     ours, theirs = relative_error(dense.depth, depth)[~sky].mean(), relative_error(near, depth)[~sky].mean()
     assert ours < 0.05
     assert ours < 0.5 * theirs
+    error, sure = relative_error(dense.depth, depth)[~sky], dense.confidence[~sky]
+    assert ((sure >= 0) & (sure <= 1)).all()
+    limits = np.quantile(sure, [0, 0.25, 0.5, 0.75, 1])
+    means = [error[(sure >= low) & (sure <= high)].mean() for low, high in zip(limits[:-1], limits[1:])]
+    assert means[0] > 3 * means[1]
+    assert means[1] >= means[3]
 
 
 def test_an_upright_wall_goes_on_above_the_beams() -> None:
@@ -70,39 +88,29 @@ def test_a_slanted_plane_is_found_to_a_thousandth() -> None:
     assert relative_error(dense.depth, depth)[inner].mean() < 1e-3
 
 
-def test_a_wrong_measurement_does_not_last() -> None:
+def test_a_wrong_measurement_does_not_last_and_sky_pulls_nothing() -> None:
     rgb, depth, sky = street()
     measured = sampled(depth)
     measured[51, 44] = 30.0  # on the road, where 6 m is right
     dense = complete_depth(rgb, measured, sky)
     assert abs(dense.depth[51, 45] / depth[51, 45] - 1) < 0.1
-
-
-def test_sky_is_at_its_distance_and_pulls_nothing() -> None:
-    rgb, depth, sky = street()
-    measured = sampled(depth)
-    dense = complete_depth(rgb, measured, sky, rules=CompletionRules(sky_m=77.0))
-    other = complete_depth(rgb, measured, sky)
-    assert (dense.depth[sky] == 77).all()
+    other = complete_depth(rgb, measured, sky, rules=CompletionRules(sky_m=77.0))
+    assert (other.depth[sky] == 77).all()
     assert np.array_equal(dense.depth[~sky], other.depth[~sky])
 
 
-def test_error_falls_with_confidence() -> None:
-    rgb, depth, sky = street()
-    dense = complete_depth(rgb, sampled(depth), sky)
-    error, sure = relative_error(dense.depth, depth)[~sky], dense.confidence[~sky]
-    assert ((sure >= 0) & (sure <= 1)).all()
-    limits = np.quantile(sure, [0, 0.25, 0.5, 0.75, 1])
-    means = [error[(sure >= low) & (sure <= high)].mean() for low, high in zip(limits[:-1], limits[1:])]
-    assert means[0] > 3 * means[1]
-    assert means[1] >= means[3]
-
-
-def test_nothing_measured_is_nothing_known() -> None:
+def test_nothing_measured_is_nothing_known_and_bad_input_is_named() -> None:
     rgb, depth, sky = street()
     dense = complete_depth(rgb, np.full_like(depth, np.nan), sky)
     assert np.isnan(dense.depth[~sky]).all()
     assert (dense.confidence[~sky] == 0).all()
+    with pytest.raises(InputError, match="size"):
+        complete_depth(rgb[:-1], depth, sky)
+    with pytest.raises(InputError, match="positive"):
+        complete_depth(rgb, np.where(np.isfinite(depth), -depth, np.nan).astype(np.float32), sky)
+    for wrong in ({"rounds": 0}, {"near_m": 5, "far_m": 2}):
+        with pytest.raises(UsageError):
+            CompletionRules(**wrong)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
@@ -140,6 +148,9 @@ def test_what_does_not_answer_is_far() -> None:
     assert dense.depth[20, 45] > 70
     assert dense.confidence[20, 45] < 0.5
     assert abs(dense.depth[20, 10] / 12 - 1) < 0.01
+    elevation = ray_elevation(View(CAMERA, LEVEL, 0.0))
+    assert elevation[HEIGHT // 2 - 1, WIDTH // 2] == pytest.approx(0.5 / FOCAL, rel=1e-3)
+    assert (np.diff(elevation, axis=0) < 0).all()
 
 
 def test_conjugate_gradients_solve_what_a_direct_solver_solves() -> None:
@@ -151,19 +162,53 @@ def test_conjugate_gradients_solve_what_a_direct_solver_solves() -> None:
     assert np.abs(found - np.linalg.solve(matrix.toarray().astype(np.float64), goal)).max() < 1e-4
 
 
-def test_bad_input_is_named() -> None:
-    rgb, depth, sky = street()
-    with pytest.raises(InputError, match="size"):
-        complete_depth(rgb[:-1], depth, sky)
-    with pytest.raises(InputError, match="positive"):
-        complete_depth(rgb, np.where(np.isfinite(depth), -depth, np.nan).astype(np.float32), sky)
-    with pytest.raises(UsageError):
-        CompletionRules(rounds=0)
-    with pytest.raises(UsageError):
-        CompletionRules(near_m=5, far_m=2)
+# -- alignment --------------------------------------------------------------------------------------
 
 
-def test_elevation_grows_upwards() -> None:
-    elevation = ray_elevation(View(CAMERA, LEVEL, 0.0))
-    assert elevation[HEIGHT // 2 - 1, WIDTH // 2] == pytest.approx(0.5 / FOCAL, rel=1e-3)
-    assert (np.diff(elevation, axis=0) < 0).all()
+def measured_half(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Generator]:
+    """True depth, and which pixels were measured."""
+    generator = torch.Generator().manual_seed(seed)
+    truth = 3 + 60 * torch.rand(1, 20, 30, generator=generator)
+    return truth, torch.rand(1, 20, 30, generator=generator) < 0.5, generator
+
+
+def test_scale_and_shift_are_recovered() -> None:
+    truth, valid, _ = measured_half()
+    fit = fit_depth((truth - 2.0) / 1.25, truth, valid)
+    assert fit.scale == pytest.approx(1.25, rel=1e-4)
+    assert fit.shift_m == pytest.approx(2.0, abs=1e-3)
+    assert fit.used
+    assert fit.residual < 1e-4 < fit.residual_before
+    with pytest.raises(InputError):
+        fit_depth(truth, truth[:, 1:], valid)
+
+
+def test_wrongly_painted_surfaces_do_not_pull() -> None:
+    """A fifth of the pixels lies on a surface at a wrong distance, and all carry 1 % noise."""
+    truth, valid, generator = measured_half(1)
+    painted = (truth - 1.0) / 0.9 * (1 + 0.01 * torch.randn(truth.shape, generator=generator))
+    painted[:, :4] = 70.0
+    aligned, (fit,) = align_depth(painted[None], truth[None], valid[None])
+    assert fit.scale == pytest.approx(0.9, rel=0.02)
+    assert fit.shift_m == pytest.approx(1.0, abs=0.2)
+    error = (aligned[0, :, 4:] / truth[:, 4:] - 1).abs()
+    assert float(error.mean()) < 0.015
+
+
+def test_too_little_or_nothing_to_align_to_leaves_the_frame_alone() -> None:
+    truth, valid, _ = measured_half(2)
+    few = torch.zeros_like(valid)
+    few[:, 0, :10] = True
+    for mask in (few, torch.zeros_like(valid)):
+        aligned, (fit,) = align_depth(2 * truth[None], truth[None], mask[None])
+        assert not fit.used
+        assert torch.equal(aligned[0], 2 * truth)
+    assert math.isnan(fit.residual)
+
+
+def test_a_hopeless_fit_is_not_applied() -> None:
+    """Depth that has nothing to do with the measurement: whatever is fitted must not make it worse."""
+    truth, valid, generator = measured_half(3)
+    painted = 3 + 60 * torch.rand(truth.shape, generator=generator)
+    fit = fit_depth(painted, truth, valid)
+    assert fit.residual <= fit.residual_before
