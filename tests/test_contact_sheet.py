@@ -59,8 +59,8 @@ def test_a_sheet_has_a_row_per_camera_and_a_view_from_above(tmp_path: Path) -> N
     image = sheets.contact_sheet(scene)
     assert image.size == (3 * sheets.TILE_WIDTH_PX, sheets.TILE_WIDTH_PX // 2 + sheets.TOP_HEIGHT_PX)
     top = np.array(image)[sheets.TILE_WIDTH_PX // 2 + 20 :]
-    assert (np.abs(top.astype(int) - above.VEHICLE_COLOR).max(2) < 60).any()
-    assert (np.abs(top.astype(int) - above.PATH_COLOR).max(2) < 60).any()
+    assert (np.abs(top.astype(int) - sheets.VEHICLE_COLOR).max(2) < 60).any()
+    assert (np.abs(top.astype(int) - sheets.PATH_COLOR).max(2) < 60).any()
 
 
 @pytest.mark.parametrize("lacking", ["sweeps", "tracks", "one frame"])
