@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import pandas_pickles
 import pytest
-from bad_logs import Asks
-from refusals import refused
+from refusals import Asks, refused
 
 from mudg.base import plain_pickle
 from mudg.base.errors import InputError
