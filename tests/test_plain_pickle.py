@@ -83,15 +83,6 @@ def test_frames_that_pandas_wrote(version: str) -> None:
     assert np.isnan(boxes["camera_used"][2])
 
 
-@pytest.mark.parametrize("new", [False, True])
-def test_the_writer_of_these_tests_writes_what_pandas_does(new: bool) -> None:
-    table = {"x": np.arange(3.0), "name": ["a", "b", "c"], "on": np.array([True, False, True])}
-    got = pandas_frame.parse_frame(pandas_pickles.frame_bytes(table, new=new), "x")
-    assert {name: column.tolist() for name, column in got.items()} == {
-        name: list(np.asarray(column).tolist()) for name, column in table.items()
-    }
-
-
 @pytest.mark.parametrize("protocol", range(6))
 def test_a_pickle_that_asks_for_a_command_is_refused_by_name(
     protocol: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -424,9 +424,10 @@ def test_shares_of_modalities_and_missing_context(model):
         encoded.planes.expand(4000, -1, -1, -1, -1), encoded.features.expand(4000, -1, -1), encoded.grey, encoded.seen
     )
     small = {m: z[:, :1, :1, :1, :1].expand(4000, -1, -1, -1, -1) for m, z in truth.items()}
-    with watched(model) as seen, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(model, "image_tokens", torch.nn.Identity())
+    tower, model.image_tokens = model.image_tokens, torch.nn.Identity()
+    with watched(model) as seen:
         model.velocity_loss(small, many, torch.Generator().manual_seed(0))
+    model.image_tokens = tower
     share = lambda flags: float(torch.tensor(flags).float().mean())
     for name, wanted in (("rgb", 0.5), ("semantics", 0.25), ("depth", 0.25)):
         assert share([n == name for n in seen["names"]]) == pytest.approx(wanted, abs=0.03)

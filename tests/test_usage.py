@@ -146,16 +146,6 @@ def test_where_no_shares_are_told_resident_sizes_add_up(monkeypatch: pytest.Monk
     assert usage.held_bytes(sizes) == sum(size.all_bytes for size in sizes.values())
 
 
-@needs_proc
-def test_shares_are_asked_for_only_where_a_new_peak_is_possible(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked, held_bytes = [], usage.held_bytes
-    meter = Meter()
-    meter.seen(1 << 50)
-    monkeypatch.setattr(usage, "held_bytes", lambda *given: asked.append(1) or held_bytes(*given))
-    time.sleep(3 * usage.PERIOD_S)
-    assert meter.stop().peak_bytes == 1 << 50 and not asked
-
-
 FREEING = """
 import numpy as np
 from mudg.base import memory
@@ -177,15 +167,6 @@ def test_freed_memory_is_given_back() -> None:
     full, freed, left = map(int, said.split())
     assert freed > full - (20 << 20), "the C library keeps what was freed"
     assert left < full - (80 << 20)
-
-
-def test_the_thread_ends_with_the_last_meter() -> None:
-    meter = Meter()
-    assert usage._SAMPLER._thread is not None
-    meter.stop()
-    usage._SAMPLER._meters.clear()  # of run folders that other tests left open
-    time.sleep(3 * usage.PERIOD_S)
-    assert usage._SAMPLER._thread is None
 
 
 def test_sizes_are_those_of_a_folder_or_of_one_file(tmp_path: Path) -> None:
