@@ -81,16 +81,6 @@ def importer(kind: str, **usual: Any) -> Callable[..., Scene]:
     return lambda source, out, **options: IMPORTERS[kind](source, out, ImportOptions(**{**usual, **options}))
 
 
-class Asks:
-    """Pickles as a call of ``function``."""
-
-    def __init__(self, function: Any, *arguments: Any) -> None:
-        self.call = (function, arguments)
-
-    def __reduce__(self) -> Any:
-        return self.call
-
-
 @functools.cache
 def city(folder: Path) -> Scene:
     """Three moments of the small city."""

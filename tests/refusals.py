@@ -1,4 +1,4 @@
-"""Calls that must end in an error of this program."""
+"""Calls that must end in an error of this program, and pickles that ask for one."""
 
 from __future__ import annotations
 
@@ -15,3 +15,13 @@ def refused(words: str, call: Callable[..., object], *args: Any, raises: type = 
     with pytest.raises(raises, match=words) as caught:
         call(*args, **options)
     return caught.value
+
+
+class Asks:
+    """Pickles as a call of ``function``."""
+
+    def __init__(self, function: Callable[..., object], *arguments: Any) -> None:
+        self.call = (function, arguments)
+
+    def __reduce__(self) -> Any:
+        return self.call

@@ -1,5 +1,6 @@
-"""The diffusion model: shapes, invariances, determinism, what is copied and what is refused."""
+"""The diffusion model, its codec and its refiner: shapes, invariances, what is copied and what is refused."""
 
+import math
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -7,15 +8,16 @@ import pytest
 import torch
 from refusals import refused
 
-from mudg.base.errors import InputError, IntegrityError, UsageError
+from mudg.base.errors import IntegrityError, UsageError
 from mudg.base.types import Camera, Clip, Condition, View
 from mudg.core import noise
 from mudg.diffusion import model as mdm
 from mudg.diffusion import model_files, models, network, requests
 from mudg.diffusion.model import MDM, BatchPart, LossSettings, MDMConfig
+from mudg.diffusion.network import ConditionPixels, Refiner
 from mudg.diffusion.requests import SampleRequest
 from mudg.networks import codec
-from mudg.networks.codec import CodecConfig
+from mudg.networks.codec import CodecConfig, PatchCodec, code_to_depth, depth_to_code, semantic_shares
 
 TINY = MDMConfig(
     widths=(16, 24),
@@ -61,6 +63,12 @@ def some_ids(generator, frames, height, width):
 def learn_part(model):
     """Parameters that training changes after the codec."""
     return [p for n, p in model.named_parameters() if not n.startswith("codec.")]
+
+
+def some_latents(model, count=1, seed=1):
+    """Noise in place of the latents of three frames."""
+    generator = torch.Generator().manual_seed(seed)
+    return {m: torch.randn(count, 3, c, 8, 12, generator=generator) for m, c in model.codec.channels.items()}
 
 
 def randomised(config, seed=0):
@@ -118,11 +126,7 @@ def test_untrained_model_copies_the_condition_where_it_is_seen():
     everything = torch.ones_like(condition.valid)
     condition = replace(condition, valid=everything, warped=everything)
     encoded = model.encode_condition(condition)
-    x = {
-        m: torch.randn(1, 3, c, 8, 12, generator=torch.Generator().manual_seed(1))
-        for m, c in model.codec.channels.items()
-    }
-    stated, _ = model.predict(x, encoded, torch.tensor([999]))
+    stated, _ = model.predict(some_latents(model), encoded, torch.tensor([999]))
     gate = torch.sigmoid(torch.tensor(mdm.COPY_BIAS))
     assert torch.allclose(stated["depth"], gate * encoded.copy["depth"], atol=1e-5)
     assert torch.allclose(stated["rgb"], gate * encoded.copy["rgb"] + (1 - gate) * encoded.backdrop, atol=1e-5)
@@ -131,8 +135,7 @@ def test_untrained_model_copies_the_condition_where_it_is_seen():
 def test_class_scores_are_shares():
     model = randomised(TINY)
     encoded = model.encode_condition(some_condition())
-    x = {m: torch.randn(1, 3, c, 8, 12) for m, c in model.codec.channels.items()}
-    _, log_shares = model.predict(x, encoded, torch.tensor([500]))
+    _, log_shares = model.predict(some_latents(model), encoded, torch.tensor([500]))
     assert torch.allclose(log_shares.exp().sum(2), torch.ones(1, 3, 8, 12), atol=1e-5)
 
 
@@ -150,10 +153,7 @@ def test_frames_and_clips_do_not_leak_across_the_batch():
     model = randomised(TINY)
     encoded = [model.encode_condition(some_condition(seed=s)) for s in (0, 1)]
     both = model.encode_condition([some_condition(seed=0), some_condition(seed=1)])
-    x = {
-        m: torch.randn(2, 3, c, 8, 12, generator=torch.Generator().manual_seed(2))
-        for m, c in model.codec.channels.items()
-    }
+    x = some_latents(model, 2)
     together, _ = model.predict(x, both, torch.tensor([100, 700]))
     with torch.no_grad():
         for i, t in enumerate((100, 700)):
@@ -294,23 +294,19 @@ def test_damaged_and_foreign_models_are_refused(tmp_path):
 
 
 def test_configuration_is_strict():
+    """What the shipped models say of fields that were taken out is accepted, every other value of these is not."""
     values = asdict(TINY)
     assert model_files.config_from_dict(values) == TINY
     refused("patches", model_files.config_from_dict, {**values, "patches": 3})
     for change in ({"blocks": (1,)}, {"widths": (16, 20)}):
-        with pytest.raises(UsageError):
-            replace(TINY, **change)
-
-
-def test_models_of_variants_that_were_taken_out_are_refused_in_words():
-    """What the shipped models say of themselves is accepted, every other value of a former field is not."""
+        refused(".", replace, TINY, raises=UsageError, **change)
     former = model_files.FORMER_FIELDS
-    values = {**asdict(TINY), **former["top"], "codec": {**asdict(TINY.codec), **former["codec"]}}
+    values = {**values, **former["top"], "codec": {**values["codec"], **former["codec"]}}
     assert model_files.config_from_dict(values) == TINY
     for name in former["top"]:
         refused(f"no longer has[^$]*{name}", model_files.config_from_dict, {**values, name: "other"})
-    with pytest.raises(InputError, match="no longer has[^$]*semantics_code"):
-        model_files.config_from_dict({**values, "codec": {**values["codec"], "semantics_code": "palette"}})
+    palette = {**values["codec"], "semantics_code": "palette"}
+    refused("no longer has[^$]*semantics_code", model_files.config_from_dict, {**values, "codec": palette})
 
 
 def test_wrong_requests_are_refused():
@@ -330,3 +326,170 @@ def test_image_size_keeps_aspect_and_area():
     assert abs(width * height / area - 1) < 0.3
     assert requests.sized_to_width(100, 480 / 320, 16) == (96, 64)
     assert MDM(TINY).image_size(480, 320) == (192, 128)
+
+
+# ---- the latent codec ----------------------------------------------------------------------------
+
+
+def smooth_images(count=6, height=16, width=24, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    coarse = torch.rand(count, 3, 3, 4, generator=generator)
+    return torch.nn.functional.interpolate(coarse, (height, width), mode="bicubic").clamp(0, 1)
+
+
+@pytest.mark.parametrize(("depth_m", "code"), [(2.0, -1.0), (math.sqrt(2.0 * 100.0), 0.0), (100.0, 1.0), (1e9, 1.0)])
+def test_depth_code_and_its_inverse(depth_m, code):
+    assert float(depth_to_code(torch.tensor(depth_m), CodecConfig())) == pytest.approx(code, abs=1e-6)
+    depth = torch.tensor([2.0, 3.0, 10.0, 55.5, 100.0])
+    assert torch.allclose(code_to_depth(depth_to_code(depth, CodecConfig()), CodecConfig()), depth, rtol=1e-5)
+
+
+def decoded(codec, **given):
+    """Pixels of some modalities' latents; the others are zeros."""
+    some = next(iter(given.values()))
+    zeros = {m: some.new_zeros(*some.shape[:-3], c, *some.shape[-2:]) for m, c in codec.channels.items()}
+    return codec.decode({**zeros, **given})
+
+
+def test_depth_survives_the_codec_exactly():
+    codec = PatchCodec(CodecConfig()).eval()
+    depth = 2.0 + 90 * torch.rand(3, 1, 16, 24, generator=torch.Generator().manual_seed(0))
+    codec.fit_depth(depth)
+    with torch.no_grad():
+        back = decoded(codec, depth=codec.encode_depth(depth)).depth
+    assert torch.allclose(back, depth, rtol=1e-4)
+
+
+def test_colour_basis_keeps_smooth_images_and_whitens():
+    codec = PatchCodec(CodecConfig()).eval()
+    images = smooth_images(40)
+    codec.fit_color(images)
+    z = codec.encode_rgb(images)
+    assert z.shape == (40, 4, 8, 12)
+    deviation = z.std((0, 2, 3))
+    assert float(deviation[0]) == pytest.approx(1.0, abs=0.02)
+    assert float(deviation[2]) == pytest.approx(1 / 1.5, abs=0.02)
+    with torch.no_grad():
+        back = decoded(codec, rgb=z).rgb
+    assert float((back - images).square().mean()) < 2e-3
+
+
+def test_colour_latent_is_blind_to_nothing_constant():
+    codec = PatchCodec(CodecConfig()).eval()
+    codec.fit_color(smooth_images(40))
+    flat = torch.tensor([0.2, 0.5, 0.8]).view(1, 3, 1, 1).expand(1, 3, 16, 24)
+    with torch.no_grad():
+        back = decoded(codec, rgb=codec.encode_rgb(flat)).rgb
+    assert float((back - flat).abs().max()) < 0.05
+
+
+def test_shares_count_labelled_pixels_only():
+    ids = torch.tensor([[0, 0, 10, 255], [0, 13, 255, 255]])
+    shares = semantic_shares(ids)
+    assert shares.shape == (19, 1, 2) and float(shares[0, 0, 0]) == pytest.approx(0.75)
+    assert float(shares[13, 0, 0]) == pytest.approx(0.25) and float(shares[10, 0, 1]) == 1.0
+    assert float(semantic_shares(torch.full((2, 2), 255)).sum()) == 0.0
+
+
+def test_uniform_classes_survive():
+    codec = PatchCodec(CodecConfig()).eval()
+    for label in range(19):
+        ids = torch.full((1, 4, 4), label)
+        with torch.no_grad():
+            made = decoded(codec, semantics=codec.encode_semantics(ids))
+        assert torch.equal(made.semantics, ids)
+
+
+@pytest.mark.parametrize("axes", [(), (2, 3)])
+def test_leading_axes_are_kept(axes):
+    codec = PatchCodec(CodecConfig()).eval()
+    rgb, depth, ids = torch.rand(*axes, 3, 8, 8), torch.full((*axes, 1, 8, 8), 9.0), torch.zeros(*axes, 8, 8).long()
+    with torch.no_grad():
+        made = codec.decode(
+            {"rgb": codec.encode_rgb(rgb), "depth": codec.encode_depth(depth), "semantics": codec.encode_semantics(ids)}
+        )
+    assert made.rgb.shape == rgb.shape and made.depth.shape == depth.shape and made.semantics.shape == ids.shape
+
+
+def test_an_empty_depth_range_is_refused():
+    refused(".", CodecConfig, near_m=5.0, far_m=5.0, raises=UsageError)
+
+
+# ---- the refiner: what is copied, shapes ---------------------------------------------------------
+
+
+def some(count=4, height=16, width=24, seed=0):
+    """A codec, a refiner whose last layer is untouched, latents and a condition of random pixels."""
+    generator = torch.Generator().manual_seed(seed)
+    codec = PatchCodec(CodecConfig(decoder_width=8, decoder_blocks=1))
+    refiner = Refiner(sum(codec.channels.values()), (16, 24), (1, 1))
+    latents = {
+        m: torch.randn(count, c, height // 2, width // 2, generator=generator) for m, c in codec.channels.items()
+    }
+    image = lambda c: torch.rand(count, c, height, width, generator=generator) * 2 - 1
+    ids = lambda: torch.randint(0, 19, (count, 1, height, width), generator=generator, dtype=torch.uint8)
+    given = ConditionPixels(image(3), image(3), image(1), image(1) > 0, image(1) > 0, ids(), ids())
+    return codec, refiner, latents, given
+
+
+def test_open_gates_hand_the_condition_through():
+    codec, refiner, latents, given = some()
+    with torch.no_grad():
+        starts = refiner.leave.bias.split(Refiner.SIZES)
+        for number in (1, 4, 6):  # colour, depth and classes of the condition
+            starts[number].fill_(30.0)
+        made = refiner(codec, latents, given, 4)
+        _, _, base = codec.decode_raw(latents)
+    assert torch.allclose(made.depth_code, given.depth_code, atol=1e-5)
+    assert torch.allclose(
+        made.rgb, given.color + torch.sigmoid(torch.tensor(-4.0)) * (given.backdrop - given.color), atol=1e-5
+    )
+    shown = given.ids.squeeze(1).long()
+    gained = (made.scores - base).gather(1, shown.unsqueeze(1))
+    assert float(gained.min()) > network.COPY_SCORE - 0.01
+
+
+def test_shut_gates_leave_what_the_codec_makes():
+    codec, refiner, latents, given = some()
+    with torch.no_grad():
+        starts = refiner.leave.bias.split(Refiner.SIZES)
+        for number in (1, 2, 4, 6, 7):
+            starts[number].fill_(-30.0)
+        made = refiner(codec, latents, given, 4)
+    for stated, base in zip((made.rgb, made.depth_code, made.scores), codec.decode_raw(latents)):
+        assert torch.allclose(stated, base, atol=1e-5)
+
+
+def test_shares_of_known_classes():
+    ids = torch.tensor([[3, 3, 255, 255], [3, 7, 255, 1]], dtype=torch.uint8).view(1, 1, 2, 4)
+    share = network.shares(ids)
+    assert share.shape == (1, 19, 1, 2)
+    assert share[0, 3, 0].tolist() == [0.75, 0.0]
+    assert share[0, 7, 0].tolist() == [0.25, 0.0]
+    assert share[0, 1, 0].tolist() == [0.0, 0.25]
+    assert float(share.sum()) == pytest.approx(1.25)
+
+
+def test_a_crop_is_refined_as_in_the_whole_image_away_from_its_border():
+    """Training on a rectangle teaches what inference on the whole image does: the receptive field is local."""
+    codec, refiner, latents, given = some(2, 48, 48)
+    with torch.no_grad():
+        refiner.leave.weight.normal_(0, 0.05, generator=torch.Generator().manual_seed(1))
+        whole = refiner(codec, latents, given, 2)
+        cells, pixels = slice(4, 24), slice(8, 48)
+        part = refiner(codec, {m: z[..., cells, cells] for m, z in latents.items()}, given.crop(pixels, pixels), 2)
+    assert torch.allclose(part.rgb[..., 14:40, 14:40], whole.rgb[..., 22:48, 22:48], atol=1e-4)
+    assert not torch.allclose(part.rgb[..., :4, :4], whole.rgb[..., 8:12, 8:12], atol=1e-4)
+
+
+def test_class_weights_are_taken_back():
+    codec, refiner, latents, given = some()
+    weights = torch.linspace(0.5, 3.0, 19)
+    with torch.no_grad():
+        before = refiner(codec, latents, given, 4)
+        refiner.take_back(weights)
+        after = refiner(codec, latents, given, 4)
+    lost = before.scores - after.scores
+    assert torch.allclose(lost, weights.log().view(1, -1, 1, 1).expand_as(lost), atol=1e-5)
+    assert torch.equal(before.rgb, after.rgb)
+    assert torch.equal(before.depth_code, after.depth_code)

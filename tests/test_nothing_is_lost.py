@@ -87,6 +87,18 @@ def _film(g: Given, v: int) -> Any:
     return partial(chain.Film, views=views, paths=_paths(g["scene"], 1))
 
 
+def _render(g: Given, v: int) -> Any:
+    return partial(RenderViews, scene=g["scene"], model=g["fitted"], settings=RenderConfig(shifts_m=(0.0, v)))
+
+
+def _fill(g: Given, v: int) -> Any:
+    return partial(chain.FillViews, scene=g["scene"], fused=g["fused"], paths=_paths(g["scene"], v))
+
+
+def _exact(g: Given, v: int) -> Any:
+    return partial(chain.ExactViews, truth=g["views"], paths=_paths(g["scene"], 1)[: 3 - v])
+
+
 def _paths(scene: Path, v: int) -> tuple[Any, ...]:
     loaded = read_scene(scene)
     return trajectory.recorded(loaded, "front"), trajectory.shifted(loaded, "front", float(v))
@@ -100,23 +112,12 @@ STEPS: dict[str, tuple[tuple[str, ...], Callable[[Given, int], Any]]] = {
     "learn": (("clips",), lambda g, v: partial(Learn, settings=tiny(g["clips"], seed=v))),
     "synthesize": (("scene", "fused", "model", "fitted"), _synthesize),
     "fit": (("scene", "fused", "views"), _fit),
-    "render": (
-        ("scene", "fitted"),
-        lambda g, v: partial(
-            RenderViews, scene=g["scene"], model=g["fitted"], settings=RenderConfig(shifts_m=(0.0, v))
-        ),
-    ),
+    "render": (("scene", "fitted"), _render),
     "score": (("scene", "views", "fused"), _score),
     "truth": (("city",), lambda g, v: partial(DrawTruth, scene=g["city"], trajectories=_paths(g["city"], v))),
     "film": (("views",), _film),
-    "fill": (
-        ("scene", "fused"),
-        lambda g, v: partial(chain.FillViews, scene=g["scene"], fused=g["fused"], paths=_paths(g["scene"], v)),
-    ),
-    "exact": (
-        ("views",),
-        lambda g, v: partial(chain.ExactViews, truth=g["views"], paths=_paths(g["scene"], 1)[: 3 - v]),
-    ),
+    "fill": (("scene", "fused"), _fill),
+    "exact": (("views",), _exact),
 }
 """Verb -> its inputs by name, and the step from these in variants 1 and 2, which differ in the settings."""
 VERBS: Final = {**{name: inputs for name, (inputs, _) in STEPS.items()}, "bench": ("model",)}
@@ -189,10 +190,9 @@ def test_an_output_that_touches_an_input_is_refused(name: str, world: Given, tmp
         places = [path, path.parent, through_link, path.parent / "x" / ".." / path.name, tmp_path / "in"]
         places += [path / "inside", through_link / "deep" / "inside"] if path.is_dir() else []
         for out, overwrite in zip((path, *places), itertools.cycle((False, True))):
-            with pytest.raises(UsageError, match="an input") as refused:
-                call(name, given, out, 1, overwrite)
-            assert str(out) in refused.value.where
-            assert str(path) in refused.value.got or out == tmp_path / "in"
+            error = refused("an input", call, name, given, out, 1, overwrite, raises=UsageError)
+            assert str(out) in error.where
+            assert str(path) in error.got or out == tmp_path / "in"
     assert tree(tmp_path) == before
 
 
@@ -200,33 +200,39 @@ def test_files_of_a_log_that_lie_beside_it_count(world: Given, tmp_path: Path) -
     shutil.copytree(world["log"].parent, tmp_path / "day")
     drive, calibration = tmp_path / "day" / world["log"].name, tmp_path / "day" / "calib_cam_to_cam.txt"
     assert calibration.is_file()
-    with pytest.raises(UsageError, match="is also an input"):
-        Ingest(log=drive, out=calibration, overwrite=True, settings=IngestConfig()).run()
+    step = Ingest(log=drive, out=calibration, overwrite=True, settings=IngestConfig())
+    refused("is also an input", step.run, raises=UsageError)
 
 
 def test_clips_of_a_training_lie_in_its_folder_only_where_they_do_by_default(world: Given, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(world["clips"], out / "clips")
     for clips in (out, out / "steps", tmp_path, out / "clips" / "deep"):
-        with pytest.raises(UsageError, match="an input"):
-            Learn(out=out, settings=tiny(clips)).run()
+        refused("an input", Learn(out=out, settings=tiny(clips)).run, raises=UsageError)
     refused("an input", Learn(out=out, overwrite=True, settings=tiny(out / "clips")).run, raises=UsageError)
-    with pytest.raises(UsageError, match="something else"):  # they are not from here
-        Learn(out=out, settings=tiny(out / "clips")).run()
+    refused("something else", Learn(out=out, settings=tiny(out / "clips")).run, raises=UsageError)  # not from here
     assert len(tree(out)) == len(tree(world["clips"]))
 
 
+def chain_refused(
+    words: str, source: Path | str, out: Path, overwrite: bool, settings: RunConfig | None = None
+) -> None:
+    step = Run(source=source, out=out, overwrite=overwrite, settings=settings or RunConfig())
+    refused(words, step.run, raises=UsageError)
+
+
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_the_chain_never_writes_into_its_log(world: Given, tmp_path: Path, overwrite: bool) -> None:
-    given = copied(world, ("log", "scene"), tmp_path)
+def test_the_chain_never_writes_into_its_log_or_the_folder_of_a_verb(
+    world: Given, tmp_path: Path, overwrite: bool
+) -> None:
+    given = copied(world, ("log", "scene", "fused"), tmp_path)
     before = tree(tmp_path)
+    chain_refused("do not belong to this run", "city", given.pop("fused"), overwrite)
     for path in given.values():
         for out in (path, path.parent, path / "out"):
-            with pytest.raises(UsageError, match="an input"):
-                Run(source=str(path), out=out, overwrite=overwrite, settings=RunConfig()).run()
+            chain_refused("an input", str(path), out, overwrite)
     config = dataclasses.replace(RunConfig(), synthesize=SynthesizeConfig(model=str(given["scene"])))
-    with pytest.raises(UsageError, match=r"synthesize\.model"):
-        Run(source="city", out=given["scene"].parent, overwrite=overwrite, settings=config).run()
+    chain_refused(r"synthesize\.model", "city", given["scene"].parent, overwrite, config)
     assert tree(tmp_path) == before
 
 
@@ -250,19 +256,8 @@ def test_the_chain_takes_the_scene_in_its_own_folder_and_leaves_it_alone(
     assert before.items() <= tree(out).items()
     (out / "run.json").unlink()
     (out / "mine.md").write_text("mine")
-    with pytest.raises(UsageError, match="do not belong to this run"):
-        Run(source=out / "scene", out=out, overwrite=True, settings=RunConfig()).run()
-    with pytest.raises(UsageError, match="an input"):
-        Run(source=out / "scene", out=out / "scene", overwrite=True, settings=RunConfig()).run()
-
-
-def test_the_chain_does_not_take_the_folder_of_a_verb_for_its_own(world: Given, tmp_path: Path) -> None:
-    folder = copied(world, ("fused",), tmp_path)["fused"]
-    before = tree(tmp_path)
-    for overwrite in (False, True):
-        with pytest.raises(UsageError, match="do not belong to this run"):
-            Run(source="city", out=folder, overwrite=overwrite, settings=RunConfig()).run()
-    assert tree(tmp_path) == before
+    chain_refused("do not belong to this run", out / "scene", out, True)
+    chain_refused("an input", out / "scene", out / "scene", True)
 
 
 def test_the_comparison_of_methods_leaves_other_folders_alone(tmp_path: Path) -> None:
@@ -270,8 +265,7 @@ def test_the_comparison_of_methods_leaves_other_folders_alone(tmp_path: Path) ->
         folder = tmp_path / name.partition(".")[2]
         folder.mkdir()
         (folder / name).write_text("{}")
-        with pytest.raises(UsageError, match="do not belong to this run"):
-            bench.run("shift", BenchConfig(), folder, overwrite=True)
+        refused("do not belong", bench.run, "shift", BenchConfig(), folder, overwrite=True, raises=UsageError)
         assert (folder / name).read_text() == "{}"
 
 
@@ -363,8 +357,8 @@ def test_a_failed_import_over_another_scene_leaves_that(world: Given, tmp_path: 
     out = Ingest(log=world["log"], out=tmp_path / "out", settings=IngestConfig(test_every=2, contact_sheet=False)).run()
     before = tree(out)
     settings = IngestConfig(cameras=("frnt",), contact_sheet=False)
-    with pytest.raises(UsageError, match="no such camera"):
-        Ingest(log=world["log"], out=out, overwrite=True, settings=settings).run()
+    step = Ingest(log=world["log"], out=out, overwrite=True, settings=settings)
+    refused("no such camera", step.run, raises=UsageError)
     assert tree(tmp_path / "out") == before
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
@@ -398,13 +392,12 @@ def test_a_model_is_replaced_by_a_whole_one_and_other_files_stay(
     to = converted("float32", overwrite=False)
     (to / "mine.md").write_text("mine")
     before = tree(to)
+    convert_to = partial(Convert, checkpoint=tmp_path / "512.ckpt", overwrite=True, settings=ConvertConfig())
     for out in (tmp_path, tmp_path / "512.ckpt"):
-        with pytest.raises(UsageError, match="an input"):
-            Convert(checkpoint=tmp_path / "512.ckpt", to=out, overwrite=True, settings=ConvertConfig()).run()
+        refused("an input", convert_to(to=out).run, raises=UsageError)
     (tmp_path / "fit").mkdir()
     store.write_json(tmp_path / "fit" / "model.json", {"schema": 1, "nodes": []})
-    with pytest.raises(UsageError, match="do not belong to a model"):
-        Convert(checkpoint=tmp_path / "512.ckpt", to=tmp_path / "fit", overwrite=True, settings=ConvertConfig()).run()
+    refused("do not belong to a model", convert_to(to=tmp_path / "fit").run, raises=UsageError)
     with counted_writes(monkeypatch, stop_at=2), pytest.raises(KeyboardInterrupt):
         converted("float16", overwrite=True)
     assert tree(to) == before

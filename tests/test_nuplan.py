@@ -17,7 +17,7 @@ import pytest
 import roundtrip
 import write_nuplan as made
 from PIL import Image
-from refusals import refused
+from refusals import Asks, refused
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Scene
@@ -142,7 +142,7 @@ def test_calibration_may_be_lists_arrays_or_the_data_sets_own_list_classes(sourc
 @pytest.mark.parametrize("column", ["translation", "rotation", "intrinsic", "distortion"])
 def test_a_calibration_that_asks_for_a_command_runs_nothing(source: Path, tmp_path: Path, column: str) -> None:
     bait = tmp_path / "ran"
-    change(source, f"UPDATE camera SET {column} = ?", pickle.dumps([bad_logs.Asks(os.system, f"touch {bait}")]))
+    change(source, f"UPDATE camera SET {column} = ?", pickle.dumps([Asks(os.system, f"touch {bait}")]))
     assert column in refused(r"asks for '(posix|nt)\.system'", ingest, source, tmp_path / "out").where
     assert not bait.exists()
 

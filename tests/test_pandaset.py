@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import roundtrip
 from pandas_pickles import write_frame
-from refusals import refused
+from refusals import Asks, refused
 from write_pandaset import CAMERA_OF, EPOCH_S, cuboids, write_pandaset
 
 from mudg.base.errors import UsageError
@@ -254,7 +254,7 @@ def test_boxes_and_path_reach_the_images_taken_before_the_end_of_the_first_turn(
 @pytest.mark.parametrize("name", ["lidar/02.pkl.gz", "annotations/cuboids/02.pkl.gz"])
 def test_a_pickle_that_asks_for_a_command_runs_nothing(source: Path, tmp_path: Path, name: str) -> None:
     bait = tmp_path / "ran"
-    (source / name).write_bytes(gzip.compress(pickle.dumps({"x": bad_logs.Asks(os.system, f"touch {bait}")})))
+    (source / name).write_bytes(gzip.compress(pickle.dumps({"x": Asks(os.system, f"touch {bait}")})))
     assert name in refused(r"asks for '(posix|nt)\.system'", ingest, source, tmp_path / "out").where
     assert not bait.exists()
     assert not (tmp_path / "out").exists()

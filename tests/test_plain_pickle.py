@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import pandas_pickles
 import pytest
-from bad_logs import Asks
-from refusals import refused
+from refusals import Asks, refused
 
 from mudg.base import plain_pickle
 from mudg.base.errors import InputError
@@ -82,15 +81,6 @@ def test_frames_that_pandas_wrote(version: str) -> None:
     assert boxes["dimensions.y"].tolist() == [4.5, 0.8, 12.0]
     assert boxes["attributes.object_motion"].tolist() == ["Moving", None, "Moving"]
     assert np.isnan(boxes["camera_used"][2])
-
-
-@pytest.mark.parametrize("new", [False, True])
-def test_the_writer_of_these_tests_writes_what_pandas_does(new: bool) -> None:
-    table = {"x": np.arange(3.0), "name": ["a", "b", "c"], "on": np.array([True, False, True])}
-    got = pandas_frame.parse_frame(pandas_pickles.frame_bytes(table, new=new), "x")
-    assert {name: column.tolist() for name, column in got.items()} == {
-        name: list(np.asarray(column).tolist()) for name, column in table.items()
-    }
 
 
 @pytest.mark.parametrize("protocol", range(6))

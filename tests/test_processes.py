@@ -181,15 +181,18 @@ def stopped_command(
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX systems")
 @pytest.mark.parametrize(
-    ("number", "group", "code"),
+    ("number", "group", "code", "calling"),
     [
-        (signal.SIGTERM, False, 143),
-        pytest.param(signal.SIGINT, False, 130, marks=pytest.mark.slow),
-        (signal.SIGINT, True, 130),
+        (signal.SIGTERM, False, 143, IN_TURN),
+        pytest.param(signal.SIGINT, False, 130, IN_TURN, marks=pytest.mark.slow),
+        (signal.SIGINT, True, 130, IN_TURN),
+        (signal.SIGTERM, False, 143, BESIDE),
     ],
 )
-def test_a_command_that_is_stopped_stops_its_workers(tmp_path: Path, number: int, group: bool, code: int) -> None:
-    got, said, workers = stopped_command(tmp_path, number, group=group)
+def test_a_command_that_is_stopped_stops_its_workers(
+    tmp_path: Path, number: int, group: bool, code: int, calling: str
+) -> None:
+    got, said, workers = stopped_command(tmp_path, number, group=group, calling=calling)
     assert got == code, said
     assert "Repeat the same command to resume" in said and "Traceback" not in said
     assert (tmp_path / "0steps" / "checkpoint").exists() and (tmp_path / "1cleanup" / "tidy").exists()
@@ -203,15 +206,6 @@ def test_a_command_that_is_stopped_after_an_error_stops_its_workers(tmp_path: Pa
     got, said, workers = stopped_command(tmp_path, signal.SIGTERM, group=False, first="fails", after_s=2.0)
     assert got == 143, said
     assert (tmp_path / "1cleanup" / "tidy").exists() and not any(process_alive(worker) for worker in workers)
-
-
-@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX systems")
-def test_a_command_that_is_stopped_stops_the_calls_beside_it(tmp_path: Path) -> None:
-    got, said, workers = stopped_command(tmp_path, signal.SIGTERM, group=False, calling=BESIDE)
-    assert got == 143, said
-    assert (tmp_path / "0steps" / "checkpoint").exists() and (tmp_path / "1cleanup" / "tidy").exists()
-    assert not list(tmp_path.glob("*never/started")), "a call began after the command was stopped"
-    assert not any(process_alive(worker) for worker in workers)
 
 
 def note(folder: Path, seconds: float, fails: bool) -> None:

@@ -14,9 +14,9 @@ from mudg.base.types import Camera, FusedCloud, PointCloud, View
 from mudg.core import project
 from mudg.core.project import ProjectConfig, project_cloud, project_points
 
+needs_native = pytest.mark.skipif(native.library() is None, reason=native.status())
 CAMERA = Camera("front", 96, 64, 70.0, 71.0, 47.3, 31.1)
 VIEW = View(CAMERA, geometry.invert(geometry.CAM_FROM_EGO_AXES), 0.0)
-FACING = geometry.invert(geometry.CAM_FROM_EGO_AXES)
 
 
 def _cloud(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -40,18 +40,16 @@ def test_every_seen_point_lands_on_its_projected_pixel_and_nothing_nearer_was_lo
     both = valid & np.isfinite(nearest)
     assert (np.abs(got.depth[0].numpy()[both] - nearest[both]) < 1e-3).mean() > 0.999
     index = got.index.numpy()
-    np.testing.assert_array_equal(
-        (got.color.permute(1, 2, 0).numpy()[valid] * 255).round().astype(np.uint8), rgb[index[valid]]
-    )
+    shown = (got.color.permute(1, 2, 0).numpy()[valid] * 255).round().astype(np.uint8)
+    np.testing.assert_array_equal(shown, rgb[index[valid]])
     assert (index[~valid] == -1).all()
     assert (got.depth[0].numpy()[~valid] == 0).all()
 
 
+@needs_native
 @pytest.mark.parametrize("splat", [1.0, 2.5, 4.0])
 @pytest.mark.parametrize("occluder", [0.0, 0.4])
 def test_native_and_numpy_give_the_same_bits(monkeypatch: pytest.MonkeyPatch, splat: float, occluder: float) -> None:
-    if native.library() is None:
-        pytest.skip("the native library is not installed")
     xyz, rgb = _cloud(5000, seed=1)
     xyz[:3] = [[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0]]
     cloud = FusedCloud(PointCloud(xyz, rgb, "world"), {"a": PointCloud(xyz[:500] * 0.1, rgb[:500], "object")})
@@ -64,9 +62,8 @@ def test_native_and_numpy_give_the_same_bits(monkeypatch: pytest.MonkeyPatch, sp
         assert torch.equal(getattr(want, name), getattr(got, name)), name
 
 
+@needs_native
 def test_result_does_not_depend_on_the_thread_count() -> None:
-    if native.library() is None:
-        pytest.skip("the native library is not installed")
     xyz, rgb = _cloud(200_000, seed=2)
     before = native.threads()
     try:
@@ -122,9 +119,8 @@ def test_occluder_removes_what_shines_through_gaps_and_keeps_the_road() -> None:
     assert (filtered.depth[central] > 20).float().mean() < 0.02
     assert torch.equal(filtered.depth[filtered.valid], plain.depth[filtered.valid])
     # a road seen at a grazing angle hides nothing of itself
-    road = np.stack([rng.uniform(2, 60, 200_000), rng.uniform(-10, 10, 200_000), np.full(200_000, -1.6)], 1).astype(
-        np.float32
-    )
+    road = np.stack([rng.uniform(2, 60, 200_000), rng.uniform(-10, 10, 200_000), np.full(200_000, -1.6)], 1)
+    road = road.astype(np.float32)
     road_cloud = FusedCloud(PointCloud(road, np.zeros((len(road), 3), np.uint8), "world"), {})
     kept = project_cloud(road_cloud, {}, VIEW, ProjectConfig(occluder_m=0.2)).valid.sum()
     assert kept > 0.97 * project_points(road, None, VIEW).valid.sum()

@@ -1,8 +1,11 @@
-"""The published networks against golden values, and a tiny model of that kind from condition to observation."""
+"""The published networks against golden values; a tiny model of that kind from condition to observation, its passes and
+its memory."""
 
 import json
 import math
-from dataclasses import asdict, replace
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,18 +16,20 @@ from toy_published import TINY, choose_trainable, fill, tiny_model, write_tiny
 from toy_scene import ToyStreet
 
 from mudg.base import palette
-from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.base.records import parse_dataclass
+from mudg.base.errors import ResourceError, UsageError
 from mudg.base.store import read_safetensors
 from mudg.base.types import Camera, Condition, View
 from mudg.core import noise
-from mudg.diffusion import memory_plan, published
+from mudg.diffusion import memory_plan, published, views
 from mudg.diffusion.condition import ConditionRules, build_conditions
-from mudg.diffusion.published import PublishedConfig, WorkSplit
+from mudg.diffusion.published import PublishedConfig, PublishedMDM, WorkSplit
 from mudg.diffusion.published_network import (
     LATENT_SCALE,
+    Attention,
     Autoencoder,
     AutoencoderConfig,
+    Decoder,
+    Encoder,
     Resampler,
     ResamplerConfig,
     VideoUNet,
@@ -167,9 +172,8 @@ def test_images_are_prepared_as_the_tower_wants_them():
     flat = torch.tensor([-1.0, 0.0, 1.0]).view(1, 3, 1, 1).expand(1, 3, 100, 300)
     made = clip.prepare_image(flat)
     assert made.shape == (1, 3, 224, 224)
-    wanted = (torch.tensor([0.0, 0.5, 1.0]) - torch.tensor([0.4815, 0.4578, 0.4082])) / torch.tensor(
-        [0.2686, 0.2613, 0.2758]
-    )
+    mean, deviation = torch.tensor([0.4815, 0.4578, 0.4082]), torch.tensor([0.2686, 0.2613, 0.2758])
+    wanted = (torch.tensor([0.0, 0.5, 1.0]) - mean) / deviation
     assert torch.allclose(made.amax((0, 2, 3)), wanted, atol=2e-3)
     assert torch.allclose(made.amin((0, 2, 3)), wanted, atol=2e-3)
     corner = torch.zeros(1, 3, 20, 20)
@@ -202,9 +206,8 @@ def test_modalities_have_no_eight_bit_step(model):
     assert torch.allclose(back, depth.clamp(0, 100), atol=1e-4)
     ids = torch.arange(19).repeat(2).view(1, 2, 19)
     assert torch.equal(nearest_class(codec.semantic_image(ids)), ids)
-    mixed = 0.6 * codec.semantic_image(torch.tensor([[[0]]])) + 0.4 * codec.semantic_image(
-        torch.tensor([[[palette.ID["pole"]]]])
-    )
+    road, pole = (codec.semantic_image(torch.tensor([[[palette.ID[name]]]])) for name in ("road", "pole"))
+    mixed = 0.6 * road + 0.4 * pole
     assert nearest_class(mixed).tolist() == [[[0]]]
     assert torch.equal(codec.semantic_image(torch.tensor([[[255]]])), torch.full((1, 3, 1, 1), -1.0))
 
@@ -250,10 +253,8 @@ def test_missing_is_zero_and_the_reference_is_frame_zero():
 def test_cuts_of_the_work_do_not_change_the_sample(model):
     condition = some_condition()
     samples = []
-    for together in (True, False):
-        model.split = WorkSplit(
-            modalities_together=together, guidance_together=together, frames_at_once=4 if together else 1
-        )
+    for split in (WorkSplit(True, True, 4), WorkSplit(False, False, 1)):
+        model.split = split
         samples.append(model.sample(condition, SampleRequest(3, seed=5, index=1)))
     model.split = WorkSplit()
     first, second = samples
@@ -324,9 +325,8 @@ def test_many_sequences_are_attended_in_parts(monkeypatch):
 
 
 def test_other_numbers_of_frames_are_refused(model):
-    for frames in (1, 3, 5):
-        with pytest.raises(UsageError, match="fixed number of frames"):
-            model.sample(some_condition(frames=frames), SampleRequest(1))
+    for count in (1, 3, 5):
+        refused("fixed number", model.sample, some_condition(count), SampleRequest(1), raises=UsageError)
     refused("multiples of 4", model.sample, some_condition(height=10), SampleRequest(1), raises=UsageError)
 
 
@@ -389,28 +389,33 @@ def test_checkpointing_gives_the_same_gradients():
     assert error(undropped, gradients[0]) > 1e-2
 
 
-def test_loss_is_the_velocity_error_and_repeats(model):
-    """Against the numbers computed here from the same draws; a known function stands in for the network."""
-    truth, encoded = batch_of(model)
+@contextmanager
+def watched(model):
+    """What the network is asked for, while a known function stands in for it."""
     seen = {}
 
     def stand_in(x, planes, t, names, text, tokens):
         seen.update(x=x, t=t, names=names, text=text, tokens=tokens)
         return torch.zeros_like(x)
 
-    original, model.predict = model.predict, stand_in
-    losses = model.velocity_loss(truth, encoded, torch.Generator().manual_seed(0))
-    model.predict = original
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(model, "predict", stand_in)
+        yield seen
+
+
+def test_loss_is_the_velocity_error_and_repeats(model):
+    """Against the numbers computed here from the same draws."""
+    truth, encoded = batch_of(model)
+    with watched(model) as seen:
+        losses = model.velocity_loss(truth, encoded, torch.Generator().manual_seed(0))
     x0 = torch.stack([truth[m][n] for n, m in enumerate(seen["names"])])
     alpha, sigma = model.schedule.alpha_sigma(seen["t"], 5)
     scale = model.schedule.scale[seen["t"]].view(-1, 1, 1, 1, 1)
     eps = (seen["x"] - alpha * scale * x0) / sigma
     wanted = (alpha * eps - sigma * scale * x0).square().mean()
     assert float(losses.total.detach()) == pytest.approx(float(wanted), rel=1e-4)
-    one, two = (
-        float(model.velocity_loss(truth, encoded, torch.Generator().manual_seed(9)).total.detach()) for _ in range(2)
-    )
-    assert one == two
+    one, two = (model.velocity_loss(truth, encoded, torch.Generator().manual_seed(9)).total for _ in range(2))
+    assert float(one.detach()) == float(two.detach())
 
 
 def test_shares_of_modalities_and_missing_context(model):
@@ -419,16 +424,10 @@ def test_shares_of_modalities_and_missing_context(model):
         encoded.planes.expand(4000, -1, -1, -1, -1), encoded.features.expand(4000, -1, -1), encoded.grey, encoded.seen
     )
     small = {m: z[:, :1, :1, :1, :1].expand(4000, -1, -1, -1, -1) for m, z in truth.items()}
-    seen = {}
-
-    def stand_in(x, planes, t, names, text, tokens):
-        seen.update(names=names, text=text, tokens=tokens)
-        return torch.zeros_like(x)
-
-    original, model.predict = model.predict, stand_in
     tower, model.image_tokens = model.image_tokens, torch.nn.Identity()
-    model.velocity_loss(small, many, torch.Generator().manual_seed(0))
-    model.predict, model.image_tokens = original, tower
+    with watched(model) as seen:
+        model.velocity_loss(small, many, torch.Generator().manual_seed(0))
+    model.image_tokens = tower
     share = lambda flags: float(torch.tensor(flags).float().mean())
     for name, wanted in (("rgb", 0.5), ("semantics", 0.25), ("depth", 0.25)):
         assert share([n == name for n in seen["names"]]) == pytest.approx(wanted, abs=0.03)
@@ -442,16 +441,14 @@ def test_shares_of_modalities_and_missing_context(model):
 # published, command, memory ---------------------------------------------------------------------------
 
 
-def test_configuration_is_strict():
-    values = json.loads(json.dumps(asdict(TINY)))
-    assert parse_dataclass(PublishedConfig, values, "model.json") == TINY
-    refused("unknown field 'lens'", parse_dataclass, PublishedConfig, {**values, "lens": 3}, "model.json")
-    with pytest.raises(InputError, match="'width' is missing"):
-        parse_dataclass(
-            PublishedConfig, {**values, "net": {k: v for k, v in values["net"].items() if k != "width"}}, "model.json"
-        )
-    refused("not a whole number", parse_dataclass, PublishedConfig, {**values, "fps": "10"}, "model.json")
+def test_parts_of_different_widths_are_refused():
     refused("context", replace, TINY, text=TowerConfig(32, 2, 2), raises=UsageError)
+
+
+def one_path(street):
+    """Settings of one trajectory by the model of ``street``."""
+    paths = {"cameras": ("front",), "shifts_m": (1.0,)}
+    return SynthesizeConfig(**paths, model=str(street / "model"), steps=6, overlap=2, precision="float32")
 
 
 @pytest.fixture(scope="module")
@@ -466,18 +463,12 @@ def street(tmp_path_factory):
 
 def test_synthesize_with_a_converted_model(street, tmp_path, monkeypatch):
     """Guidance 7.5, rescale 0.7, three modalities: every frame of the trajectory becomes an observation."""
-    passes = []
-    forward = VideoUNet.forward
-    config = SynthesizeConfig(
-        cameras=("front",), shifts_m=(1.0,), model=str(street / "model"), steps=6, overlap=2, precision="float32"
-    )
-    with monkeypatch.context() as watched:
-        watched.setattr(
-            VideoUNet,
-            "forward",
-            lambda net, x, t, label, *rest: (passes.append(label.tolist()), forward(net, x, t, label, *rest))[1],
-        )
-        out = Synthesize(scene=street / "scene", fused=street / "fused", out=tmp_path / "out", settings=config).run()
+    passes, forward = [], VideoUNet.forward
+    noted = lambda net, x, t, label, *rest: (passes.append(label.tolist()), forward(net, x, t, label, *rest))[1]
+    work = partial(Synthesize, scene=street / "scene", fused=street / "fused")
+    with monkeypatch.context() as patched:
+        patched.setattr(VideoUNet, "forward", noted)
+        out = work(out=tmp_path / "out", settings=one_path(street)).run()
     found = read_observations(out / "front_shift+1.0")
     assert len(found) == 6
     assert passes == [[0, 500, 1] * 2] * 12
@@ -487,13 +478,8 @@ def test_synthesize_with_a_converted_model(street, tmp_path, monkeypatch):
         depth = found[n].depth[torch.isfinite(found[n].depth)]
         assert bool(((depth >= 0) & (depth <= 100)).all())
         assert bool(found[n].mask.all()) == (n > 0)  # frame 0 shows the recorded place, not the shifted one
-    with pytest.raises(ResourceError, match="memory budget"):
-        Synthesize(
-            scene=street / "scene",
-            fused=street / "fused",
-            out=tmp_path / "none",
-            settings=replace(config, memory_budget_gb=0.5),
-        ).run()
+    step = work(out=tmp_path / "none", settings=replace(one_path(street), memory_budget_gb=0.5))
+    refused("memory budget", step.run, raises=ResourceError)
 
 
 def test_the_released_resizing(street):
@@ -527,11 +513,8 @@ def test_short_trajectories_are_refused_in_words(street, tmp_path):
     root = tmp_path
     ToyStreet(times=[0.1 * n for n in range(3)]).write(root / "scene", width=48, height=32)
     Fuse(scene=root / "scene", out=root / "fused", settings=FuseConfig()).run()
-    config = SynthesizeConfig(
-        cameras=("front",), shifts_m=(1.0,), model=str(street / "model"), steps=20, precision="float32"
-    )
-    with pytest.raises(UsageError, match="fixed number of frames"):
-        Synthesize(scene=root / "scene", fused=root / "fused", out=root / "out", settings=config).run()
+    step = Synthesize(scene=root / "scene", fused=root / "fused", out=root / "out", settings=one_path(street))
+    refused("fixed number of frames", step.run, raises=UsageError)
 
 
 @pytest.mark.slow
@@ -576,3 +559,150 @@ def test_stage_two_freezes_the_published_number_of_weights():
     assert count(choose_trainable(model, 2)) == 1_440_917_060 - 272_850_880 + 48_787_456
     fewer = 272_850_880 + 266_891_520 + 5_580_736
     assert count(choose_trainable(model, 2, "all")) == 1_440_917_060 - fewer + 48_787_456
+
+
+# passes, memory -----------------------------------------------------------------------------------
+
+
+def same(one, other):
+    return all(
+        torch.equal(getattr(one, name), getattr(other, name)) for name in ("rgb", "depth", "semantics", "confidence")
+    )
+
+
+@pytest.mark.parametrize("steps", [50, 20, 8])
+@pytest.mark.parametrize("guidance", [None, 1.0])
+def test_passes_for_a_clip(model, monkeypatch, steps, guidance):
+    """The numbers of docs/research/published.md: the denoiser once per step, the rest once per clip."""
+    rows: dict[str, list[int]] = {}
+
+    def watch(owner, name="forward", answer=None):
+        original = getattr(owner, name)
+
+        def counted(self, x, *rest):
+            rows.setdefault(owner.__name__, []).append(len(x[0]) if name == "keys" else len(x))
+            return original(self, x, *rest) if answer is None else answer(x)
+
+        monkeypatch.setattr(owner, name, counted)
+
+    watch(VideoUNet, answer=lambda x: torch.zeros_like(x[:, :, :4]))
+    for owner in (Encoder, Decoder, ImageTower, Resampler):
+        watch(owner)
+    watch(Attention, "keys")
+    layers = len(model.net.context_keys(model.text[:1], torch.zeros(1, 4, 2, 16)))
+    rows.clear()
+    model.sample(some_condition(), SampleRequest(steps, guidance=guidance))
+    halves = 1 if guidance == 1 else 2
+    assert rows["VideoUNet"] == [3 * halves] * steps
+    assert rows["Encoder"] == [4, 4] and rows["Decoder"] == [4, 4, 4]  # colour and depth condition; three modalities
+    assert rows["ImageTower"] == [2] and rows["Resampler"] == [2]  # the reference, and grey for its absence
+    assert rows["Attention"] == [3 * halves] * layers
+
+
+@pytest.mark.parametrize("split", [WorkSplit(), WorkSplit(False, False, 1), WorkSplit(offload=True)])
+@pytest.mark.parametrize("bf16", [False, True])
+def test_keys_computed_once_change_nothing(model, monkeypatch, split, bf16):
+    monkeypatch.setattr(model, "split", split)
+    condition, request = some_condition(), SampleRequest(3, 7, bf16=bf16)
+    once = model.sample(condition, request)
+    told = PublishedMDM._told
+    monkeypatch.setattr(PublishedMDM, "_told", lambda self, *given, ahead: told(self, *given, ahead=False))
+    assert same(once, model.sample(condition, request))
+
+
+@torch.no_grad()
+def test_keys_belong_to_their_layers(model):
+    """Exactly the network's own; and keys of another context give another result."""
+    draw = torch.Generator().manual_seed(0)
+    x = torch.randn(2, 4, 12, 4, 6, generator=draw)
+    at, label, fps = (torch.tensor(pair) for pair in ([700, 3], [0, 500], [10, 10]))
+    text, image = torch.randn(2, 77, 16, generator=draw), torch.randn(2, 4, 2, 16, generator=draw)
+    plain = model.net(x, at, label, fps, text, image)
+    assert torch.equal(plain, model.net(x, at, label, fps, text, image, model.net.context_keys(text, image)))
+    assert not torch.equal(
+        plain, model.net(x, at, label, fps, text, image, model.net.context_keys(text.flip(0), image))
+    )
+
+
+@pytest.mark.slow
+def test_a_compiled_network_makes_the_same(model):
+    """Traced by torch.compile without its code generator, so that no compiler is needed."""
+    request = SampleRequest(2, 3)
+    plain = model.sample(some_condition(), request)
+    other = tiny_model()
+    names = list(other.state_dict())
+    other.net.compile(backend="eager")
+    made = other.sample(some_condition(), request)
+    assert list(other.state_dict()) == names
+    assert torch.allclose(made.rgb, plain.rgb, atol=1e-5) and torch.allclose(made.depth, plain.depth, atol=1e-2)
+    torch._dynamo.reset()
+
+
+@pytest.fixture(scope="module")
+def full():
+    """The full model in bfloat16 on the meta device, and what it needs."""
+    config = PublishedConfig()
+    return memory_plan.meta_model(config, torch.bfloat16), memory_plan.needs_of(config, 2)
+
+
+def test_inputs_that_die_hide_nothing():
+    """A tensor that gets the address of an input that is gone is counted all the same."""
+    inputs = [torch.empty(1, device="meta") for _ in range(64)]
+
+    def work():
+        while inputs:
+            inputs.pop().add(1)
+        return [torch.empty(1024, device="meta") for _ in range(256)]
+
+    assert memory_plan.peak_activations(work) == 256 * 4096
+
+
+@pytest.mark.parametrize(
+    ("card_gb", "together", "frames"),
+    [(16, (True, False), 8), (24, (True, True), 16), (40, (True, True), 16), (80, (True, True), 16)],
+)
+@pytest.mark.slow
+def test_what_fits_on_a_card(full, card_gb, together, frames):
+    """At 576x1024; a whole clip, run on the meta device as the plan says, takes no more."""
+    model, needs = full
+    split, peak_bytes = memory_plan.choose(needs, card_gb * 10**9)
+    assert ((split.modalities_together, split.guidance_together), split.frames_at_once) == (together, frames)
+    assert not split.offload
+    assert peak_bytes <= card_gb * 10**9
+    if card_gb > 24:
+        return  # as with 24
+    counted = needs.parameters + memory_plan.sampling_bytes(model, split) + memory_plan.RESERVE_BYTES
+    assert 0.97 * peak_bytes < counted <= 1.01 * peak_bytes
+
+
+@pytest.mark.slow
+def test_the_tower_goes_where_that_avoids_a_smaller_cut(full):
+    _, needs = full
+    assert needs.tower == pytest.approx(1.26e9, rel=0.01)
+    split, peak_bytes = memory_plan.choose(needs, 14_000_000_000)
+    assert split.offload and split.modalities_together and peak_bytes <= 14_000_000_000
+    kept, more = memory_plan.choose(needs, 14_000_000_000, offload=(False,))  # on a CPU
+    assert not kept.offload and not kept.modalities_together and more > peak_bytes - needs.tower
+    asked, _ = memory_plan.choose(needs, 80_000_000_000, offload=(True,))
+    assert asked.offload and asked.guidance_together
+    _, least = memory_plan.choose(needs, 1)
+    assert least == pytest.approx(
+        needs.parameters - needs.tower + needs.clip + needs.one_video + memory_plan.RESERVE_BYTES, rel=0.1
+    )
+
+
+def test_frames_go_through_the_autoencoder_in_any_number(model):
+    z = torch.randn(4, 4, 4, 6, generator=torch.Generator().manual_seed(1))
+    whole = model.codec.decode_image(z, 4)
+    for at_once in (1, 2, 3):
+        assert torch.allclose(model.codec.decode_image(z, at_once), whole, atol=1e-5)
+
+
+def test_settings_of_the_published_kind_alone(tmp_path):
+    folder = write_tiny(tmp_path)
+    config = SynthesizeConfig(model=str(folder), device="cpu", steps=20)
+    refused("on the CPU already", views.check_config, replace(config, offload=True), False, raises=UsageError)
+    checked = views.check_config(config, False)
+    assert (checked.processes, checked.device) == (1, "cpu")
+    assert views.load_any(checked).split == WorkSplit(frames_at_once=1)
+    assert views.load_any(replace(checked, memory_budget_gb=4.0)).split.frames_at_once == 16

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +12,12 @@ import torch
 from fit_settings import SMALL_RADIANCE, fit_config
 from pretend_device import pretend_device
 from refusals import refused
-from toy_world import fused_cloud, view_at, write_scene
+from toy_world import camera, fused_cloud, view_at, write_scene
 
-from mudg.base import seeds, store
-from mudg.base.errors import InputError, NumericsError, UsageError
+from mudg.base import geometry, seeds, store
+from mudg.base.errors import NumericsError, UsageError
 from mudg.baselines import emernerf as loop
 from mudg.baselines import emernerf_field as fields
-from mudg.baselines import emernerf_field as marching
-from mudg.baselines import emernerf_field as sampling
 from mudg.baselines.emernerf import extent_of, flow_colors, lidar_rays, load_field, view_rays
 from mudg.baselines.emernerf_field import SIZES, Budget, Extent, RadianceField, RayDraws, Rays, aggregated
 from mudg.diffusion.settings import SynthesizeConfig
@@ -40,10 +39,8 @@ def drawn(*shape: int, name: str = "values", dtype: torch.dtype = torch.float64)
 
 
 def tiny_field() -> RadianceField:
-    sizes = SIZES["tiny"]
-    return RadianceField(
-        sizes, Extent((1.0, 2.0, 3.0), (10.0, 20.0, 5.0), 0.0, 2.0, 0.2), ("front",), {"method": "emernerf"}
-    )
+    extent = Extent((1.0, 2.0, 3.0), (10.0, 20.0, 5.0), 0.0, 2.0, 0.2)
+    return RadianceField(SIZES["tiny"], extent, ("front",), {"method": "emernerf"})
 
 
 # ---- space and rays ------------------------------------------------------------------------------
@@ -55,12 +52,12 @@ def test_the_box_fills_the_inner_half_and_infinity_is_the_border():
     wanted = torch.tensor(
         [[0.5, 0.5, 0.5], [0.75, 0.5, 0.5], [0.5, 0.25, 0.5], [0.875, 0.5, 0.5], [0.5, 0.5, 1.0], [0.875, 0.6875, 0.5]]
     )
-    assert torch.allclose(sampling.contract(places, center, half), wanted)
+    assert torch.allclose(fields.contract(places, center, half), wanted)
 
 
 def test_distances_are_even_to_the_middle_and_even_in_their_inverse_beyond():
     along = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0])
-    found = sampling.distances(along, 0.1, 200.0, 1000.0)
+    found = fields.distances(along, 0.1, 200.0, 1000.0)
     assert torch.allclose(found, torch.tensor([0.1, 100.05, 200.0, 1 / (0.5 / 200 + 0.5 / 1000), 1000.0]))
 
 
@@ -69,24 +66,21 @@ def test_weights_of_slabs_are_those_of_beer_and_lambert():
     density = torch.tensor([[0.5, 0.0, 2.0, 1e6]])
     first, third = 1 - math.exp(-0.5), math.exp(-0.5) * (1 - math.exp(-2.0))
     wanted = torch.tensor([[first, 0.0, third, math.exp(-2.5)]])
-    assert torch.allclose(sampling.rendering_weights(density, edges), wanted, atol=1e-6)
+    assert torch.allclose(fields.rendering_weights(density, edges), wanted, atol=1e-6)
 
 
 def test_samples_gather_where_the_weights_are():
     edges = torch.linspace(0, 1, 11)[None]
     weights = torch.zeros(1, 10)
     weights[0, 6] = 1.0
-    found = sampling.resampled_edges(edges, weights, 20, torch.full((1, 1), 0.5))
+    found = fields.resampled_edges(edges, weights, 20, torch.full((1, 1), 0.5))
     assert found.shape == (1, 21) and (found.diff() >= 0).all()
     assert ((found >= 0.6) & (found <= 0.7)).float().mean() > 0.9
-    even = sampling.resampled_edges(edges, torch.ones(1, 10), 9, torch.full((1, 1), 0.5))
-    assert torch.allclose(even[0], (torch.arange(10) + 0.5) / 10, atol=1e-6)
-
-
-def test_even_edges_cover_the_ray_whatever_the_jitter():
     for jitter in (0.0, 0.5, 0.99):
-        edges = sampling.even_edges(1, 8, torch.full((1, 1), jitter))
-        assert edges[0, 0] == 0 and edges[0, -1] == 1 and (edges.diff() >= 0).all()
+        across = fields.even_edges(1, 8, torch.full((1, 1), jitter))
+        assert across[0, 0] == 0 and across[0, -1] == 1 and (across.diff() >= 0).all()
+    even = fields.resampled_edges(edges, torch.ones(1, 10), 9, torch.full((1, 1), 0.5))
+    assert torch.allclose(even[0], (torch.arange(10) + 0.5) / 10, atol=1e-6)
 
 
 def test_a_blurred_histogram_keeps_its_mass_and_equals_a_fine_convolution():
@@ -101,7 +95,7 @@ def test_a_blurred_histogram_keeps_its_mass_and_equals_a_fine_convolution():
     box = int(2 * radius * fine)
     blurred = torch.nn.functional.avg_pool1d(height[None, None], box + 1, 1, box // 2)[0, 0]
     expected = blurred.view(10, -1).sum(1) / fine
-    found = sampling.blurred_mass(edges, weights, wanted, radius)[0]
+    found = fields.blurred_mass(edges, weights, wanted, radius)[0]
     assert torch.allclose(found, expected, atol=2e-4)
     assert float(found.sum()) == pytest.approx(1.0, abs=1e-9)
 
@@ -110,32 +104,18 @@ def test_proposals_that_agree_cost_nothing_and_others_do():
     edges = drawn(3, 9).sort(1).values
     weights = drawn(3, 8, name="weights")
     weights = weights / weights.sum(1, keepdim=True)
-    assert float(sampling.interlevel_loss(edges, weights, edges, weights, 0.0)) < 1e-6
-    even, flat = (
-        torch.linspace(0, 1, 9, dtype=torch.float64).expand(2, -1),
-        torch.full((2, 8), 0.125, dtype=torch.float64),
-    )
-    assert float(sampling.interlevel_loss(even, flat, even, flat, 0.03)) == pytest.approx(0.0, abs=1e-12)
-    assert float(sampling.interlevel_loss(edges, weights, edges, weights.flip(1), 0.0)) > 1e-2
-
-
-def test_only_the_proposal_learns_from_the_interlevel_loss():
-    edges, weights = drawn(2, 5).sort(1).values, drawn(2, 4, name="w").requires_grad_()
-    proposal = drawn(2, 4, name="p").requires_grad_()
-    sampling.interlevel_loss(edges, weights, edges, proposal, 0.01).backward()
-    assert weights.grad is None and proposal.grad.abs().sum() > 0
+    assert float(fields.interlevel_loss(edges, weights, edges, weights, 0.0)) < 1e-6
+    even, flat = torch.linspace(0, 1, 9).double().expand(2, -1), torch.full((2, 8), 0.125).double()
+    assert float(fields.interlevel_loss(even, flat, even, flat, 0.03)) == pytest.approx(0.0, abs=1e-12)
+    assert float(fields.interlevel_loss(edges, weights, edges, weights.flip(1), 0.0)) > 1e-2
 
 
 # ---- the field -----------------------------------------------------------------------------------
 
 
 def test_flow_aggregation_equals_a_loop_and_moves_its_flow():
-    xyz, time, flow, share = (
-        drawn(6, 3),
-        drawn(6, 1, name="t"),
-        drawn(6, 6, name="f").requires_grad_(),
-        drawn(6, 1, name="n"),
-    )
+    xyz, time, share = drawn(6, 3), drawn(6, 1, name="t"), drawn(6, 1, name="n")
+    flow = drawn(6, 6, name="f").requires_grad_()
 
     def feature(places: torch.Tensor, times: torch.Tensor) -> torch.Tensor:
         return torch.cat([places.square().sum(1, keepdim=True), times * places[:, :1]], 1)
@@ -159,25 +139,25 @@ def test_each_proposal_round_asks_its_own_network(monkeypatch):
     monkeypatch.setattr(
         field, "proposed_density", lambda level, xyz: (asked.append((level, len(xyz))), real(level, xyz))[1]
     )
-    rays, _ = view_rays(view_at(0.0, _camera(4, 2)), field.extent, 0)
-    marching.march(field, rays, Budget((16, 12), 8, 0.1, 1000.0))
+    rays, _ = view_rays(view_at(0.0, camera("front", 4, 2)), field.extent, 0)
+    fields.march(field, rays, Budget((16, 12), 8, 0.1, 1000.0))
     assert asked == [(0, 8 * 16), (1, 8 * 12)]
 
 
 def test_color_loss_reaches_every_field_and_proposals_learn_only_when_asked():
     field = tiny_field()
-    rays, _ = view_rays(view_at(0.3, _camera(6, 4)), field.extent, 0)
+    rays, _ = view_rays(view_at(0.3, camera("front", 6, 4)), field.extent, 0)
     budget = Budget((16, 12), 8, 0.1, 1000.0)
     draws = RayDraws.of(len(rays), budget, seeds.torch_generator(0, 1, "draws"), torch.device("cpu"))
-    marched = marching.march(field, rays, budget, draws)
-    marching.colors(field, rays, marched)[0].square().mean().backward()
+    marched = fields.march(field, rays, budget, draws)
+    fields.colors(field, rays, marched)[0].square().mean().backward()
     reached = {
         name for name, value in field.named_parameters() if value.grad is not None and value.grad.abs().sum() > 0
     }
     for part in ("static.table", "dynamic.table", "flow.net.weights.0", "color.out", "shadow", "sky", "appearance"):
         assert any(name.startswith(part) for name in reached), part
     assert not any(name.startswith("proposals") for name in reached)
-    marching.proposal_loss(marching.march(field, rays, budget, draws, True)).backward()
+    fields.proposal_loss(fields.march(field, rays, budget, draws, True)).backward()
     for level in (0, 1):
         assert field.proposals[level].table.grad.abs().sum() > 0
 
@@ -186,20 +166,16 @@ def test_line_of_sight_wants_emptiness_before_the_surface_and_the_mass_of_a_bell
     edges, measured = torch.tensor([[1.0, 8.0, 9.5, 10.5, 20.0, 30.0]]), torch.tensor([10.0])
     one = math.erf(1 / math.sqrt(2))  # the mass within a standard deviation, which is 0.5 m
     weights = torch.tensor([[0.2, (1 - one) / 2, one, (1 - one) / 2, 0.7]])
-    assert float(marching.line_of_sight(weights, edges, measured, 1.5)) == pytest.approx(0.04, abs=5e-5)
-    assert float(marching.line_of_sight(weights - 0.05, edges, measured, 1.5)) == pytest.approx(0.03, abs=5e-5)
+    assert float(fields.line_of_sight(weights, edges, measured, 1.5)) == pytest.approx(0.04, abs=5e-5)
+    assert float(fields.line_of_sight(weights - 0.05, edges, measured, 1.5)) == pytest.approx(0.03, abs=5e-5)
 
 
 def test_the_median_lies_where_half_of_the_weight_is_passed():
     edges = torch.tensor([[1.0, 2.0, 3.0, 5.0]]).expand(3, -1)
     weights = torch.tensor([[0.1, 0.8, 0.1], [0.2, 0.2, 0.4], [0.0, 0.0, 0.5]])
-    marched = marching.Marched(edges, edges, edges[:, 1:], weights, edges, edges, None, ())
+    marched = fields.Marched(edges, edges, edges[:, 1:], weights, edges, edges, None, ())
     assert marched.median_m.tolist() == pytest.approx([2.5, 3.0, 4.0])
     assert marched.range_m.tolist() == pytest.approx([(0.2 + 2.4 + 0.5), (0.4 + 0.6 + 2.0) / 0.8, 5.0])
-
-
-def test_direction_code_has_the_published_width():
-    assert fields.encoded_direction(torch.tensor([[0.0, 0.0, 1.0]])).shape == (1, fields.DIRECTION_WIDTH) == (1, 33)
 
 
 def test_schedules():
@@ -208,12 +184,6 @@ def test_schedules():
     assert loop.rate_share(1000, 1000) == pytest.approx(0.33**4)
     assert [loop.sight_width(step, 1000) for step in (80, 81, 290, 900)] == [0.0, 6.0, 3.0, 0.6]
     assert [loop.dynamic_share(step, 1000) for step in (1, 100, 300, 500, 900)] == pytest.approx([0, 0, 0.5, 1, 1])
-
-
-def _camera(width: int, height: int):
-    from toy_world import camera
-
-    return camera("front", width, height)
 
 
 # ---- the fit -------------------------------------------------------------------------------------
@@ -254,9 +224,8 @@ def test_resumed_equals_uninterrupted(world, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "take_step", stopped)
     with pytest.raises(KeyboardInterrupt):
         Fit(scene=world / "scene", out=tmp_path / "fit", settings=fit_config(**TINY)).run()
-    monkeypatch.setattr(
-        loop, "take_step", lambda state, config, step: (calls.append(step), real(state, config, step))[1]
-    )
+    noted = lambda state, config, step: (calls.append(step), real(state, config, step))[1]
+    monkeypatch.setattr(loop, "take_step", noted)
     Fit(scene=world / "scene", out=tmp_path / "fit", settings=fit_config(**TINY)).run()
     assert calls == [1, 2, 3, 4, 5, 6, 5, 6, 7, 8]
     assert same(parameters(world / "fit"), parameters(tmp_path / "fit"))
@@ -306,24 +275,15 @@ def test_what_is_not_finite_never_reaches_the_parameters(world):
 
 
 def test_renders_as_observations_without_classes(world, tmp_path):
-    out = RenderViews(
-        scene=world / "scene",
-        model=world / "fit",
-        out=tmp_path / "render",
-        settings=RenderConfig(shifts_m=(0.0, 2.0), video=True),
-    ).run()
+    render = partial(RenderViews, scene=world / "scene", model=world / "fit")
+    out = render(out=tmp_path / "render", settings=RenderConfig(shifts_m=(0.0, 2.0), video=True)).run()
     seen = read_observations(out / "front_shift+2.0")[1]
     assert seen.source == "emernerf" and seen.semantics is None
     assert seen.rgb.shape == (3, 16, 24) and torch.isfinite(seen.rgb).all()
     known = seen.depth[torch.isfinite(seen.depth)]
     assert len(known) and (known > 0).all()
-    with pytest.raises(UsageError, match="no objects"):
-        RenderViews(
-            scene=world / "scene",
-            model=world / "fit",
-            out=tmp_path / "other",
-            settings=RenderConfig(remove_tracks=("car",)),
-        ).run()
+    other = render(out=tmp_path / "other", settings=RenderConfig(remove_tracks=("car",)))
+    refused("no objects", other.run, raises=UsageError)
 
 
 def test_saved_field_is_the_fitted_one(world):
@@ -338,19 +298,14 @@ def test_saved_field_is_the_fitted_one(world):
 
 def test_what_needs_gaussians_refuses_a_radiance_field(world, tmp_path):
     refused("radiance field", FittedScene.read, world / "fit", "cpu")
-    with pytest.raises(InputError, match="radiance field"):
-        Synthesize(
-            scene=world / "scene",
-            fused=world / "fuse",
-            fitted=world / "fit",
-            out=tmp_path / "virtual",
-            settings=SynthesizeConfig(),
-        ).run()
+    inputs = {"scene": world / "scene", "fused": world / "fuse", "fitted": world / "fit"}
+    refused("radiance field", Synthesize(**inputs, out=tmp_path / "virtual", settings=SynthesizeConfig()).run)
     refused("no radiance field", load_field_of_gaussians, tmp_path)
-    with pytest.raises(UsageError, match="cannot go on"):
-        Fit(scene=world / "scene", start_from=world / "fit", out=tmp_path / "more", settings=fit_config(**TINY)).run()
-    with pytest.raises(UsageError, match="needs fused clouds"):
-        Fit(scene=world / "scene", out=tmp_path / "gs3d", settings=fit_config(method="gs3d")).run()
+    again = partial(Fit, scene=world / "scene")
+    more = again(start_from=world / "fit", out=tmp_path / "more", settings=fit_config(**TINY))
+    refused("cannot go on", more.run, raises=UsageError)
+    gs3d = again(out=tmp_path / "gs3d", settings=fit_config(method="gs3d"))
+    refused("needs fused clouds", gs3d.run, raises=UsageError)
 
 
 def load_field_of_gaussians(folder: Path) -> None:
@@ -363,6 +318,7 @@ def test_published_sizes_are_a_row_of_the_same_table():
     assert SIZES[config.radiance.size].static == (10, 4, 16, 8192, 20)
     assert loop.BUDGETS[config.radiance.size].proposals == (128, 64)
     assert loop.BATCHES[config.radiance.size] == (8192, 8192)
+    assert fields.encoded_direction(torch.tensor([[0.0, 0.0, 1.0]])).shape == (1, fields.DIRECTION_WIDTH) == (1, 33)
 
 
 # ---- rays ----------------------------------------------------------------------------------------
@@ -374,15 +330,13 @@ def test_pixels_and_lidar_are_rays_of_the_world(world):
     extent = extent_of(scene, lidar)
     ends = lidar.origins + lidar.range_m[:, None] * lidar.directions
     assert float((ends[:, 2]).min()) > -0.1  # nothing below the ground
-    inside = sampling.contract(ends, torch.tensor(extent.center), torch.tensor(extent.half))
+    inside = fields.contract(ends, torch.tensor(extent.center), torch.tensor(extent.half))
     assert 0.85 < float(((inside > 0.249) & (inside < 0.751)).all(1).float().mean()) < 0.99
     assert extent.step == pytest.approx(0.3 / 0.9) and extent.normalised(-5.0) == 0.0
     view = scene.frames[1].view
     rays, z_per_m = view_rays(view, extent, 0)
     assert torch.allclose(rays.directions.norm(dim=1), torch.ones(len(rays)), atol=1e-6)
     place = rays.origins[5 * 24 + 7] + 10 / z_per_m[5 * 24 + 7] * rays.directions[5 * 24 + 7]
-    from mudg.base import geometry
-
     uv, z = geometry.project(view, place.numpy()[None])
     assert np.allclose(uv[0], (7.5, 5.5), atol=1e-3) and z[0] == pytest.approx(10.0, abs=1e-4)
 
@@ -410,10 +364,10 @@ def test_flow_pictures_are_black_at_rest():
 def test_rays_move_to_a_device_and_back(world):
     with pretend_device() as there:
         field = tiny_field().to(there)
-        rays, _ = view_rays(view_at(0.0, _camera(3, 2)), field.extent, 0)
-        marched = marching.march(field, rays.to(there), Budget((8, 8), 4, 0.1, 1000.0))
-        rgb = marching.colors(field, rays.to(there), marched)[0].cpu()
+        rays, _ = view_rays(view_at(0.0, camera("front", 3, 2)), field.extent, 0)
+        marched = fields.march(field, rays.to(there), Budget((8, 8), 4, 0.1, 1000.0))
+        rgb = fields.colors(field, rays.to(there), marched)[0].cpu()
     field = tiny_field()
-    marched = marching.march(field, rays, Budget((8, 8), 4, 0.1, 1000.0))
-    assert torch.allclose(rgb, marching.colors(field, rays, marched)[0], atol=1e-5)
+    marched = fields.march(field, rays, Budget((8, 8), 4, 0.1, 1000.0))
+    assert torch.allclose(rgb, fields.colors(field, rays, marched)[0], atol=1e-5)
     assert isinstance(rays.part(0, 2), Rays)

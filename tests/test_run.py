@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from refusals import refused
 
 from mudg import app
 from mudg.base import config as configuration
 from mudg.base import log, store
 from mudg.base import memory as usage
-from mudg.base.errors import InputError, IntegrityError, NumericsError, ResourceError, UsageError
+from mudg.base.errors import IntegrityError, NumericsError, ResourceError, UsageError
 from mudg.scoring import score
 from mudg.steps import pipeline
 from mudg.steps.run import Demo, Run
@@ -107,11 +108,13 @@ def test_each_step_says_how_many_there_are(
     tmp_path: Path, verbs: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
     log.set_quiet(False)
-    chain(tmp_path, run_preset("fast"))
+    config = with_seed(run_preset("fast"), 5)
+    chain(tmp_path, config)
     said = capsys.readouterr().err
     assert said.index("== ingest") < said.index("== fuse, step 1 of 9\n")
     assert "== report, step 9 of 9" in said
     assert verbs["ingest"].settings.resolution == "", "a city has a size of its own"
+    assert configuration.load(RunConfig, None, tmp_path / "out" / "run.yaml") == config  # it repeats the run
     (tmp_path / "log").mkdir()
     Run(source=tmp_path / "log", out=tmp_path / "other", settings=run_preset("fast")).run()
     assert verbs["ingest"].settings.resolution == "480"
@@ -126,8 +129,8 @@ def test_two_runs_in_one_folder_at_a_time(
     sleeper = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     try:
         store.write_json(out / "lock", {"pid": sleeper.pid, "host": socket.gethostname()})
-        with pytest.raises(ResourceError, match="another process is working in this folder"):
-            Run(source="city", out=out, overwrite=True, settings=run_preset("fast")).run()
+        step = Run(source="city", out=out, overwrite=True, settings=run_preset("fast"))
+        refused("another process is working in this folder", step.run, raises=ResourceError)
         assert (out / "run.json").read_bytes() == record
     finally:
         sleeper.communicate(b"\n")
@@ -146,37 +149,31 @@ def test_a_repeat_makes_no_second_report_unless_it_was_touched(tmp_path: Path, v
     assert (tmp_path / "out" / "report.html").read_text() == "page"
 
 
-def test_run_yaml_repeats_the_run(tmp_path: Path, verbs: dict[str, Any]) -> None:
-    config = with_seed(run_preset("fast"), 5)
-    chain(tmp_path, config)
-    assert configuration.load(RunConfig, None, tmp_path / "out" / "run.yaml") == config
-
-
-def test_a_scene_without_labels_is_annotated_and_then_used(tmp_path: Path, verbs: dict[str, Any]) -> None:
+def test_a_scene_without_labels_is_annotated_and_one_with_labels_is_used(tmp_path: Path, verbs: dict[str, Any]) -> None:
     verbs["labelled"] = False
     chain(tmp_path)
     assert verbs["calls"] == [CHAIN[0], "annotate", *CHAIN[1:]]
     for label in ("fuse", "synthesize", "fit:mudg_s", "render:mudg_s", "score"):
         assert verbs[label].scene == tmp_path / "out" / "annotate"
+    verbs["labelled"] = True
+    verbs["calls"].clear()
+    store.write_json(tmp_path / "scene" / "scene.json", {})
+    Run(source=tmp_path / "scene", out=tmp_path / "other", settings=USUAL).run()
+    assert verbs["calls"] == CHAIN[1:] and verbs["fuse"].scene == tmp_path / "scene"
 
 
-def test_a_scene_needs_no_ingest(tmp_path: Path, verbs: dict[str, Any]) -> None:
-    scene = tmp_path / "scene"
-    scene.mkdir()
-    (scene / "scene.json").write_text("{}")
-    Run(source=scene, out=tmp_path / "out", settings=RunConfig()).run()
-    assert verbs["calls"] == CHAIN[1:]
-    assert verbs["fuse"].scene == scene
-
-
-def test_an_interruption_is_recorded_and_the_repeat_continues(tmp_path: Path, verbs: dict[str, Any]) -> None:
-    verbs["trouble"]["synthesize"] = KeyboardInterrupt()
-    with pytest.raises(KeyboardInterrupt):
+@pytest.mark.parametrize(
+    ("trouble", "state"), [(KeyboardInterrupt(), "interrupted"), (NumericsError("a loss is not finite"), "failed")]
+)
+def test_what_stopped_a_run_is_recorded_and_the_repeat_continues(
+    tmp_path: Path, verbs: dict[str, Any], trouble: BaseException, state: str
+) -> None:
+    verbs["trouble"]["synthesize"] = trouble
+    with pytest.raises(type(trouble)):
         chain(tmp_path)
     ledger = store.read_json(tmp_path / "out" / "run.json")
-    assert ledger["state"] == "interrupted"
-    assert ledger["steps"]["synthesize"]["state"] == "interrupted"
-    assert "score" not in ledger["steps"]
+    assert ledger["state"] == ledger["steps"]["synthesize"]["state"] == state
+    assert ledger["steps"]["fuse"]["state"] == "complete" and "score" not in ledger["steps"]
     page = tmp_path / "out" / "report.html"
     assert "Repeat the same command to go on" in page.read_text(), "the report of a run grows with it"
     assert 'http-equiv="refresh"' not in page.read_text()
@@ -225,9 +222,7 @@ def test_seconds_add_up_over_continuations_and_reuse_adds_none(
 def test_other_settings_are_refused_at_once_and_named(tmp_path: Path, verbs: dict[str, Any]) -> None:
     chain(tmp_path)
     verbs["calls"].clear()
-    with pytest.raises(UsageError) as refused:
-        chain(tmp_path, with_seed(RunConfig(), 3))
-    assert "fit.seed: 0 there, 3 asked" in str(refused.value)
+    refused("fit.seed: 0 there, 3 asked", chain, tmp_path, with_seed(RunConfig(), 3), raises=UsageError)
     assert verbs["calls"] == []
     chain(tmp_path, with_seed(RunConfig(), 3), overwrite=True)
     assert verbs["calls"] == CHAIN
@@ -239,32 +234,15 @@ def test_an_altered_record_of_a_run_is_not_taken(tmp_path: Path, verbs: dict[str
     record = store.read_json(tmp_path / "out" / "run.json")
     record["steps"]["fuse"]["seconds"] = 0.125
     store.write_json(tmp_path / "out" / "run.json", record)
-    with pytest.raises(IntegrityError, match="altered"):
-        chain(tmp_path)
+    refused("altered", chain, tmp_path, raises=IntegrityError)
 
 
-def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, verbs: dict[str, Any]) -> None:
+def test_a_log_that_is_none_and_a_folder_of_something_else_are_refused(tmp_path: Path, verbs: dict[str, Any]) -> None:
+    step = Run(source=tmp_path / "nothing", out=tmp_path / "out", settings=USUAL)
+    refused("no such driving log", step.run)
     (tmp_path / "holiday.jpg").write_text("x")
-    with pytest.raises(UsageError, match="do not belong to this run"):
-        Run(source="city", out=tmp_path, settings=RunConfig()).run()
-    assert verbs["calls"] == []
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["holiday.jpg"]
-
-
-def test_no_such_log(tmp_path: Path, verbs: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match="no such driving log"):
-        Run(source=tmp_path / "nothing", out=tmp_path / "out", settings=RunConfig()).run()
-    assert not (tmp_path / "out").exists()
-
-
-def test_an_error_in_a_step_keeps_what_was_done(tmp_path: Path, verbs: dict[str, Any]) -> None:
-    verbs["trouble"]["fit"] = NumericsError("a loss is not finite")
-    with pytest.raises(NumericsError):
-        chain(tmp_path)
-    ledger = store.read_json(tmp_path / "out" / "run.json")
-    assert ledger["state"] == "failed"
-    assert ledger["steps"]["fuse"]["state"] == "complete"
-    chain(tmp_path)
+    refused("do not belong to this run", Run(source="city", out=tmp_path, settings=USUAL).run, raises=UsageError)
+    assert verbs["calls"] == [] and sorted(p.name for p in tmp_path.iterdir()) == ["holiday.jpg"]
 
 
 def test_ctrl_c_prints_how_to_continue(

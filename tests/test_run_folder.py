@@ -94,14 +94,9 @@ def test_lock_of_a_live_process_is_respected_and_of_a_dead_one_taken_over(tmp_pa
 
 @pytest.mark.parametrize(
     "state",
-    [
-        None,
-        "{",
-        "[]",
-        '{"schema": 1}',
-        '{"schema": 3, "verb": "fit", "key": "k", "state": "complete"}',
-        '{"schema": 1, "state": "complete", "asked": {"verb": "run"}}',
-    ],
+    [None, "{", "[]", '{"schema": 1}']
+    + ['{"schema": 3, "verb": "fit", "key": "k", "state": "complete"}']
+    + ['{"schema": 1, "state": "complete", "asked": {"verb": "run"}}'],
 )
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_a_folder_of_somebody_elses_files_is_refused(tmp_path: Path, state: str | None, overwrite: bool) -> None:
@@ -187,21 +182,13 @@ def test_an_older_unfinished_run_that_did_not_note_its_files_is_known_by_its_ver
     assert set(contents(folder)) == {"manifest.json", "mine.md", "out.txt", "rows/2.txt", "run.yaml"}
 
 
-def test_names_of_temporary_files() -> None:
-    names = [
-        ".run.abcd_f12.part.json",
-        ".scene.123-456.part/images/a.png",
-        ".r.new.part",
-        "a.part",
-        ".bashrc",
-        "film.part.mp4",
-    ]
-    assert [is_temporary(name) for name in names] == [True, True, False, False, False, False]
-
-
-def test_names_that_writers_give_are_known_as_temporary(tmp_path: Path) -> None:
+def test_names_of_temporary_files(tmp_path: Path) -> None:
     with store.atomic_path(tmp_path / "picture.png") as path:
         assert is_temporary(path.name)
+    for name in (".run.abcd_f12.part.json", ".scene.123-456.part/images/a.png"):
+        assert is_temporary(name)
+    for name in (".r.new.part", "a.part", ".bashrc", "film.part.mp4"):
+        assert not is_temporary(name)
 
 
 # replaced when the new result is finished ---------------------------------------------------------
@@ -356,9 +343,8 @@ def test_a_folder_made_by_hand_between_the_renames_is_not_mistaken(
     crashed(folder, monkeypatch, ("rename", 2))
     folder.mkdir()
     (folder / "mine.md").write_text("mine")
-    with pytest.raises(UsageError, match="in each other's way") as refused:
-        run(folder, 2, overwrite=True)
-    assert str(store.retired_path(folder)) in refused.value.got
+    error = refused("in each other's way", run, folder, 2, overwrite=True, raises=UsageError)
+    assert str(store.retired_path(folder)) in error.got
     (folder / "mine.md").unlink()
     assert run(folder, 2).complete
 
@@ -420,10 +406,9 @@ NEAR = ("other", "data/scene2", "data/sc")
 def test_overlaps_are_found_through_links_and_dots(places: Path, relation: str, pair: str) -> None:
     out, given = pair.split("=")
     for base in (Path(), places):
-        with pytest.raises(UsageError, match=relation) as refused:
-            refuse_overlap(base / out, {"nothing": None, "none": "", "scene": base / given})
-        assert str(base / out) in str(refused.value) and str(base / given) in str(refused.value)
-        assert refused.value.remedy
+        inputs = {"nothing": None, "none": "", "scene": base / given}
+        error = refused(relation, refuse_overlap, base / out, inputs, raises=UsageError)
+        assert str(base / out) in str(error) and str(base / given) in str(error) and error.remedy
 
 
 def test_neighbours_do_not_overlap(places: Path) -> None:
@@ -442,5 +427,4 @@ def test_upper_and_lower_case_are_one_where_the_file_system_says_so(
 
     monkeypatch.setattr(Path, "stat", careless)
     for out in ("Data/Scene", "DATA/SCENE/new", "Data"):
-        with pytest.raises(UsageError):
-            refuse_overlap(places / out, {"scene": places / "data" / "scene"})
+        refused(".", refuse_overlap, places / out, {"scene": places / "data" / "scene"}, raises=UsageError)

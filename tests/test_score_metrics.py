@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import io
+from collections.abc import Callable
 
 import numpy as np
 import pytest
+import score_goldens
 import torch
 import toy_views
 from PIL import Image
 from refusals import refused
+from test_metrics import pair
 from torch.nn import functional
 
 from mudg.base import store
@@ -19,18 +22,12 @@ from mudg.city.config import CityConfig
 from mudg.city.world import CityWorld
 from mudg.core import losses as perceptual
 from mudg.core import metrics
-from mudg.core.metrics import Pair
 from mudg.diffusion import model_files as files
 from mudg.editing.settings import ScoreConfig
 from mudg.networks.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance, lpips_shapes
 from mudg.scoring import score
 from mudg.scoring import tables as score_tables
 from mudg.steps.render import Score
-
-
-def pair(**given) -> Pair:
-    names = ("rgb", "depth", "semantics", "truth_rgb", "truth_depth", "truth_depth_valid", "truth_semantics")
-    return Pair(**{**dict.fromkeys(names), **given})
 
 
 @pytest.fixture(scope="module")
@@ -331,3 +328,16 @@ def test_lpips_equals_its_float64_twin(pictures, name, given):
     assert stage == len(network.channel_weights)
     apart = PerceptualDistance(network, network.channel_weights)(pair(rgb=made, truth_rgb=truth))
     assert apart == pytest.approx(total, rel=1e-4)
+
+
+# ---- the networks of the scores still give the recorded features ---------------------------------
+
+
+@pytest.mark.parametrize("part", [score_goldens.inception_values, score_goldens.i3d_values, score_goldens.vit_values])
+def test_features_are_the_recorded_ones(part: Callable[[], dict[str, np.ndarray]]) -> None:
+    recorded = store.read_safetensors(score_goldens.PATH)
+    for name, value in part().items():
+        assert value.shape == recorded[name].shape
+        apart = np.abs(value.astype(np.float64) - recorded[name]).max() / np.abs(recorded[name]).max()
+        assert apart < 1e-4, name  # other processors add up in another order; measured 0 on the same one
+        assert np.ptp(recorded[name]) > 0

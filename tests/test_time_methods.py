@@ -13,6 +13,7 @@ import pytest
 import torch
 from fit_settings import SMALL_RADIANCE, fit_to, fitted_bytes, interrupted, small_fit, written_street
 from pretend_device import pretend_device
+from refusals import refused
 from toy_world import CAR_SIZE, camera, car_pose, truth, view_at, write_scene
 
 from mudg.base import geometry
@@ -24,7 +25,7 @@ from mudg.baselines import emernerf as rays
 from mudg.baselines import pvg
 from mudg.baselines.bezier import BezierNode, bernstein, distance_change, fit_path
 from mudg.baselines.omnire import DeformationField, DeformedNode
-from mudg.baselines.pvg import VibrationNode, average_velocity, starting_columns
+from mudg.baselines.pvg import VibrationNode, starting_columns
 from mudg.baselines.s3gaussian import SHORT_GAIN, HexPlaneNode, plane_smoothness
 from mudg.baselines.timed import FlatNetwork, waves
 from mudg.core import losses, metrics
@@ -89,27 +90,6 @@ def vibrating(count: int = 5) -> NodeRows:
     return NodeRows(drawn(count, 3), drawn(count, 4), torch.sigmoid(drawn(count)), drawn(count, 1, 3), own)
 
 
-def test_vibration_by_hand():
-    """A quarter of a cycle after its peak a Gaussian is v l / (2 pi) away, and as faint as the normal density says."""
-    node = VibrationNode("background", middle_s=10.0, frame_s=0.1)
-    assert node.time_of(10.1) == pytest.approx(0.02)
-    own = {
-        "tau": torch.tensor([0.0, 0.05]),
-        "log_beta": torch.tensor([0.05, 0.01]).log(),
-        "velocity": torch.tensor([[2.0, 0, 0]] * 2),
-    }
-    rows = NodeRows(torch.zeros(2, 3), torch.ones(2, 4), torch.tensor([0.8, 0.8]), torch.zeros(2, 1, 3), own)
-    seen = node.at_time(rows, 10.25)  # t = 0.05, a quarter of the cycle 0.2
-    assert seen.means[0].tolist() == pytest.approx([2.0 * 0.2 / (2 * math.pi), 0, 0])
-    assert seen.means[1].tolist() == pytest.approx([0, 0, 0])
-    assert seen.opacity.tolist() == pytest.approx([0.8 * math.exp(-0.5), 0.8])
-    later = node.at_time(rows, 10.4)  # t = 0.08: three life spans after the peak of the second
-    assert later.opacity[1] == 0.0
-    assert average_velocity(own["velocity"], torch.tensor([0.4, 0.0]))[:, 0].tolist() == pytest.approx(
-        [2 * math.exp(-1), 2.0]
-    )
-
-
 def test_vibration_agrees_with_a_plain_loop_and_its_slopes_with_differences():
     rows, node = vibrating(), VibrationNode("background", 1.0, 0.1, 0.013)
     seen = node.at_time(rows, 1.2)
@@ -126,10 +106,8 @@ def test_vibration_agrees_with_a_plain_loop_and_its_slopes_with_differences():
     held = [rows.means, rows.opacity, *(rows.own[name] for name in ("tau", "log_beta", "velocity"))]
 
     def at(means, opacity, tau, log_beta, velocity):
-        now = node.at_time(
-            replace(rows, means=means, opacity=opacity, own={"tau": tau, "log_beta": log_beta, "velocity": velocity}),
-            1.2,
-        )
+        own = {"tau": tau, "log_beta": log_beta, "velocity": velocity}
+        now = node.at_time(replace(rows, means=means, opacity=opacity, own=own), 1.2)
         return now.means, now.opacity
 
     assert torch.autograd.gradcheck(at, [value.clone().requires_grad_() for value in held])
@@ -165,13 +143,8 @@ def test_what_changes_in_time_is_split_in_time(step, late, rows):
     report = densify.densify(model, stats, step, densify.DensifySettings(1, 99, 10, growth=9.0, late=late), 0)
     assert (report["split"], report["cloned"], report["rows"]) == (1, 0, rows)
     assert len(set(model.table["tau"].tolist())) == rows - 2
-    copied = densify.densify(
-        model,
-        densify.DensifyStats(*(torch.ones(rows) for _ in range(3))),
-        step,
-        densify.DensifySettings(1, 99, 10, static_gradient=9.0, growth=9.0),
-        0,
-    )
+    stats = densify.DensifyStats(*(torch.ones(rows) for _ in range(3)))
+    copied = densify.densify(model, stats, step, densify.DensifySettings(1, 99, 10, static_gradient=9.0, growth=9.0), 0)
     assert copied["cloned"] == 1
 
 
@@ -191,10 +164,8 @@ def test_the_losses_of_pvg_by_hand():
 def test_half_of_the_steps_draw_the_state_of_another_time():
     table = Table({"means": torch.zeros(1, 3)}, {"node": torch.zeros(1, dtype=torch.int32)})
     model = SceneModel(table, (VibrationNode("b", 0, 0.1),), None, (), 0)
-    drawn = [
-        pvg.VibrationRecipe().drawn_model(model, None, step, small_fit("pvg")).nodes[0].early for step in range(400)
-    ]
-    moved = [early for early in drawn if early]
+    drawn = (pvg.VibrationRecipe().drawn_model(model, None, step, small_fit("pvg")) for step in range(400))
+    moved = [one.nodes[0].early for one in drawn if one.nodes[0].early]
     assert 160 < len(moved) < 240
     assert max(map(abs, moved)) <= 0.03
     assert max(moved) > 0.02 and min(moved) < -0.02
@@ -287,11 +258,8 @@ def test_the_field_moves_and_recolors_what_lies_in_its_box():
     node, g = field_in_float64(), torch.Generator().manual_seed(6)
     means = torch.cat([torch.rand(4, 3, generator=g).double(), torch.tensor([[9.0, 0, 0]]).double()])
     rows = NodeRows(means, torch.ones(5, 4).double(), torch.ones(5).double(), torch.zeros(5, 1, 3).double())
-    now, later, resting = (
-        node.at_time(rows, 1.2),
-        node.at_time(rows, 1.9),
-        node.with_values(rests=True).at_time(rows, 1.2),
-    )
+    now, later = node.at_time(rows, 1.2), node.at_time(rows, 1.9)
+    resting = node.with_values(rests=True).at_time(rows, 1.2)
     assert bool((now.means[:4] != means[:4]).all()) and torch.equal(now.means[4], means[4])
     assert bool((now.sh_dc[:4] != 0).all()) and bool((now.sh_dc[4] == 0).all())
     assert not torch.equal(now.means, later.means)
@@ -456,32 +424,23 @@ def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, method):
 
 @pytest.fixture(scope="module")
 def tracked_or_not(tmp_path_factory) -> dict[str, Path]:
-    """Scenes of two cameras, one darker, that differ in their tracks alone, each with what fusing makes of it."""
+    """Scenes of two cameras, one darker, that differ in their tracks alone, and three other clouds made of them."""
     root = tmp_path_factory.mktemp("tracks")
     for name, changes in {"tracked": {}, "untracked": {"tracks": False}, "garbled": {"garbled": True}}.items():
         write_scene(
             root / name, frames=4, cameras=("front", "left"), width=SIZE[0], height=SIZE[1], dark=("left",), **changes
         )
         Fuse(scene=root / name, out=root / f"{name}-fuse", settings=FuseConfig(min_object_points=5, voxel_m=0.05)).run()
+    clouds = [read_fused(root / f"{name}-fuse") for name in ("tracked", "untracked", "garbled")]
+    assert len({len(cloud.static) for cloud in clouds}) == 3
+    assert [len(cloud.objects) for cloud in clouds] == [1, 0, 1]
+    assert clouds[1].colors.to_common["left"].gain != clouds[2].colors.to_common["left"].gain
     return {path.name: path for path in root.iterdir()}
 
 
 def fitted_to(worlds: dict[str, Path], name: str, out: Path, method: str, iterations: int = 4) -> Path:
-    small = SMALL_RADIANCE if method == "emernerf" else {}
-    return Fit(
-        scene=worlds[name],
-        fused=worlds[f"{name}-fuse"],
-        out=out / name,
-        settings=small_fit(method, iterations=iterations, **small),
-    ).run()
-
-
-def test_fusing_depends_on_tracks(tracked_or_not):
-    """Otherwise the next test proves nothing: points and colours of the three clouds differ."""
-    clouds = [read_fused(tracked_or_not[f"{name}-fuse"]) for name in ("tracked", "untracked", "garbled")]
-    assert len({len(cloud.static) for cloud in clouds}) == 3
-    assert [len(cloud.objects) for cloud in clouds] == [1, 0, 1]
-    assert clouds[1].colors.to_common["left"].gain != clouds[2].colors.to_common["left"].gain
+    settings = small_fit(method, iterations=iterations, **(SMALL_RADIANCE if method == "emernerf" else {}))
+    return Fit(scene=worlds[name], fused=worlds[f"{name}-fuse"], out=out / name, settings=settings).run()
 
 
 def test_the_page_says_which_methods_know_boxes():
@@ -513,22 +472,16 @@ def test_a_method_learns_from_what_the_table_says_and_from_nothing_else(tracked_
 
     def fitted_without(field: str) -> dict[str, bytes]:
         with monkeypatch.context() as patched:
-            patched.setattr(
-                reader,
-                "load_recorded",
-                lambda *given: ((n, replace(view, **{field: None})) for n, view in load(*given)),
-            )
+            bare = lambda *given: ((n, replace(view, **{field: None})) for n, view in load(*given))
+            patched.setattr(reader, "load_recorded", bare)
             if (row.scene, field) == ("radiance", "lidar"):
                 patched.setattr(radiance_loop, "lidar_rays", lambda scene: None)
             folder = fitted_to(tracked_or_not, "tracked", tmp_path / field, method, 3)
         return {file.name: file.read_bytes() for file in folder.glob("*.safetensors") if file.stem in FITTED}
 
     usual = fitted_without("depth")  # which recorded views never have
-    changed = {
-        name
-        for name, field in {"lidar": "lidar", "sky": "sky", "semantics": "channels"}.items()
-        if fitted_without(field) != usual
-    }
+    fields = {"lidar": "lidar", "sky": "sky", "semantics": "channels"}
+    changed = {name for name, field in fields.items() if fitted_without(field) != usual}
     assert {"color", *changed} == set(row.supervision)
     if row.scene == "gaussians":
         model = fit.load_model(tmp_path / "depth" / "tracked")
@@ -549,9 +502,8 @@ def test_a_static_scene_starts_with_what_moved(tracked_or_not, tmp_path):
 
 
 def test_a_cloud_without_boxes_has_the_settings_of_the_one_with_them(tracked_or_not, tmp_path):
-    Fuse(
-        scene=tracked_or_not["tracked"], out=tmp_path / "coarse", settings=FuseConfig(voxel_m=0.8, match_colors=False)
-    ).run()
+    settings = FuseConfig(voxel_m=0.8, match_colors=False)
+    Fuse(scene=tracked_or_not["tracked"], out=tmp_path / "coarse", settings=settings).run()
     scene = read_scene(tracked_or_not["tracked"])
     fine, coarse = (
         fuse.fused_without_boxes(scene, folder) for folder in (tracked_or_not["tracked-fuse"], tmp_path / "coarse")
@@ -565,8 +517,8 @@ def test_a_cloud_without_boxes_has_the_settings_of_the_one_with_them(tracked_or_
     "changes", [{"poses__learn": True}, {"objects__deformable": False}, {"loss__object_weight": 0.1}]
 )
 def test_settings_about_boxes_are_refused_by_methods_without_them(world, tmp_path, method, changes):
-    with pytest.raises(UsageError, match="knows nothing of it"):
-        fit_to(world, tmp_path / "fit", small_fit(method, **changes)).run()
+    step = fit_to(world, tmp_path / "fit", small_fit(method, **changes))
+    refused("knows nothing of it", step.run, raises=UsageError)
     assert not (tmp_path / "fit").exists()
 
 
@@ -574,12 +526,12 @@ def test_settings_about_boxes_are_refused_by_methods_without_them(world, tmp_pat
 def test_what_a_method_cannot_follow_is_refused(world, tmp_path, method):
     fit_to_world = partial(Fit, scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit")
     for weight in WEIGHTS.get(method, ()):
-        with pytest.raises(UsageError, match="published weights of its own"):
-            fit_to_world(settings=small_fit(method, **{weight.replace(".", "__"): 0.33})).run()
+        step = fit_to_world(settings=small_fit(method, **{weight.replace(".", "__"): 0.33}))
+        refused("published weights of its own", step.run, raises=UsageError)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "model.json").write_text("{}")
-    with pytest.raises(UsageError, match="cannot go on"):
-        fit_to_world(start_from=tmp_path / "other", settings=small_fit(method)).run()
+    step = fit_to_world(start_from=tmp_path / "other", settings=small_fit(method))
+    refused("cannot go on", step.run, raises=UsageError)
 
 
 FOREIGN = {
@@ -600,9 +552,8 @@ def test_help_shows_the_settings_of_a_method_and_others_are_refused(method, flag
     assert command.chosen(Fit, ["--out", "x", f"--method={method}"]) == method
     assert command.chosen(Fit, ["--method", method]) == method
     value = {"--radiance.size": "tiny"}.get(flag, "1")
-    with pytest.raises(UsageError, match=f"does not apply to --method {method}") as refused:
-        command.parse(Fit, ["scene", "--out", "x", "--method", method, flag, value])
-    assert flag in str(refused.value)
+    words = ["scene", "--out", "x", "--method", method, flag, value]
+    assert flag in str(refused(f"does not apply to --method {method}", command.parse, Fit, words, raises=UsageError))
 
 
 @pytest.mark.slow

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import io
 import pickle
 import zipfile
 from pathlib import Path
 
 import pytest
 import torch
-from refusals import refused
+from refusals import Asks, refused
 from test_i3d import made_up, renamed
 
-from mudg.base.errors import InputError
 from mudg.base.weights import is_torchscript, read_checkpoint, read_torchscript
 from mudg.networks import i3d
 
@@ -74,15 +72,9 @@ def rewritten(path: Path, change) -> Path:
     return target
 
 
-class Evil:
-    def __reduce__(self):
-        return print, ("ran",)
-
-
 def test_what_no_network_needs_is_refused(archive: tuple[Path, Outer], capsys: pytest.CaptureFixture[str]) -> None:
-    evil = io.BytesIO()
-    pickle.Pickler(evil, protocol=2).dump(Evil())
-    path = rewritten(archive[0], lambda name, old: evil.getvalue() if name.endswith("/data.pkl") else old)
+    evil = pickle.dumps(Asks(print, "ran"), 2)
+    path = rewritten(archive[0], lambda name, old: evil if name.endswith("/data.pkl") else old)
     refused("print", read_torchscript, path)
     assert capsys.readouterr().out == ""
 
@@ -91,8 +83,7 @@ def test_damaged_archives_are_refused(archive: tuple[Path, Outer]) -> None:
     short = rewritten(archive[0], lambda name, old: old[:-4] if "/data/" in name else old)
     refused("does not fit its storage", read_torchscript, short)
     cut = rewritten(archive[0], lambda name, old: old[:50] if name.endswith("/data.pkl") else old)
-    with pytest.raises(InputError):
-        read_torchscript(cut)
+    refused(".", read_torchscript, cut)
 
 
 class Tree(torch.nn.Module):

@@ -1,7 +1,8 @@
-"""Weather on G-buffers: closed forms, exact inverses, invariants."""
+"""Weather on G-buffers and LiDAR returns: closed forms, exact inverses, invariants."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,21 +13,19 @@ from mudg.base import geometry
 from mudg.base.config import build
 from mudg.base.errors import UsageError
 from mudg.base.palette import ID
-from mudg.base.types import Camera, View
+from mudg.base.types import Camera, SweepPoints, View
 from mudg.base.weather_settings import (
     Conditions,
     FogSettings,
     LightSettings,
     RainSettings,
+    SeasonSettings,
     SnowSettings,
     WeatherSettings,
 )
 from mudg.core import weather
-from mudg.core.weather import air as fog
-from mudg.core.weather import air as noise
-from mudg.core.weather import ground
+from mudg.core.weather import air, ground, lidar
 from mudg.core.weather import light as relight
-from mudg.core.weather import light as tone
 from mudg.core.weather.gbuffer import (
     GBuffer,
     OccluderMap,
@@ -89,18 +88,20 @@ LIGHT = Surroundings(
 # --- response -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("curve", [tone.SRGB, tone.LINEAR, tone.gamma_curve(2.2)], ids=lambda c: c.name)
-def test_a_curve_and_its_inverse_give_back_the_light(curve: tone.ToneCurve) -> None:
+@pytest.mark.parametrize("curve", [relight.SRGB, relight.LINEAR, relight.gamma_curve(2.2)], ids=lambda c: c.name)
+def test_a_curve_and_its_inverse_give_back_the_light(curve: relight.ToneCurve) -> None:
     light = np.linspace(0, 1, 300, dtype=np.float32).reshape(10, 10, 3)
     np.testing.assert_allclose(curve.decode(curve.encode(light)), light, atol=2e-6)
 
 
 def test_the_srgb_curve_has_its_known_values() -> None:
-    assert tone.srgb_encode(np.array([0.0, 0.0031308, 0.18, 1.0])) == pytest.approx([0, 0.04045, 0.46135, 1], abs=2e-5)
+    assert relight.srgb_encode(np.array([0.0, 0.0031308, 0.18, 1.0])) == pytest.approx(
+        [0, 0.04045, 0.46135, 1], abs=2e-5
+    )
 
 
 def test_a_filmic_camera_is_inverted_where_nothing_was_clipped() -> None:
-    curve = tone.FilmicResponse(0.6, (1.02, 1.0, 0.97), saturation=0.9, contrast=1.05, vignette=0.3).curve()
+    curve = relight.FilmicResponse(0.6, (1.02, 1.0, 0.97), saturation=0.9, contrast=1.05, vignette=0.3).curve()
     light = np.random.default_rng(1).uniform(0.05, 1.2, (12, 16, 3))
     shown = curve.encode(light)
     inside = ((shown > 0.001) & (shown < 0.999)).all(-1)
@@ -135,9 +136,8 @@ def test_noisy_depth_gives_steady_normals() -> None:
     noise_share = 1 + 0.01 * np.random.default_rng(3).normal(size=scene.depth.shape).astype(np.float32)
 
     def error_deg(smooth_px: int) -> float:
-        found = from_render(
-            view, scene.color, scene.depth * noise_share, scene.classes, weather.BufferRules(smooth_px=smooth_px)
-        )
+        rules = weather.BufferRules(smooth_px=smooth_px)
+        found = from_render(view, scene.color, scene.depth * noise_share, scene.classes, rules)
         return float(np.degrees(np.arccos(np.clip((found.normal * scene.normal).sum(-1)[~scene.sky], -1, 1))).mean())
 
     assert error_deg(2) < 0.5 * error_deg(0)
@@ -200,8 +200,8 @@ def test_planes_of_different_sizes_are_refused() -> None:
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
 def test_patches_cover_the_share_that_is_asked(share: float) -> None:
     x, y = np.random.default_rng(5).uniform(-400, 400, (2, 200_000))
-    level = noise.patch_threshold(share, 77)
-    assert (noise.patches(x, y, 1.0, 77) > level).mean() == pytest.approx(share, abs=0.02)
+    level = air.patch_threshold(share, 77)
+    assert (air.patches(x, y, 1.0, 77) > level).mean() == pytest.approx(share, abs=0.02)
 
 
 def test_the_hash_is_that_of_the_generated_city() -> None:
@@ -214,15 +214,15 @@ def test_the_hash_is_that_of_the_generated_city() -> None:
 
     for a, b, c in ((0, 0, 0), (1, 2, 3), (-5, 70000, 123456)):
         text = (a * 0x9E3779B1) % 2**32 ^ ((b * 0x85EBCA77 + 0x165667B1) % 2**32) ^ ((c * 0xC2B2AE3D) % 2**32)
-        assert int(noise.hash_bits(a, b, c)) == mix(text)
-        assert int(noise.hash_bits(a, b, c, 9)) == mix((mix(text) + 9 * 0x27D4EB2F) % 2**32)
+        assert int(air.hash_bits(a, b, c)) == mix(text)
+        assert int(air.hash_bits(a, b, c, 9)) == mix((mix(text) + 9 * 0x27D4EB2F) % 2**32)
 
 
 # --- fog ------------------------------------------------------------------------------------------
 
 
 def test_contrast_falls_to_a_twentieth_at_the_visibility() -> None:
-    share = fog.transmittance(np.array([150.0]), np.array([0.0]), 1.5, FogSettings(visibility_m=150))
+    share = air.transmittance(np.array([150.0]), np.array([0.0]), 1.5, FogSettings(visibility_m=150))
     assert share[0] == pytest.approx(0.05, rel=0.01)
 
 
@@ -231,25 +231,25 @@ def test_fog_that_fades_with_height_agrees_with_integration() -> None:
     for rise in (-0.05, 0.0, 0.02, 0.4):
         s = (np.arange(200_000) + 0.5) / 200_000 * 60.0
         expected = (0.03 * np.exp(-(5 + s * rise) / 30)).mean() * 60.0
-        found = fog.optical_depth(np.array([60.0]), np.array([rise]), 5.0, settings)[0]
+        found = air.optical_depth(np.array([60.0]), np.array([rise]), 5.0, settings)[0]
         assert found == pytest.approx(expected, rel=1e-6)
-    towards_sky = fog.optical_depth(np.array([np.inf]), np.array([0.5]), 5.0, settings)[0]
+    towards_sky = air.optical_depth(np.array([np.inf]), np.array([0.5]), 5.0, settings)[0]
     assert towards_sky == pytest.approx(0.03 * np.exp(-5 / 30) * 30 / 0.5)
 
 
 def test_uniform_fog_ends_at_its_top() -> None:
     settings = FogSettings(visibility_m=300, top_m=50)
-    depth = fog.optical_depth(np.array([np.inf, 10.0, np.inf]), np.array([1.0, 1.0, 0.0]), 2.0, settings)
+    depth = air.optical_depth(np.array([np.inf, 10.0, np.inf]), np.array([1.0, 1.0, 0.0]), 2.0, settings)
     assert depth == pytest.approx([0.01 * 48, 0.1, np.inf])
-    from_above = fog.optical_depth(np.array([100.0]), np.array([-1.0]), 80.0, settings)
+    from_above = air.optical_depth(np.array([100.0]), np.array([-1.0]), 80.0, settings)
     assert from_above == pytest.approx([0.01 * 70])
 
 
 def test_two_layers_of_haze_are_one() -> None:
     color, air = np.random.default_rng(2).uniform(0, 1, (50, 3)), np.array([0.7, 0.7, 0.8])
     a, b = np.full(50, 0.6), np.full(50, 0.5)
-    np.testing.assert_allclose(fog.veiled(fog.veiled(color, a, air), b, air), fog.veiled(color, a * b, air), atol=1e-6)
-    np.testing.assert_allclose(fog.unveiled(fog.veiled(color, a, air), a, air), color, atol=1e-6)
+    np.testing.assert_allclose(air.veiled(air.veiled(color, a, air), b, air), air.veiled(color, a * b, air), atol=1e-6)
+    np.testing.assert_allclose(air.unveiled(air.veiled(color, a, air), a, air), color, atol=1e-6)
 
 
 # --- wet ground and snow --------------------------------------------------------------------------
@@ -428,8 +428,8 @@ def test_a_drive_is_edited_image_by_image() -> None:
     for yaw in (-0.2, 0.2):
         view = forward_view(yaw)
         scene = street(view)
-        shown.append(weather.ShownView(view, tone.SRGB.encode(scene.color), scene.depth, scene.classes))
-    drive = weather.drive_facts(shown, tone.SRGB)
+        shown.append(weather.ShownView(view, relight.SRGB.encode(scene.color), scene.depth, scene.classes))
+    drive = weather.drive_facts(shown, relight.SRGB)
     assert drive.surroundings.ground_z_m == pytest.approx(0, abs=1e-3)
     assert drive.heights.top_m.max() == pytest.approx(6, abs=0.3)
     same, result = weather.edited_view(shown[0], Conditions(), 1, drive)
@@ -437,9 +437,9 @@ def test_a_drive_is_edited_image_by_image() -> None:
     assert (result.confidence == 1).all()
     foggy, _ = weather.edited_view(shown[0], CASES["fog"], 1, drive)
     wall = shown[0].classes == ID["building"]
-    air = tone.SRGB.encode(drive.surroundings.airlight[None])[0]
-    assert np.abs(foggy - air)[wall].mean() < 0.5 * np.abs(shown[0].rgb - air)[wall].mean()
-    refused("estimated from views", weather.drive_facts, [], tone.SRGB)
+    haze = relight.SRGB.encode(drive.surroundings.airlight[None])[0]
+    assert np.abs(foggy - haze)[wall].mean() < 0.5 * np.abs(shown[0].rgb - haze)[wall].mean()
+    refused("estimated from views", weather.drive_facts, [], relight.SRGB)
 
 
 def test_ripples_of_the_ground_are_smoothed_farther_than_those_of_walls() -> None:
@@ -452,3 +452,237 @@ def test_ripples_of_the_ground_are_smoothed_farther_than_those_of_walls() -> Non
     }
     assert np.abs(found["road"]).max() < np.sin(np.radians(1.5))
     assert np.abs(found["building"]).max() > np.sin(np.radians(6))
+
+
+def view_at(x: float = 0.0, yaw: float = 0.0, time_s: float = 0.0, size: tuple[int, int] = (60, 40)) -> View:
+    pose = np.eye(4)
+    pose[:3, :3] = geometry.yaw_matrix(yaw)[:3, :3] @ np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    pose[:3, 3] = (x, 0, 1.5)
+    width, height = size
+    return View(Camera("front", width, height, 50.0, 50.0, width / 2, height / 2), pose, time_s)
+
+
+# --- drops, flakes and LiDAR returns --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mm_h", [2.0, 10.0, 50.0])
+def test_numbers_and_areas_of_drops_agree_with_integration(mm_h: float) -> None:
+    d = np.linspace(1, 5, 400_001)
+    n = 8000 * np.exp(-4.1 * mm_h**-0.21 * d)
+    sizes = air.rain_sizes(mm_h)
+    assert sum(s.density for s in sizes) == pytest.approx(np.trapezoid(n, d), rel=1e-6)
+    assert air.area_per_m(sizes) == pytest.approx(np.trapezoid(n * math.pi / 4 * d**2, d) * 1e-6, rel=1e-6)
+
+
+@pytest.mark.parametrize("mm_h", [5.0, 10.0, 50.0])
+def test_the_published_extinction_of_rain_is_twice_the_area_of_the_drops(mm_h: float) -> None:
+    slope = 4.1 * mm_h**-0.21
+    both = 2 * math.pi / 4 * 8000 * 2 / slope**3 * 1e-6
+    assert air.rain_extinction(mm_h) == pytest.approx(both, rel=0.2)
+
+
+SIZE = air.ParticleSize(60.0, 0.002, 5.0)
+FALL = np.array([0.0, 0.0, -5.0])
+
+
+def rows(xyz: np.ndarray) -> set[tuple[float, ...]]:
+    return {tuple(np.round(p, 6)) for p in xyz}
+
+
+def test_two_cameras_see_the_same_drops() -> None:
+    left, right = view_at(yaw=0.15), view_at(yaw=-0.15)
+    a, b = (air.places(SIZE, FALL, view, 6.0, 99) for view in (left, right))
+
+    def both(xyz: np.ndarray) -> np.ndarray:
+        seen = [geometry.project(view, xyz) for view in (left, right)]
+        inside = [(uv[:, 0] > 0) & (uv[:, 0] < 60) & (uv[:, 1] > 0) & (uv[:, 1] < 40) & (z > 0.2) for uv, z in seen]
+        return xyz[inside[0] & inside[1] & (np.linalg.norm(xyz - left.center_world, axis=1) < 6)]
+
+    assert len(both(a)) > 200
+    assert rows(both(a)) == rows(both(b))
+    assert rows(air.places(SIZE, FALL, left, 6.0, 100)) != rows(a)
+
+
+def test_drops_fall_with_their_speed() -> None:
+    now, later = view_at(time_s=3.0), view_at(time_s=3.02)
+    a = air.places(SIZE, FALL, now, 5.0, 1)
+    b = air.places(SIZE, FALL, later, 5.0, 1)
+    shared = rows(a + FALL * 0.02) & rows(b)
+    assert len(shared) > 0.8 * len(a)
+
+
+def test_the_number_of_drops_is_that_of_the_volume() -> None:
+    view = view_at()
+    counts = []
+    for key in range(12):
+        xyz = air.places(SIZE, FALL, view, 6.0, key)
+        uv, z = geometry.project(view, xyz)
+        inside = (uv[:, 0] > 0) & (uv[:, 0] < 60) & (uv[:, 1] > 0) & (uv[:, 1] < 40)
+        counts.append(np.sum(inside & (z > 0) & (z < 5)))
+    volume = 5**3 / 3 * (60 / 50) * (40 / 50)
+    assert np.mean(counts) == pytest.approx(60 * volume, rel=0.02)
+    assert np.std(counts) == pytest.approx(math.sqrt(60 * volume), rel=0.6)
+
+
+@pytest.mark.parametrize("velocity", [(0, 0, 0), (0, 0, -6.0), (15.0, 0, -6)], ids=["still", "falling", "driving"])
+def test_a_drop_covers_the_area_of_its_disc_whatever_its_streak(velocity: tuple[float, float, float]) -> None:
+    view = view_at(size=(300, 200))
+    moving = air.Moving(np.array([[4.0, 0.4, 1.6]]), np.array(velocity, float), 0.02, 0.02)
+    depth = np.full((200, 300), 50.0, np.float32)
+    shown = air.covered(view, depth, moving)
+    stretch = math.sqrt(1 + 0.1**2 + 0.025**2)  # off the axis
+    assert shown.sum() == pytest.approx(stretch * math.pi / 4 * (50 * 0.02 / 4.0) ** 2, rel=1e-6)
+    assert air.covered(view, np.full_like(depth, 3.0), moving).sum() == 0  # behind a surface
+
+
+def test_rows_of_a_streak_follow_the_motion() -> None:
+    view = view_at(size=(300, 200))
+    moving = air.Moving(np.array([[2.0, 0.0, 1.5]]), np.array([0, 0, -8.0]), 0.002, 0.05)
+    shown = air.covered(view, np.full((200, 300), 50.0), moving)
+    lit = np.flatnonzero(shown.sum(1))
+    assert lit[-1] - lit[0] == pytest.approx(50 * 8 * 0.05 / 2.0, abs=2)
+    assert np.flatnonzero(shown.sum(0)).tolist() == [149, 150]
+
+
+def test_all_drops_together_cover_what_the_density_says() -> None:
+    """Mean optical depth = area of the drops per metre x metres, within 5 %."""
+    sizes = air.rain_sizes(50.0)
+    what = air.Falling(sizes, (0.0, 0.0), 6.0, 0.01, "rain")
+    depth = np.full((40, 60), 100.0)
+    shown = [air.falling(view_at(time_s=t), depth, what, (0, 0, 0), 5).mean() for t in (0.0, 1.0, 2.0, 3.0)]
+    assert np.mean(shown) == pytest.approx(air.area_per_m(sizes) * (6.0 - air.NEAREST_M), rel=0.05)
+
+
+SENSOR = lidar.LidarSensor(range_10_m=90.0)
+COUNT = 40_000
+
+
+def beams() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(11)
+    return rng.uniform(5, 120, COUNT), rng.uniform(0.02, 1, COUNT)
+
+
+def detected_in(share: np.ndarray, at: np.ndarray, floor: np.ndarray | float = 0.0) -> float:
+    """Share of reflectances uniform in 0.02..1 whose hard return exceeds the threshold or the fog's return."""
+    limit = np.maximum(SENSOR.threshold, floor)
+    least = limit * math.pi * at**2 / share
+    return float(np.clip((1 - np.maximum(least, 0.02)) / 0.98, 0, 1).mean())
+
+
+LATE = lidar.LidarSensor(range_10_m=90.0, cross_from_m=10.0, cross_to_m=20.0)
+
+
+@pytest.mark.parametrize("sensor", [SENSOR, LATE], ids=["near", "far"])
+@pytest.mark.parametrize("visibility_m", [50.0, 150.0, 600.0, 3000.0])
+def test_shares_of_lost_hard_and_soft_returns_in_fog(visibility_m: float, sensor: lidar.LidarSensor) -> None:
+    """Against an integration: the fog's return by a direct sum, the shares by the reflectances."""
+    ranges, reflectances = beams()
+    found = lidar.in_fog(ranges, reflectances, visibility_m, 3, sensor)
+    at = np.linspace(5, 120, 2001)
+    alpha = math.log(20) / visibility_m
+    r = np.arange(sensor.cross_from_m, 40, 0.01)
+    crossover = np.clip((r - sensor.cross_from_m) / (sensor.cross_to_m - sensor.cross_from_m), 0, 1)
+    centers = np.arange(0.5, 30, 0.05)
+    pulse = [np.where(np.abs(c - r) < 3, np.cos(math.pi * (c - r) / 6) ** 2, 0) for c in centers]
+    power = [0.046 / visibility_m * np.trapezoid(np.exp(-2 * alpha * r) / r**2 * crossover * p, r) for p in pulse]
+    soft = np.interp(at, centers, np.maximum.accumulate(power))
+    hard_share = detected_in(np.exp(-2 * alpha * at), at, soft)
+    assert (found.kind == 1).mean() == pytest.approx(hard_share, abs=0.02)
+    above = soft > sensor.threshold
+    least = np.clip(soft * math.pi * at**2 / np.exp(-2 * alpha * at), 0.02, 1)
+    soft_share = float((above * (least - 0.02) / 0.98).mean())
+    assert found.soft.mean() == pytest.approx(soft_share, abs=0.02)
+    assert (~found.kept).mean() == pytest.approx(1 - hard_share - soft_share, abs=0.02)
+    assert (found.range_m[found.soft] < ranges[found.soft] + 1e-9).all()
+    hard = found.kind == 1
+    np.testing.assert_array_equal(found.range_m[hard], ranges[hard])
+    np.testing.assert_allclose(found.intensity[hard], (reflectances * np.exp(-2 * alpha * ranges))[hard])
+
+
+@pytest.mark.parametrize("mm_h", [0.0, 10.0, 50.0])
+def test_shares_and_noise_of_returns_in_rain(mm_h: float) -> None:
+    ranges, reflectances = beams()
+    found = lidar.in_rain(ranges, reflectances, mm_h, 3, SENSOR)
+    at = np.linspace(5, 120, 4001)
+    assert found.kept.mean() == pytest.approx(
+        detected_in(np.exp(-0.02 * mm_h**0.6 * at) if mm_h else np.ones_like(at), at), abs=0.02
+    )
+    error = ((found.range_m - ranges) / ranges)[found.kept]
+    assert error.std() == pytest.approx(0.02 * (1 - math.exp(-mm_h)) ** 2, rel=0.02)
+
+
+def test_a_sweep_in_fog_and_rain_keeps_its_beams() -> None:
+    rng = np.random.default_rng(4)
+    ranges, reflectances = beams()
+    directions = rng.normal(size=(COUNT, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    points = SweepPoints(
+        (directions * ranges[:, None]).astype(np.float32),
+        reflectances.astype(np.float32),
+        np.zeros(COUNT, np.float32),
+        np.full(COUNT, 2, np.uint8),
+    )
+    clear, kinds = lidar.sweep_in_weather(points, WeatherSettings(), 1, LATE)
+    np.testing.assert_allclose(clear.xyz, points.xyz, rtol=1e-5, atol=1e-5)
+    assert (kinds == 1).all()
+    bad = WeatherSettings(fog=FogSettings(visibility_m=150), rain=RainSettings(mm_h=10))
+    found, _ = lidar.sweep_in_weather(points, bad, 1, LATE)
+    assert 0 < len(found.xyz) < COUNT
+    near, kinds = lidar.sweep_in_weather(points, bad, 1, SENSOR)
+    assert set(near.classes[kinds == 2].tolist()) == {255}
+    assert set(near.classes[kinds == 1].tolist()) == {2}
+    again = lidar.sweep_in_weather(points, bad, 1, LATE)[0]
+    np.testing.assert_array_equal(found.xyz, again.xyz)
+    fog_alone, _ = lidar.sweep_in_weather(points, WeatherSettings(fog=FogSettings(visibility_m=150)), 1, LATE)
+    assert len(found.xyz) < len(fog_alone.xyz)
+    got = found.xyz / np.linalg.norm(found.xyz, axis=1, keepdims=True)
+    assert {tuple(d) for d in np.round(got[:200], 4)} <= {tuple(d) for d in np.round(directions.astype(np.float32), 4)}
+
+
+# --- seasons --------------------------------------------------------------------------------------
+
+LOOKING = geometry.from_rotation_translation(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), (0, 0, 1.5))
+
+
+def hedge(place: float = 0.0):
+    """A hedge 10 m ahead of x = 0, left half; a green wall, right half; one row of bark."""
+    pose = LOOKING.copy()
+    pose[0, 3] += place
+    view = View(Camera("front", 32, 16, 30.0, 30.0, 16.0, 8.0), pose, 0.0)
+    rgb = np.zeros((16, 32, 3), np.float32) + np.array([0.1, 0.3, 0.05], np.float32)
+    rgb[3] = (0.2, 0.15, 0.1)
+    classes = np.full((16, 32), ID["vegetation"], np.uint8)
+    classes[:, 16:] = ID["wall"]
+    return view, from_render(view, rgb, np.full((16, 32), 10.0 - place, np.float32), classes)
+
+
+@pytest.mark.parametrize("leaves", ["autumn", "bare"])
+def test_only_green_plants_change_and_their_luminance_by_the_stated_factor(leaves: str) -> None:
+    view, buffer = hedge()
+    made = relight.in_season(buffer, view, SeasonSettings(leaves=leaves), 7)
+    same = np.ones((16, 32), bool)
+    same[:, :16] = False
+    same[3] = True  # bark
+    assert np.array_equal(made.color[same], buffer.color[same])
+    before, after = (c[~same] @ relight.LUMINANCE for c in (buffer.color, made.color))
+    assert np.allclose(after, before * relight.BRIGHTER[leaves], rtol=1e-5)
+    assert (made.color[~same][:, 0] > made.color[~same][:, 1]).all()  # redder than green
+    half = relight.in_season(buffer, view, SeasonSettings(leaves=leaves, amount=0.5), 7)
+    assert np.allclose(half.color, (buffer.color + made.color) / 2, atol=1e-6)
+
+
+def test_views_agree_and_a_drive_without_green_stays() -> None:
+    """The same place of the hedge has the same colour from 10 m and from 5 m."""
+    colors = []
+    for place in (0.0, 5.0):
+        view, buffer = hedge(place)
+        made = relight.in_season(buffer, view, SeasonSettings(leaves="autumn"), 7).color
+        uv, _ = geometry.project(view, np.array([[10.0, 1.0, 0.8]]))
+        colors.append(made[int(uv[0, 1]), int(uv[0, 0])])
+    assert np.abs(colors[0] - colors[1]).max() < 0.05
+    view, buffer = hedge()
+    grey = replace(buffer, color=np.full_like(buffer.color, 0.3))
+    settings = Conditions(season=SeasonSettings(leaves="bare"))
+    assert np.array_equal(relight.in_season(grey, view, settings.season, 1).color, grey.color)
+    assert not np.array_equal(weather.apply(buffer, settings, view, 0.0, 1).color, buffer.color)
+    assert np.array_equal(weather.apply(buffer, Conditions(), view, 0.0, 1).color, buffer.color)

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from refusals import refused
+from refusals import Asks, refused
 from toy_published import TINY, dynamicrafter_checkpoint, scale_table, tiny_checkpoint
 
 from mudg import app
 from mudg.base import weights
-from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
+from mudg.base.errors import IntegrityError, ResourceError, UsageError
 from mudg.diffusion import convert
 from mudg.diffusion import published as published_files
 from mudg.diffusion.published import PublishedConfig
@@ -159,17 +159,9 @@ def test_harmless_objects_are_ignored_without_their_code(tmp_path, monkeypatch):
     assert torch.equal(weights.read_checkpoint(path)["a"], torch.ones(2))
 
 
-class Malicious:
-    def __init__(self, command):
-        self.command = command
-
-    def __reduce__(self):
-        return os.system, (self.command,)
-
-
 @pytest.mark.parametrize("where", ["beside", "inside"])
 def test_a_pickle_that_runs_code_is_refused(tmp_path, where):
-    bad = Malicious(f"touch {tmp_path / 'ran'}")
+    bad = Asks(os.system, f"touch {tmp_path / 'ran'}")
     content = {"state_dict": {"a": torch.ones(1)}, "x": bad} if where == "beside" else {"state_dict": {"a": bad}}
     refused(r"not loaded(.|\n)*system", weights.read_checkpoint, saved(tmp_path, content))
     assert not (tmp_path / "ran").exists()
@@ -248,9 +240,7 @@ def test_what_does_not_fit_is_listed(tmp_path, complete):
         del state[name]
     state["something.else"] = torch.zeros(1)
     state[ENTER] = torch.zeros(32, 12, 1, 1)
-    with pytest.raises(InputError) as refused:
-        converted(tmp_path, {"state_dict": state})
-    text = str(refused.value)
+    text = str(refused(".", converted, tmp_path, {"state_dict": state}))
     assert "8 missing: " in text
     assert list(complete)[5] in text
     assert "1 unexpected: something.else" in text
@@ -299,8 +289,8 @@ def test_conversion_in_its_own_process(tmp_path, complete):
     assert published_files.load(tmp_path / "model").config.height == 320
     refused("exists", converted_by_process, ConvertConfig(), path, tmp_path / "model", raises=UsageError)
     (tmp_path / "photos").mkdir()
-    with pytest.raises(UsageError, match="do not belong to a model"):
-        converted_by_process(ConvertConfig(), path, tmp_path / "photos", overwrite=True)
+    again = functools.partial(converted_by_process, overwrite=True)
+    refused("do not belong to a model", again, ConvertConfig(), path, tmp_path / "photos", raises=UsageError)
 
 
 @pytest.mark.slow
@@ -315,8 +305,8 @@ def test_errors_come_back_from_the_process(tmp_path, complete):
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of address space are a matter of Linux")
 def test_the_memory_limit_holds(tmp_path, complete):
     path = saved(tmp_path, {"state_dict": {**complete, "big": torch.zeros(64_000_000)}}, "512.ckpt")
-    with pytest.raises(ResourceError, match="memory"):
-        converted_by_process(ConvertConfig(memory_gb=0.1), path, tmp_path / "model")
+    config = ConvertConfig(memory_gb=0.1)
+    refused("memory", converted_by_process, config, path, tmp_path / "model", raises=ResourceError)
     assert not (tmp_path / "model").exists()
 
 

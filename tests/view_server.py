@@ -9,9 +9,22 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from mudg.base.types import View
 from mudg.viewer import view
 from mudg.viewer.live import EditFiles
 from mudg.viewer.settings import ViewConfig
+
+
+def seen_from(view: View) -> dict[str, object]:
+    """A view as the page and its server name it: size, lens, place and axes."""
+    camera, pose = view.camera, view.world_from_cam
+    lens = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    return {**lens, "eye": pose[:3, 3].tolist(), "axes": pose[:3, :3].T.tolist()}
+
+
+def allowed(port: int, token: str, host: str = "127.0.0.1") -> dict[str, str]:
+    """Headers of a request that the server answers."""
+    return {"X_Mudg_Token": token, "Origin": f"http://{host}:{port}", "Host": f"{host}:{port}"}
 
 
 @contextmanager
