@@ -49,7 +49,7 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 
 def test_nothing_is_offered_where_no_package_offers_it() -> None:
-    assert plugins("importer") == {}
+    assert plugins() == {}
 
 
 def test_an_importer_of_another_package_reads_a_recording(installed: Path, truth: Scene, tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_doctor_lists_what_other_packages_offer_and_loads_none_of_it(
 @pytest.mark.parametrize(("name", "got"), [("broken", "AttributeError"), ("gone", "ModuleNotFoundError")])
 def test_code_that_cannot_be_loaded_is_named_with_its_package(installed: Path, name: str, got: str) -> None:
     with pytest.raises(UsageError, match=rf"importer {name}(.|\n)*of my-package 1.2(.|\n)*{got}"):
-        load_plugin("importer", name)
+        load_plugin(name)
 
 
 def test_a_metric_becomes_a_column_of_the_scores(

@@ -61,7 +61,7 @@ def report_machine() -> dict[str, Any]:
         "native library": _native(problems),
         "packages": _packages(problems),
         "optional packages": _optional(),
-        "plugins": {f"importer {name}": origin(point) for name, point in plugins("importer").items()},
+        "plugins": {f"importer {name}": origin(point) for name, point in plugins().items()},
         "video": _video(problems),
         "weights": _weights(problems),
     }
