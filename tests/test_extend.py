@@ -73,7 +73,7 @@ def test_doctor_lists_what_other_packages_offer_and_loads_none_of_it(
 @pytest.mark.parametrize(("name", "got"), [("broken", "AttributeError"), ("gone", "ModuleNotFoundError")])
 def test_code_that_cannot_be_loaded_is_named_with_its_package(installed: Path, name: str, got: str) -> None:
     with pytest.raises(UsageError, match=rf"importer {name}(.|\n)*of my-package 1.2(.|\n)*{got}"):
-        load_plugin("importer", name)
+        load_plugin(name)
 
 
 def test_a_metric_becomes_a_column_of_the_scores(

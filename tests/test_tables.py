@@ -1,12 +1,9 @@
 """Tables of text: one renderer for Markdown, CSV and pages."""
 
-import csv
-import io
-
 import pytest
 
 from mudg.base import html
-from mudg.base.html import PUBLISHED, TextCell, TextLine, TextTable, best_of, csv_text, markdown, markdown_table
+from mudg.base.html import PUBLISHED, TextCell, TextLine, TextTable, best_of, markdown, markdown_table
 
 TABLE = TextTable(
     ("", "FID ↓", "a_b"),
@@ -28,11 +25,6 @@ def test_markdown_marks_the_best():
         "| ours (mudg_s) | **45 %** | - |",
     ]
     assert markdown_table(["a", "b"], []) == ["| a | b |", "|---|---|"]
-
-
-def test_csv_quotes_what_it_must():
-    text = csv_text(["row", "value"], [['a, "b"', 0.5], ["c", ""]])
-    assert list(csv.reader(io.StringIO(text))) == [["row", "value"], ['a, "b"', "0.5"], ["c", ""]] and "\r" not in text
 
 
 def test_a_page_escapes_cells_and_marks_lines():

@@ -28,9 +28,8 @@ if TYPE_CHECKING:
 def write_shards(
     folder: Path, tensors: Mapping[str, Tensor], shard_bytes: int, dtype: torch.dtype | None = None
 ) -> dict[str, str]:
-    """Write tensors, on any device, as `weights_NN.safetensors` of at most about `shard_bytes` each to a tree under a
-    temporary name; returns file name -> sha256. dtype: of floating-point tensors (None: as they are). Memory: one shard
-    twice over."""
+    """Write tensors as `weights_NN.safetensors` of about `shard_bytes` each to a tree under a temporary name; returns
+    file name -> sha256. dtype: of floating-point tensors (None: as they are). Memory: one shard twice over."""
     from safetensors.torch import save as safetensors_bytes
 
     files: dict[str, str] = {}
@@ -70,9 +69,8 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def read_shards(folder: Path, files: object, *, remedy: str = "make the model again") -> dict[str, Tensor]:
-    """The tensors of files written by `write_shards`, checked against their sha256. files: what a description says:
-    names -> sha256. InputError: it says no such thing. IntegrityError: a file is missing or altered; `remedy` says what
-    to do."""
+    """The tensors of files written by `write_shards`. files: what a description says: names -> sha256; if it does not,
+    InputError. IntegrityError: a file is missing or altered; `remedy` says what to do."""
     tensors: dict[str, Tensor] = {}
     if not isinstance(files, Mapping) or not all(isinstance(digest, str) for digest in files.values()):
         what = "the description of a model does not name its weight files"
@@ -170,8 +168,8 @@ def _path(folder: Path, step: int) -> Path:
 
 
 def latest(folder: Path) -> Checkpoint | None:
-    """The newest checkpoint that verifies; None if there is none at all. IntegrityError: checkpoints exist but not one
-    verifies (nothing is deleted)."""
+    """The newest checkpoint that verifies; None if there is none. IntegrityError: there are some but not one
+    verifies."""
     steps = (path for path in folder.glob(f"{_PREFIX}*") if path.is_dir())
     candidates = sorted((path for path in steps if path.name[len(_PREFIX) :].isdigit()), reverse=True)
     problems = []

@@ -6,7 +6,7 @@ import copy
 import dataclasses
 import functools
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar, dataclass_transform
 
@@ -86,8 +86,7 @@ def _plain(value: Any) -> Any:
 
 
 def result_settings(config: Any) -> dict[str, Any]:
-    """What a result depends on: ``to_dict`` without every ``device``, so that a result made or begun on one device is
-    reused or resumed on another."""
+    """What a result depends on: ``to_dict`` without every ``device``: on another device it is reused or resumed."""
     return without_devices(to_dict(config))
 
 
@@ -110,17 +109,22 @@ def load(
     yaml_path: Path | None = None,
     overrides: Mapping[str, Any] | None = None,
 ) -> Config:
-    """Build a configuration from a preset (default: the type's defaults), then a YAML file, then nested overrides.
-    UsageError: unknown key (the nearest is suggested), wrong type or range. InputError: the file is missing or
-    malformed."""
+    """A configuration from a preset (or the type's defaults), then a YAML file, then nested overrides. UsageError:
+    unknown key (the nearest is suggested), wrong type or range. InputError: the file is missing or malformed."""
     usual = config_type() if preset is None else preset
     if yaml_path is None and not overrides:
         return usual
     values = to_dict(usual)
     if yaml_path is not None:
-        content = _read_yaml(yaml_path)
+        from mudg.base import store  # late, with its numpy: --help needs neither
+        from mudg.base.plain_yaml import parse_yaml
+
+        where = str(yaml_path)
+        content = {} if (found := parse_yaml(store.read_bytes(yaml_path), where)) is None else found
+        if not isinstance(content, dict):
+            raise InputError("a configuration file holds keys and values", where=where, got=type(content).__name__)
         content.pop("verb", None)
-        values = _merge(values, content, str(yaml_path), config_type)
+        values = _merge(values, content, where, config_type)
     if overrides:
         values = _merge(values, overrides, "flags", config_type)
     from pydantic import ValidationError
@@ -130,23 +134,17 @@ def load(
     try:
         return _adapter(config_type).validate_python(values)
     except ValidationError as error:
-        path = [str(part) for part in error.errors(include_url=False)[0]["loc"]]
+        path = ".".join(str(part) for part in error.errors(include_url=False)[0]["loc"])
         problem = first_problem(error, f"{yaml_path or 'configuration'}: ", UsageError)
-        if _holds(overrides or {}, path):
-            flag = "--" + ".".join(path).replace("_", "-")
-            problem = problem.located(flag)
+        if any(f"{name}.".startswith(f"{path}.") or path.startswith(f"{name}.") for name in dotted(overrides or {})):
+            problem = problem.located(f"--{path.replace('_', '-')}")
         raise problem from error
 
 
-def _holds(values: Any, path: Sequence[str]) -> bool:
-    """Whether nested values have something at a path, or the value in which it lies."""
-    for part in path:
-        if not isinstance(values, Mapping):
-            return True
-        if part not in values:
-            return False
-        values = values[part]
-    return True
+def dotted(values: Mapping[str, Any], path: str = "") -> Iterator[str]:
+    """Names of nested values, as ``virtual.start``."""
+    for name, value in values.items():
+        yield from dotted(value, f"{path}{name}.") if isinstance(value, Mapping) else (f"{path}{name}",)
 
 
 def nested(dotted: Mapping[str, Any]) -> dict[str, Any]:
@@ -175,20 +173,9 @@ def build(config_type: type[Config], values: Mapping[str, Any], where: str) -> C
         raise first_problem(error, f"{where}: ", UsageError) from error
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
-    from mudg.base import store  # late, with its numpy: --help needs neither
-    from mudg.base.plain_yaml import parse_yaml
-
-    content = parse_yaml(store.read_bytes(path), str(path))
-    if content is None:
-        return {}
-    if not isinstance(content, dict):
-        raise InputError("a configuration file holds keys and values", where=str(path), got=type(content).__name__)
-    return content
-
-
 def _merge(base: dict[str, Any], new: Mapping[str, Any], where: str, kind: Any, path: str = "") -> dict[str, Any]:
-    known = _types_of_fields(kind)
+    hints = typing.get_type_hints(kind) if dataclasses.is_dataclass(kind) else {}
+    known = {field.name: hints[field.name] for field in dataclasses.fields(kind)} if hints else {}
     merged = dict(base)
     for name, value in new.items():
         group = known.get(name)
@@ -208,29 +195,24 @@ def _merge(base: dict[str, Any], new: Mapping[str, Any], where: str, kind: Any, 
     return merged
 
 
-def _types_of_fields(config_type: Any) -> dict[str, Any]:
-    hints = typing.get_type_hints(config_type) if dataclasses.is_dataclass(config_type) else {}
-    return {f.name: hints[f.name] for f in dataclasses.fields(config_type)} if hints else {}
-
-
 def differences(old: Any, new: Any) -> list[str]:
     """What two nested configurations differ in, one ``a.b: x there, y asked`` per value; settings that only one of them
     has (another version named them differently) are counted in one line, which comes first."""
-    values, lonely = [], []
-    _collect_differences(old, new, "", values, lonely)
+    values, lonely = list[str](), list[str]()
+
+    def collect(old: Any, new: Any, path: str) -> None:
+        if isinstance(old, dict) and isinstance(new, dict):
+            for name in sorted(old.keys() | new.keys(), key=str):
+                inside = f"{path}.{name}".lstrip(".")
+                if name not in old or name not in new or isinstance(old[name], dict) != isinstance(new[name], dict):
+                    lonely.append(inside)
+                else:
+                    collect(old[name], new[name], inside)
+        elif old != new:
+            values.append(f"{path}: {old!r} there, {new!r} asked")
+
+    collect(old, new, "")
     if not lonely:
         return values
     named = ", ".join(lonely[:3]) + (f" and {len(lonely) - 3} more" if len(lonely) > 3 else "")
     return [f"settings that only one of the two has, as after a change of version: {named}", *values]
-
-
-def _collect_differences(old: Any, new: Any, path: str, values: list[str], lonely: list[str]) -> None:
-    if isinstance(old, dict) and isinstance(new, dict):
-        for name in sorted(old.keys() | new.keys(), key=str):
-            inside = f"{path}.{name}".lstrip(".")
-            if name not in old or name not in new or isinstance(old[name], dict) != isinstance(new[name], dict):
-                lonely.append(inside)
-            else:
-                _collect_differences(old[name], new[name], inside, values, lonely)
-    elif old != new:
-        values.append(f"{path}: {old!r} there, {new!r} asked")

@@ -52,9 +52,8 @@ SAME_CODE: Final[dict[str, str]] = {}
 
 
 def choose_device(wanted: str, purpose: str, kinds: tuple[str, ...] = ("cpu", "cuda")) -> torch.device:
-    """The device that a verb computes on. Says which, once per purpose (as "fit", "diffusion model"). kinds: of devices
-    that this purpose has an implementation for. UsageError: a kind that is not known, or not implemented for this
-    purpose. ResourceError: it is not on this machine."""
+    """The device that a verb computes on. Says which, once per purpose (as "fit"). kinds: for which the purpose has an
+    implementation; another kind is a UsageError. ResourceError: the device is not on this machine."""
     import torch
 
     name = usual_device(kinds) if wanted == "auto" else wanted

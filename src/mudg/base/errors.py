@@ -67,17 +67,9 @@ def _listed(text: str, separator: str, most: int) -> str:
 
 
 class MudgError(Exception):
-    """Base of all errors raised on purpose.
-
-    Long values are cut and control characters escaped, here for all messages.
-
-    Args:
-        what: one sentence: what is wrong.
-        where: path, record and field, e.g. ``scene.json: frames[12].world_from_cam``.
-        expected: what would have been right.
-        got: what was found.
-        remedy: what the user can do about it.
-    """
+    """Base of all errors raised on purpose. what: one sentence: what is wrong. where: path, record and field, e.g.
+    ``scene.json: frames[12].world_from_cam``. expected: what would have been right. got: what was found. remedy: what
+    the user can do about it. Long values are cut and control characters escaped, here for all messages."""
 
     exit_code = 1
 

@@ -38,16 +38,21 @@ _DISK: Final = {
 
 
 def in_words(error: BaseException, smaller: str = "") -> MudgError | None:
-    """What a user can make of an error that this program did not raise; None for one that is a mistake in the program.
-    smaller: the settings that make the work need less memory."""
+    """An error that this program did not raise, for users; None for a mistake in the program. smaller: settings for
+    less memory."""
     from concurrent.futures.process import BrokenProcessPool  # late: --help needs no processes
 
     if isinstance(error, MudgError):
         return error
     if is_memory(error):
-        free = memory.free_bytes()
+        free, text = memory.free_bytes(), str(error)
+        # numpy: "... for an array with shape (3, 4) and data type float32"
+        if wanted := re.search(r"allocate ([\d.]+ [KMGTPE]i?B)\b(.{0,120})", text, re.DOTALL):
+            asked = wanted[1] + wanted[2]
+        else:
+            asked = memory.in_words(int(wanted[1])) if (wanted := re.search(r"allocate (\d+) bytes", text)) else ""
         got, remedy = f"{memory.in_words(free)} free" if free else "", f"{smaller}; {SMALLER}" if smaller else SMALLER
-        return ResourceError("there is not enough memory", expected=_asked(error), got=got, remedy=remedy)
+        return ResourceError("there is not enough memory", expected=asked, got=got, remedy=remedy)
     if isinstance(error, BrokenProcessPool):
         return ended_process(str(error))
     if isinstance(error, OSError):
@@ -69,17 +74,6 @@ def is_memory(error: BaseException) -> bool:
         return True
     kind = isinstance(error, RuntimeError | ImportError | SystemError)
     return kind and any(sign in str(error) for sign in _NO_MEMORY)
-
-
-def _asked(error: BaseException) -> str:
-    """How much the failed allocation wanted, where the message says that."""
-    text = str(error)
-    # numpy: "... for an array with shape (3, 4) and data type float32"
-    found = re.search(r"allocate ([\d.]+ [KMGTPE]i?B)\b", text)
-    if found:
-        return f"{found[1]}{text[found.end() :][:120]}"
-    found = re.search(r"allocate (\d+) bytes", text)
-    return memory.in_words(int(found[1])) if found else ""
 
 
 def silence(stream: int) -> None:

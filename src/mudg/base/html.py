@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import functools
-import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -74,16 +72,9 @@ def cells(row: Mapping[str, Any], forms: Mapping[str, str]) -> list[str]:
     return ["-" if row[key] is None else form.format(row[key]) for key, form in forms.items()]
 
 
-def csv_text(heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Rows of values as CSV."""
-    out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows([heads, *rows])
-    return out.getvalue()
-
-
 def best_of(better: str, numbers: Mapping[str, float]) -> list[str]:
-    """Names of the best of the numbers as they are shown; none where there are fewer than two. better: ``higher``,
-    ``lower``, or ``one``: those near 1."""
+    """Names of the best of two or more numbers as they are shown. better: ``higher``, ``lower``, or ``one``: those near
+    1."""
     apart = {name: {"higher": -number, "one": abs(number - 1)}.get(better, number) for name, number in numbers.items()}
     return [name for name, number in apart.items() if number == min(apart.values())] if len(apart) > 1 else []
 
@@ -95,8 +86,7 @@ TONES: Final = ("truth", "nearest_fill", "street_gaussians", "mudg_r", "mudg_s")
 
 
 def render(template: str, **values: Any) -> str:
-    """The text of a page from a file in ``assets/templates`` and the values that it names; one that is missing is an
-    error."""
+    """The text of a page from a file in ``assets/templates`` and the values that it names, all of them."""
     return _environment().get_template(template).render(**values)
 
 

@@ -1,10 +1,5 @@
 """A path on this machine, or an address in an object store behind fsspec (S3, Google Cloud, Azure): the same calls for
-both.
-
-    runs = Location.of("s3://bucket/runs")
-    runs.names()                                    ['city', 'kitti']
-    (runs / "kitti").fetch(Path("/scratch/kitti"))  staged in; every file's SHA-256 is compared
-    (runs / "kitti").push(Path("/scratch/kitti"))   uploaded; the manifest is written last
+both, as in ``(Location.of("s3://bucket/runs") / "kitti").fetch(Path("/scratch/kitti"))``.
 
 An uploaded folder holds ``_contents.json``: size and SHA-256 of every file, and whether all have arrived. That record
 alone says what a result is. Requests that fail are repeated by the store's own package. Credentials come from the
@@ -215,16 +210,15 @@ def _files_below(folder: Path) -> list[str]:
 
 @dataclass(frozen=True)
 class Location:
-    """A file or folder on this machine, or in an object store. Made by ``Location.of``. Every method raises
-    ResourceError where the store or the disk fails."""
+    """A file or folder on this machine, or in an object store. ResourceError, everywhere: the store or the disk
+    fails."""
 
     text: str
     """The path, or the address in its one spelling. It never holds credentials."""
 
     @classmethod
     def of(cls, given: str | Path | Location) -> Location:
-        """A location from what a user gave. UsageError: an address of an unknown kind, or one with credentials in
-        it."""
+        """A location from what a user gave. UsageError: an address of an unknown kind, or with credentials in it."""
         if isinstance(given, Location):
             return given
         text = given.as_posix() if isinstance(given, Path) else str(given)
@@ -443,9 +437,9 @@ class Location:
 
     def push(self, frm: Path) -> None:
         """Upload a folder: all files, several at a time, the manifest last; until it is there, what is at this place is
-        no result. Files that are there already are not sent again; those of an earlier push that are no longer part of
-        the folder are removed; files of others stay. InputError: no folder. UsageError: files of others have the same
-        names. IntegrityError: a file did not arrive."""
+        no result. Files that are there are not sent again; those of an earlier push that are gone are removed; others'
+        stay. InputError: no folder. UsageError: files of others have the same names. IntegrityError: a file did not
+        arrive."""
         frm = Path(frm)
         if not frm.is_dir():
             raise InputError("no folder to upload", where=str(frm))

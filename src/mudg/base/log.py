@@ -40,8 +40,8 @@ def _console() -> Console:
 
 
 def _say(lines: Iterable[str], style: str | None = None) -> None:
-    """Control characters and line breaks within a line are escaped. A message that cannot be written (stderr closed, or
-    on a full disk) ends nothing."""
+    """Print lines without control characters. One that cannot be written (stderr closed, or on a full disk) ends
+    nothing."""
     with contextlib.suppress(OSError, ValueError):  # ValueError: the stream is closed
         _console().print(plain_lines(lines), markup=False, style=style)
 

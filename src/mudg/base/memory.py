@@ -101,8 +101,8 @@ PERIOD_S: Final = 0.25
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """What was taken so far. processor_s: of all threads, and of child processes that ended. peak_bytes: None where the
-    system has no ``/proc``."""
+    """What was taken so far; processor_s: of all threads and ended child processes. peak_bytes: None without
+    ``/proc``."""
 
     seconds: float = 0.0
     processor_s: float = 0.0
@@ -130,7 +130,7 @@ class Meter:
     """Measures from its making on: time, and the most memory that this process and its descendants held together."""
 
     def __init__(self) -> None:
-        self._began_s, self._processor_s = time.monotonic(), _processor_seconds()
+        self._began_s, self._processor_s = time.monotonic(), sum(os.times()[:4])  # with children that have ended
         self._peak = held_bytes() or 0
         self._last: Usage | None = None
         self._stopped = threading.Event()
@@ -149,7 +149,7 @@ class Meter:
         if self._last is not None:
             return self._last
         self.look()
-        return Usage(time.monotonic() - self._began_s, _processor_seconds() - self._processor_s, self._peak or None)
+        return Usage(time.monotonic() - self._began_s, sum(os.times()[:4]) - self._processor_s, self._peak or None)
 
     def stop(self) -> Usage:
         """Measure no further."""
@@ -192,7 +192,3 @@ def folder_bytes(folder: Path) -> int:
             with contextlib.suppress(OSError):
                 total += os.lstat(os.path.join(top, name)).st_size
     return total
-
-
-def _processor_seconds() -> float:
-    return sum(os.times()[:4])  # of this process and of children that have ended

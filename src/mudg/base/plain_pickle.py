@@ -1,11 +1,9 @@
 """Reading pickles without running them: an interpreter of the opcodes that knows only plain values and arrays.
 
-Some data sets ship calibration or point clouds as pickles. Python's own reader runs whatever a pickle asks for. This
-one cannot: it never imports, looks up or calls anything that the file names. A name in the file is compared with a
-literal table of makers; each of them builds a plain value from plain values. Any other name is an error that says which
-one it was. The opcodes are cut apart by the standard library's disassembler, which executes nothing.
-
-Bounds: bytes and opcodes are limited, an array may not be longer than the bytes that are there, and nothing recurses.
+Python's own reader runs whatever a pickle asks for. This one never imports, looks up or calls anything that the file
+names: a name is compared with a literal table of makers, which build plain values from plain values; any other is an
+error. The opcodes are cut apart by the standard library's disassembler, which executes nothing. Bytes and opcodes are
+limited, an array may not be longer than the bytes that are there, and nothing recurses.
 """
 
 from __future__ import annotations
@@ -82,8 +80,8 @@ class Array:
 def _filled(shape: Any, dtype: Any, order: str, content: Any) -> NDArray[Any]:
     if not isinstance(dtype, Dtype):
         raise ValueError("array without a type")
-    sizes = [_integer(side) for side in shape]
-    if len(sizes) > _MAX_DIMENSIONS or min(sizes, default=0) < 0:
+    sizes = list(shape)
+    if any(type(side) is not int for side in sizes) or len(sizes) > _MAX_DIMENSIONS or min(sizes, default=0) < 0:
         raise ValueError(f"array of shape {tuple(sizes)}")
     count = math.prod(sizes)
     if dtype.value.hasobject:
@@ -97,12 +95,6 @@ def _filled(shape: Any, dtype: Any, order: str, content: Any) -> NDArray[Any]:
             raise ValueError(f"array of shape {tuple(sizes)} and type {dtype.value} holds {len(content)} bytes")
         flat = np.frombuffer(content, dtype.value)
     return flat.reshape(sizes, order="F" if order == "F" else "C")
-
-
-def _integer(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise ValueError(f"{value!r} is no whole number")
-    return value
 
 
 def _new_array(kind: Any, _shape: Any, _code: Any) -> Array:

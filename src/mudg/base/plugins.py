@@ -5,7 +5,7 @@ Names are read from package metadata; a package's code is imported only when you
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
 
 from mudg.base.errors import UsageError
 
@@ -13,14 +13,15 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 GROUP: Final = "mudg.plugins"
+_KIND: Final = "importer."
 
 
-def plugins(kind: Literal["importer"]) -> dict[str, EntryPoint]:
-    """Names of a kind that installed packages offer, in order, and where their code is."""
+def plugins() -> dict[str, EntryPoint]:
+    """Names of importers that installed packages offer, in order, and where their code is."""
     from importlib.metadata import entry_points  # 14 ms
 
     offered = sorted(entry_points(group=GROUP), key=lambda point: point.name)
-    return {point.name.removeprefix(f"{kind}."): point for point in offered if point.name.startswith(f"{kind}.")}
+    return {point.name.removeprefix(_KIND): point for point in offered if point.name.startswith(_KIND)}
 
 
 def origin(point: EntryPoint) -> str:
@@ -29,13 +30,12 @@ def origin(point: EntryPoint) -> str:
     return f"{point.value}{package}"
 
 
-def load_plugin(kind: Literal["importer"], name: str) -> Any:
-    """The object behind a name of ``plugins``. KeyError: no installed package offers it. UsageError: its code cannot be
-    imported."""
-    point = plugins(kind)[name]
+def load_plugin(name: str) -> Any:
+    """The object behind a name of ``plugins``, else KeyError. UsageError: its code cannot be imported."""
+    point = plugins()[name]
     try:
         return point.load()
     except (ImportError, AttributeError) as error:
-        what = f"the {kind} {name} of another package cannot be loaded"
+        what = f"the importer {name} of another package cannot be loaded"
         remedy = "mend or uninstall the package that offers it"
         raise UsageError(what, where=origin(point), got=f"{type(error).__name__}: {error}", remedy=remedy) from error

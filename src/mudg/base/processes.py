@@ -1,17 +1,6 @@
 """Processes, threads, interrupts, and errors that cross a process boundary. Everything of that kind in the package is
 here.
 
-    run_in_processes    one function over many arguments, several processes at a time
-    calls_beside        the same while the caller does something else
-    Pool                the processes themselves
-    computed_ahead      one function over numbers in order, several threads at a time
-    run_limited         one call on a foreign file, under a limit of address space
-    Interruption        Ctrl-C and SIGTERM wait for the end of a step
-    one_torch_thread    results that do not depend on how many cores are free
-    child_environment   threads of processes that are started meanwhile
-    process_alive       whether a process still runs
-    life_line           commands that end with the process that started them
-
 Children are spawned, never forked. What parent and child tell each other beside arguments and results is JSON text.
 """
 
@@ -192,8 +181,7 @@ def run_in_processes(
 
 @contextlib.contextmanager
 def _working(processes: int) -> Iterator[Pool]:
-    """A pool for this block. Where the block is stopped, so are the calls; a worker that died ends all others: nobody
-    waits for one that may never answer."""
+    """A pool for this block. Where it is stopped, so are the calls; a worker that died ends all others."""
     pool = Pool(processes)
     try:
         yield pool
@@ -211,10 +199,9 @@ def _working(processes: int) -> Iterator[Pool]:
 def calls_beside(
     function: Callable[..., object], arguments: Sequence[tuple[Any, ...]], processes: int
 ) -> Iterator[None]:
-    """Call a module's ``function`` with each of ``arguments`` in processes of one thread each while the block runs.
-    Once a call fails, none begins any more. At the end of the block calls that have not begun are dropped, and those
-    that run are waited for; where it ends with an error or is stopped (Ctrl-C, SIGTERM), they are stopped. Errors as in
-    ``run_in_processes``, at the end of the block."""
+    """``run_in_processes`` while the block runs, without results. Once a call fails, none begins any more. At the end
+    of the block calls that have not begun are dropped, and those that run are waited for; where it ends with an error
+    or is stopped (Ctrl-C, SIGTERM), they are stopped. Errors of calls are raised at the end of the block."""
     with _working(processes) as pool:
         with child_environment():
             futures = [pool.submit(_stoppable, function, items) for items in arguments]
@@ -347,13 +334,8 @@ def _prepare_child() -> None:
 
     log.set_quiet(True)
     torch.set_num_threads(1)
-    end_with_parent()
-
-
-def end_with_parent() -> None:
-    """End this spawned process when its parent is gone: a worker would wait for work for ever."""
     parent = multiprocessing.parent_process()
-    if parent is not None:
+    if parent is not None:  # a worker would wait for work for ever
         _end_after(functools.partial(wait, [parent.sentinel]), "parent")
 
 

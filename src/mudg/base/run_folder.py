@@ -60,8 +60,8 @@ class Replacement:
         return store.retired_path(self.folder)
 
     def begin(self) -> Path:
-        """Make the staging folder, or take up the one that is there; returns it. ResourceError: the folder is a mount
-        point, or its parent cannot be written."""
+        """Make the staging folder, or take up the one that is there. ResourceError: a mount point, or it cannot be
+        made."""
         if os.path.ismount(self.folder):
             remedy = "choose an --out inside it"
             raise ResourceError("a mount point cannot be replaced", where=str(self.folder), remedy=remedy)
@@ -263,8 +263,7 @@ def is_temporary(name: str) -> bool:
 
 
 def run_state(folder: Path) -> dict[str, Any]:
-    """What ``run.json`` says; empty if the folder is missing or holds nothing. UsageError: it holds something else than
-    a run."""
+    """What ``run.json`` says; empty if nothing is in the folder. UsageError: it holds something else than a run."""
     what, empty = "the output folder holds files of something else", "choose an empty --out"
     refused = UsageError(what, where=str(folder), remedy=empty)
     if not folder.is_dir():
@@ -292,24 +291,20 @@ def run_state(folder: Path) -> dict[str, Any]:
 
 def known_input(folder: Path, name: str) -> Path | None:
     """Where an input of a result lies, as seen from the result or from the root; None if unknown, gone or changed."""
-    try:
+    with contextlib.suppress(InputError, KeyError, TypeError, IndexError):
         state = store.read_json(folder / _STATE)
         places, digest = state["paths"][name], state["inputs"][name]
-        for place in (folder / places[0], Path(places[1])):
-            if place.exists() and store.digest(place) == digest:
-                return place
-    except (InputError, KeyError, TypeError, IndexError):
-        pass
+        places = (place for place in (folder / places[0], Path(places[1])) if place.exists())
+        return next((place for place in places if store.digest(place) == digest), None)
     return None
 
 
 def _owner(lock: Path) -> tuple[int, str] | None:
     """Process and machine that hold a lock."""
-    try:
+    with contextlib.suppress(InputError, KeyError, TypeError, ValueError):
         owner = store.read_json(lock)
         return int(owner["pid"]), str(owner["host"])
-    except (InputError, KeyError, TypeError, ValueError):
-        return None
+    return None
 
 
 def own_names(output: VerbOutput, folder: Path) -> list[str]:
@@ -479,7 +474,7 @@ class RunDir:
             self._board.flush()
 
     def watch(self) -> None:
-        """Write what is logged from now on to ``tensorboard/`` as well. No result depends on it, and no manifest lists
+        """Write what is logged from now on to ``tensorboard/``, too. No result depends on it, and no manifest lists
         it."""
         from torch.utils.tensorboard import SummaryWriter
 
@@ -502,8 +497,8 @@ class RunDir:
                 self.path.rmdir()
 
     def finish(self, summary: Mapping[str, Any] | None = None) -> None:
-        """Mark the folder complete: hash every file of the verb, write the manifest, release the lock, and take the
-        place of the result that is to be replaced."""
+        """Mark the folder complete: write the manifest, release the lock, and take the place of what is to be
+        replaced."""
         remove_files(self.path, list(filter(is_temporary, all_names(self.path))))  # of runs that were killed
         if self._board is not None:
             self._board.close()

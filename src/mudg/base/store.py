@@ -128,8 +128,7 @@ def write_image(path: Path, picture: NDArray[np.uint8] | Image.Image, **options:
 
 
 def write_in_tree(path: Path, content: bytes) -> None:
-    """Write a file of a tree that is still under a temporary name; ``sync_tree`` must follow before the tree is
-    renamed: one journal flush for a thousand small files."""
+    """Write a file of a tree under a temporary name; one ``sync_tree`` for all follows before the tree is renamed."""
     make_folder(path.parent)
     with _writing(path):
         Path(path).write_bytes(content)
@@ -149,13 +148,10 @@ def sync_tree(folder: Path) -> None:
         os.sync()
         return
     with _writing(folder):
-        for path in sorted(Path(folder).rglob("*")):
+        for path in Path(folder).rglob("*"):
             if path.is_file():
                 with path.open("rb+") as handle:
                     os.fsync(handle.fileno())
-            else:
-                fsync_directory(path)
-    fsync_directory(folder)
 
 
 def create_once(path: Path, content: bytes) -> bool:
@@ -168,22 +164,18 @@ def create_once(path: Path, content: bytes) -> bool:
         with _temporary(path) as temporary:
             temporary.write_bytes(content)
             _complete(temporary)
-            return _linked(temporary, path, content)
-
-
-def _linked(temporary: Path, path: Path, content: bytes) -> bool:
-    try:
-        os.link(temporary, path)
-    except FileExistsError:
-        return temporary.stat().st_nlink == 2  # a network drive can lose the answer to a link that it made
-    except OSError:  # no links here: the name is taken first and filled then
-        try:
-            with path.open("xb") as handle:
-                handle.write(content)
-        except FileExistsError:
-            return False
-    fsync_directory(path.parent)
-    return True
+            try:
+                os.link(temporary, path)
+            except FileExistsError:
+                return temporary.stat().st_nlink == 2  # a network drive can lose the answer to a link that it made
+            except OSError:  # no links here: the name is taken first and filled then
+                try:
+                    with path.open("xb") as handle:
+                        handle.write(content)
+                except FileExistsError:
+                    return False
+        fsync_directory(path.parent)
+        return True
 
 
 def make_folder(path: Path) -> None:
@@ -245,12 +237,8 @@ def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return result
 
 
-def _no_constants(name: str) -> Any:
-    raise ValueError(f"{name} is not JSON")
-
-
 def _finite(number: str) -> None:
-    if math.isinf(float(number)):
+    if not math.isfinite(float(number)):
         raise ValueError(f"{number[:40]} is beyond what a number can be")
 
 
@@ -268,7 +256,7 @@ def parse_json(text: str | bytes, where: str) -> Any:
     try:
         if isinstance(text, bytes):
             text = text.decode(json.detect_encoding(text))
-        value = json.loads(text, object_pairs_hook=_no_duplicates, parse_constant=_no_constants)
+        value = json.loads(text, object_pairs_hook=_no_duplicates, parse_constant=_finite)
         if _HALVES.search(text):
             json.dumps(value, ensure_ascii=False).encode()
         if _BEYOND.search(text):
@@ -335,8 +323,8 @@ def read_text(path: Path) -> str:
 
 
 def append_line(path: Path, text: str) -> None:
-    """Append one line to a log. A crash or a full disk (ResourceError) can lose the last line, never an earlier one;
-    half a line does not stay."""
+    """Append a line to a log. A crash or a full disk (ResourceError) can lose the last line, never an earlier one or
+    half of one."""
     make_folder(path.parent)
     with _writing(path), Path(path).open("ab+", buffering=0) as handle:
         end = _end_of_lines(handle)
@@ -373,8 +361,8 @@ def sha256_file(path: Path) -> str:
 def write_safetensors(
     path: Path, tensors: Mapping[str, NDArray[Any] | Tensor], metadata: Mapping[str, str] | None = None
 ) -> None:
-    """Write named arrays (numpy or torch, any device) as one safetensors file with these texts in its header,
-    atomically; without a copy of them in memory."""
+    """Write named arrays (numpy or torch, any device) as one safetensors file, atomically and without a copy in
+    memory."""
     from safetensors import SafetensorError
     from safetensors.numpy import save_file
 
@@ -488,8 +476,8 @@ def write_manifest(folder: Path, names: Sequence[str] | None = None) -> str:
 
 
 def verify_manifest(folder: Path) -> str:
-    """Check every file named in the manifest; return the manifest's digest. IntegrityError: the manifest is missing or
-    malformed, or a file is missing or altered."""
+    """Check every file in the manifest; return the manifest's digest. IntegrityError: it or a file is missing or
+    altered."""
     path = folder / MANIFEST
     try:
         files = read_json(path)["files"]

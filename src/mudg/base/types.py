@@ -279,8 +279,7 @@ class View(_Brief):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Trajectory(_Brief):
-    """An ordered path of views of one camera. name: e.g. ``left_2m``. origin: a recorded path, or one shifted from
-    it."""
+    """An ordered path of views of one camera, recorded or shifted from a recorded one. name: e.g. ``left_2m``."""
 
     name: str
     views: tuple[View, ...]
@@ -325,9 +324,8 @@ class Photo(_Brief):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Sweep(_Brief):
-    """One turn of a LiDAR. id: ``<sensor>/<digits>``, unique in the scene. time_s: seconds on the scene's clock; the
-    points (``SweepPoints``) are motion-compensated to it. world_from_lidar: f64[4, 4], rigid, metres, at that time;
-    copied and read-only."""
+    """One turn of a LiDAR. id: ``<sensor>/<digits>``, unique in the scene. time_s: on the scene's clock; the points
+    (``SweepPoints``) are motion-compensated to it. world_from_lidar: rigid f64[4, 4], metres; copied and read-only."""
 
     id: str
     sensor: str
@@ -396,8 +394,7 @@ class Track(_Brief):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class EgoPath(_Brief):
-    """The path of the recording vehicle: times f64[T] in seconds, strictly increasing, and rigid poses f64[T, 4, 4],
-    metres."""
+    """The path of the vehicle: times f64[T], seconds, strictly increasing; rigid poses f64[T, 4, 4], metres."""
 
     times_s: NDArray[np.float64]
     world_from_ego: Matrix
@@ -414,9 +411,8 @@ class EgoPath(_Brief):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Source(_Brief):
-    """Where a scene comes from: data set or generator, and licence. recipe: what a generated scene needs to rebuild its
-    exact truth; None for recordings. notes: sentences a reader of results should know (assumed timestamps, derived
-    poses)."""
+    """Where a scene comes from, and under which licence. recipe: what a generated scene needs to rebuild its exact
+    truth; None for recordings. notes: what a reader of results should know (assumed timestamps, derived poses)."""
 
     dataset: str
     licence: str
@@ -688,10 +684,9 @@ class Gaussians(_Brief):
 
 @dataclass(slots=True, eq=False, repr=False)
 class RasterTrace(_Brief):
-    """What densification needs to know about a render; of several views drawn at once, with a leading dimension V.
-    means2d: f32[N, 2] pixels; its gradient is kept after backward. radii: i32[N, 2] half extent in pixels, 0 = not
-    drawn. visible: bool[N]. abs_grad2d: f32[N, 2], sum over pixels of absolute gradients; filled by backward if asked
-    for."""
+    """What densification needs to know about a render; of several views, with a leading dimension V. means2d: f32[N, 2]
+    pixels; its gradient is kept after backward. radii: i32[N, 2] half extent in pixels, 0 = not drawn. visible:
+    bool[N]. abs_grad2d: f32[N, 2], sum over pixels of absolute gradients; filled by backward if asked for."""
 
     means2d: Tensor
     radii: Tensor

@@ -26,8 +26,7 @@ def version() -> str:
 
 @functools.cache
 def environment() -> dict[str, Any]:
-    """Versions and machine facts that results may depend on. Holds no host name, user name or path. Looked up once:
-    metadata is parsed anew at every question."""
+    """Versions and machine facts that results may depend on, without host name, user name or path; looked up once."""
     machine = {"system": platform.system(), "machine": platform.machine(), "cpu_count": os.cpu_count()}
     packages = {
         name: installed(name) or "missing" for name in ("torch", "numpy", "scipy", "pillow", "safetensors", "av")

@@ -126,8 +126,7 @@ class Conditions(StrictRecord):
 
     @property
     def changes_air_ground_or_light(self) -> bool:
-        """Whether fog, rain, snow, wet ground or another light is asked for; seasons and exposure alone do not
-        count."""
+        """Whether fog, rain, snow, wet ground or another light is asked for."""
         weather = self.weather
         rain, snow = weather.rain is not None and weather.rain.mm_h > 0, weather.snow
         snowy = snow is not None and (snow.mm_h > 0 or snow.cover > 0)

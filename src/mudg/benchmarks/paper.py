@@ -9,6 +9,8 @@ logs at a place, as one set as in papers; a mean of the distances of small sets 
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +24,7 @@ from numpy.typing import NDArray
 from mudg.base import config as configuration
 from mudg.base import store
 from mudg.base.errors import InputError
-from mudg.base.html import ARROWS, PUBLISHED, TextCell, TextLine, TextTable, best_of, csv_text, markdown_table
+from mudg.base.html import ARROWS, PUBLISHED, TextCell, TextLine, TextTable, best_of, markdown_table
 from mudg.base.html import markdown as rendered
 from mudg.base.run_folder import refuse_overlap
 from mudg.benchmarks.chain import Facts, compare, films, refuse_foreign, render_page, seconds_of
@@ -505,7 +507,9 @@ def as_csv(doc: Facts) -> str:
                 best = int(row["name"] in doc["best"][place][key])
                 last = [result.get("logs", ""), *counts, result.get("reason", ""), best]
                 rows.append([*first, place, key, *numbers, *last])
-    return csv_text("kind row source place metric value standard_error logs n n_reference reason best".split(), rows)
+    heads, out = "kind row source place metric value standard_error logs n n_reference reason best", io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows([heads.split(), *rows])
+    return out.getvalue()
 
 
 def page(doc: Facts) -> str:

@@ -66,14 +66,8 @@ class Ending:
 
 def run_step(words: Sequence[str], folder: Path, threads: int, stop: Stop, *, alone: bool = False) -> Ending:
     """Run a command in a process group of its own and wait for its end. It ends with this process, however that ends.
-
-    Args:
-        folder: where it runs. threads: that it may use. alone: wait until no other step runs on this
-            machine.
-
-    Raises:
-        UsageError: there is no such program. ResourceError: no process can be started.
-    """
+    alone: wait until no other step runs on this machine. UsageError: there is no such program. ResourceError: no
+    process can be started."""
     own = {"OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "PASSIVE", "MUDG_THREADS": str(threads), _HELD: "1"}
     with _turn(alone, stop), tempfile.TemporaryFile() as said, processes.life_line() as line:
         began_s = time.monotonic()

@@ -73,11 +73,8 @@ class LocalRun:
 
 def run_on_ray(job: Job, entries: Sequence[Entry], batch: BatchConfig, tell: Tell) -> None:
     """One task of a Ray cluster per scene: the one at ``ray_address``, the one Ray finds, or one on this machine.
-
-    Raises:
-        ResourceError: Ray is not installed, or no cluster answers. KeyboardInterrupt: stopped; running steps have
-            written checkpoints.
-    """
+    ResourceError: Ray is not installed, or no cluster answers. KeyboardInterrupt: stopped; running steps have written
+    checkpoints."""
     try:
         import ray
     except ImportError as error:
@@ -150,12 +147,8 @@ class SlurmTask:
 
 
 def submit_to_slurm(job: Job, entries: Sequence[Entry], batch: BatchConfig) -> tuple[str, Path]:
-    """Submit an array job of ``batch.jobs`` tasks; returns its number and the folder of its messages.
-
-    Raises:
-        ResourceError: submitit is not installed, or there is no Slurm, or it refuses. UsageError: options that cannot
-            be.
-    """
+    """Submit an array job of ``batch.jobs`` tasks; returns its number and the folder of its messages. ResourceError:
+    submitit is not installed, there is no Slurm, or it refuses. UsageError: options that cannot be."""
     try:
         import submitit
     except ImportError as error:

@@ -47,15 +47,8 @@ class Entry:
 
 def read_list(listed: Path | str, settings: Sequence[str] = ()) -> list[Entry]:
     """Entries of a list file, or one for each entry of a folder (but for what an earlier run over a list wrote there).
-
-    Relative sources count from the list's folder. Without a name, the last part of the source is taken.
-
-    Args:
-        listed: a path, or an address (``s3://...``). settings: settings a line may give.
-
-    Raises:
-        InputError: missing, empty, malformed, or two lines that would write one folder.
-    """
+    Relative sources count from the list's folder. settings: those that a line may give. InputError: missing, empty,
+    malformed, or two lines that would write one folder."""
     place = Location.of(listed)
     if place.local is not None and place.local.is_dir():
         names = sorted(path.name for path in place.local.iterdir() if not _LEFT_OUT.fullmatch(path.name))
@@ -122,11 +115,7 @@ def shard_of(name: str, count: int) -> int:
 
 def parse_shard(text: str, environment: Mapping[str, str] = os.environ) -> tuple[int, int]:
     """(i, n) of ``"i/n"``; of ``"env"`` and ``"env/n"``, where the environment of a scheduler says i; (0, 1) of an
-    empty text.
-
-    Raises:
-        UsageError: not of this form, or the environment does not say it.
-    """
+    empty text. UsageError: not of this form, or the environment does not say it."""
     if not text:
         return 0, 1
     first, _, count = text.partition("/")
@@ -236,15 +225,11 @@ def _key(stage: BatchStage, entry: Entry, needs: Mapping[str, str]) -> str:
 def plan_of(
     names: Sequence[str], lines: Mapping[str, Sequence[str]], settings: Mapping[str, Any], command: Sequence[str] = ()
 ) -> BatchPlan:
-    """The plan of these steps.
+    """The plan of these steps. UsageError: an unknown step, one twice, or one whose inputs no step makes.
 
-    Args:
-        lines: words after ``mudg`` of every step. Names of other steps in braces stand for their results, ``{scene}``
-            for that of annotate or ingest, or for the source.
-        settings: those of ``mudg run``, as JSON values. command: a program of the user's own, as the step ``command``.
-
-    Raises:
-        UsageError: an unknown step, one twice, or one whose inputs no step makes.
+    lines: words after ``mudg`` of every step; names of other steps in braces stand for their results, ``{scene}`` for
+    that of annotate or ingest, or for the source. settings: those of ``mudg run``, as JSON values. command: a program
+    of the user's own, as the step ``command``.
     """
     if command:
         if COMMAND not in names:
@@ -273,12 +258,8 @@ def plan_of(
 
 
 def command_of(unit: Unit, places: Mapping[str, str], out: str, config: str) -> list[str]:
-    """The command line of a step of a scene.
-
-    Args:
-        places: ``source`` and steps -> where they lie. out: folder to write. config: file of its settings, if it has
-            any.
-    """
+    """The command line of a step of a scene. places: ``source`` and steps -> where they lie. out: folder to write.
+    config: file of its settings, if it has any."""
     filled = {**places, "out": out, "name": unit.entry.name}
     words = [_PLACEHOLDER.sub(lambda match: filled.get(match[1], match[0]), word) for word in unit.stage.words]
     if unit.stage.is_own:

@@ -171,11 +171,8 @@ class BatchFolder:
     # plan and list --------------------------------------------------------------------------------
 
     def begin(self, plan: BatchPlan, entries: Sequence[Entry]) -> None:
-        """Put plan and list on record, or check that they are the same.
-
-        Raises:
-            UsageError: the folder holds a batch of other steps or settings, or something else.
-        """
+        """Put plan and list on record, or check that they are the same. UsageError: the folder holds a batch of other
+        steps or settings, or something else."""
         file, record = self.own / "plan.json", json.loads(store.json_text(plan.record()))
         names = [name for name in self.out.names() if not name.startswith(".")] if self.out.local is not None else []
         if names and BOOKKEEPING not in names:  # another shard may begin at the same moment
@@ -228,16 +225,9 @@ class BatchFolder:
         self, shard: tuple[int, int] = (0, 1), *, numbered: bool = False, take_over: bool = False
     ) -> Iterator[Location]:
         """Drive the batch, or one shard of it, alone. Yields the owner's record, which is removed at the end unless
-        somebody changed it.
-
-        Args:
-            numbered: a scheduler numbered this task, and runs every number once: what an earlier one left is taken
-                over.
-            take_over: take over from any other driver.
-
-        Raises:
-            UsageError: another driver works on it, or may do so on another machine.
-        """
+        somebody changed it. numbered: a scheduler numbered this task, and runs every number once: what an earlier one
+        left is taken over. take_over: from any other driver. UsageError: another driver works on it, or may do so on
+        another machine."""
         index, count = shard
         name = "owner.json" if count == 1 else f"owner-{index}-of-{count}.json"
         mine, me = self.own / name, Owner(host=this_host(), process=os.getpid(), since=time.time(), shard=shard)

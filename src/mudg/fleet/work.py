@@ -74,15 +74,9 @@ class InputStore:
 
     @contextlib.contextmanager
     def held(self, source: Location, version: str, stop: Stop, *, keep: bool = False) -> Iterator[Path]:
-        """The file or folder at an address, on this machine, for as long as the block runs.
-
-        Args:
-            version: of what lies there, where the address alone does not tell. keep: leave it there, for others that
-                come later.
-
-        Raises:
-            InputError: nothing is there. ResourceError: no connection, the disk is full, or work is to stop.
-        """
+        """The file or folder at an address, on this machine, for as long as the block runs. version: of what lies
+        there, where the address alone does not tell. keep: leave it there for others. InputError: nothing is there.
+        ResourceError: no connection, the disk is full, or work is to stop."""
         place = self._place(source, version)
         content, mark, file = place / "content" / source.name, place / "complete", place.with_suffix(".lock")
         store.create_once(file, b"")
@@ -126,12 +120,9 @@ class InputStore:
 
 @dataclass(frozen=True)
 class Job:
-    """What every task of a batch needs to know.
-
-    Args:
-        threads: of each step. grace_s: seconds that a step has to stop. scratch: folder for unfinished results (None:
-            in the output if that is a folder, else the system's) and for inputs from a store. token: of the driver.
-    """
+    """What every task of a batch needs to know. threads: of each step. grace_s: seconds that a step has to stop.
+    scratch: folder for unfinished results (None: in the output if that is a folder, else the system's) and for inputs
+    from a store. token: of the driver."""
 
     folder: BatchFolder
     plan: BatchPlan

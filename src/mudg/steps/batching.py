@@ -61,20 +61,13 @@ def run(
     take_over: bool = False,
     dry: bool = False,
 ) -> dict[str, Any]:
-    """Run the steps of a batch, or submit the tasks that do.
+    """Run the steps of a batch, or submit the tasks that do. listed, out: paths or addresses. settings, lines: of the
+    steps, and their words (``plan_of``). shard_text: ``i/n``, ``env`` or ``env/n``, or empty. wait: for the end of an
+    array job. dry: only say what there is to do.
 
-    Args:
-        listed: path or address of the list. out: path or address of the results. batch: where scenes run. settings: of
-            the steps. lines: words of every step (``plan_of``). shard_text: ``i/n``, ``env`` or ``env/n``, or empty.
-            wait: for the end of an array job. scratch: folder for unfinished results. take_over: drive the batch even
-            if another driver may be alive elsewhere. dry: only say what there is to do.
-
-    Returns:
-        Counts, ``text``, and ``exit_code``: 0, or 10 plus the number of failed steps of this call (at most 99).
-
-    Raises:
-        UsageError: settings that contradict each other, an output that belongs to another batch, or to another driver.
-            InputError: a bad list. KeyboardInterrupt: asked to stop; running steps have written checkpoints.
+    Returns counts, ``text``, and ``exit_code``: 0, or 10 plus the number of failed steps of this call (at most 99).
+    UsageError: settings that contradict each other, or an output of another batch or driver. InputError: a bad list.
+    KeyboardInterrupt: asked to stop; running steps have written checkpoints.
     """
     scenes = read_list(listed, (*OF_A_LINE, REVISION))
     part = parse_shard(shard_text)
@@ -169,8 +162,7 @@ def _with_absolute_paths(values: Any) -> Any:
 
 
 def show_status(out: str, every_s: float = 0.0) -> dict[str, Any]:
-    """How far a batch is, what has failed and what it took. ``every_s``: show it again until nothing is left (0:
-    once)."""
+    """How far a batch is, what has failed and what it took; every so many seconds until nothing is left (0: once)."""
     while True:
         state = status.read_status(BatchFolder(Location.of(out)))
         result: dict[str, Any] = {**state.record(), "text": status.text_of(state)}

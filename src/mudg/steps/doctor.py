@@ -48,11 +48,8 @@ _OPTIONAL: Mapping[str, tuple[str, str]] = {
 
 
 def report_machine() -> dict[str, Any]:
-    """Describe machine, Python, torch, native library, packages, video encoders and weights.
-
-    Returns:
-        Plain values for ``--json``; ``text`` is the same for people; ``ready`` says whether everything needed is here.
-    """
+    """Machine, Python, torch, native library, packages, video encoders and weights as plain values; ``text`` is the
+    same for people; ``ready``: everything needed is here."""
     problems: list[str] = []
     sections: dict[str, dict[str, str]] = {
         "machine": _machine(),
@@ -61,7 +58,7 @@ def report_machine() -> dict[str, Any]:
         "native library": _native(problems),
         "packages": _packages(problems),
         "optional packages": _optional(),
-        "plugins": {f"importer {name}": origin(point) for name, point in plugins("importer").items()},
+        "plugins": {f"importer {name}": origin(point) for name, point in plugins().items()},
         "video": _video(problems),
         "weights": _weights(problems),
     }
@@ -75,13 +72,9 @@ def report_machine() -> dict[str, Any]:
 
 
 def report_scene(scene: Path) -> dict[str, Any]:
-    """Check a scene directory, that of a run, or a log in the neutral layout, and say in words what is wrong or
-    odd.
-
-    Returns:
-        Plain values for ``--json``; ``text`` is the same for people; ``exit_code`` is 3 if it cannot be used. Of a
-        sound scene, ``alignment`` tells for each camera whether LiDAR and image edges agree.
-    """
+    """What is wrong or odd about a scene directory, that of a run, or a log in the neutral layout, as plain values;
+    ``text`` is the same for people; ``exit_code`` is 3 if it cannot be used. Of a sound scene, ``alignment`` tells for
+    each camera whether LiDAR and image edges agree."""
     from mudg.editing.runs import scene_of_run
     from mudg.formats.importers import RECOGNISERS
     from mudg.formats.importers.custom import check_log

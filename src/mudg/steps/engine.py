@@ -22,11 +22,8 @@ Make = Callable[[Any], dict[str, Any]]
 
 class Result(Step):
     """A step that makes a folder of its own, which is verified and reused, resumed, or replaced when the new one is
-    finished.
-
-    A subclass says what it writes (`version`, `files`), and how (`prepare`, or `make`). What it reads follows from its
-    fields; the methods below are overridden where it reads more, or less.
-    """
+    finished. A subclass says what it writes (`version`, `files`), and how (`prepare`, or `make`); the methods below are
+    overridden where it reads more, or less, than its fields say."""
 
     version: ClassVar[int]
     """Counts up when the rules of the verb change; older results are then made again."""
@@ -92,11 +89,8 @@ class Result(Step):
         return {}
 
     def prepare(self, inputs: dict[str, str]) -> Make:
-        """What makes the result. All that can be refused is refused here, before anything is written.
-
-        Args:
-            inputs: digests; those that only reading tells are added.
-        """
+        """What makes the result. All that can be refused is refused here, before anything is written. inputs: digests;
+        those that only reading tells are added."""
         return self.make
 
     def make(self, work: Any) -> dict[str, Any]:

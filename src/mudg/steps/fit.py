@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, cast, get_args
 
+from mudg.base import config as configuration
 from mudg.base.errors import UsageError
 from mudg.base.layout import MODEL_FILES
 from mudg.steps.engine import Make, Watched, paths_of
@@ -16,12 +17,6 @@ from mudg.steps.step import SCENE, Flag, flag_name, hint_of
 if TYPE_CHECKING:
     from mudg.base.run_folder import VerbOutput
     from mudg.baselines.settings import MethodConfig
-
-
-def _dotted(values: Mapping[str, Any], path: str = "") -> Iterator[str]:
-    """Names of nested values, with dots."""
-    for name, value in values.items():
-        yield from _dotted(value, f"{path}{name}.") if isinstance(value, Mapping) else (f"{path}{name}",)
 
 
 class Fit(Watched):
@@ -61,7 +56,7 @@ class Fit(Watched):
     def settings_from(cls, inputs: Mapping[str, Any], file: Path | None, given: Mapping[str, Any]) -> MethodConfig:
         """UsageError for a setting that was given and does not apply to the method."""
         settings = super().settings_from(inputs, file, given)
-        for name in _dotted(given):
+        for name in configuration.dotted(given):
             if not cls.suits(settings.method, name):
                 own = [method for method in get_args(hint_of(type(settings), "method")) if cls.suits(method, name)]
                 what, remedy = f"this setting does not apply to --method {settings.method}", "leave it out"

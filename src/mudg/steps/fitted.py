@@ -38,11 +38,8 @@ class Picture:
 
 
 def read_scene(folder: str | Path) -> Scene:
-    """Read a scene written by ingest or annotate, the one of a run, or the one that a fit belongs to.
-
-    Raises:
-        InputError: nothing is there, or something else. IntegrityError: a file was altered.
-    """
+    """Read a scene written by ingest or annotate, the one of a run, or the one that a fit belongs to. InputError:
+    nothing is there, or something else. IntegrityError: a file was altered."""
     from mudg.editing.runs import scene_at
     from mudg.scene.read import read_scene
 
@@ -83,15 +80,9 @@ class FittedScene:
 
     @classmethod
     def read(cls, folder: str | Path, device: str = "auto") -> FittedScene:
-        """Read the folder of a finished fit, or the best fit of a run.
-
-        Args:
-            device: where it is rendered: ``auto`` (CUDA if there is one), ``cpu``, ``cuda``, ``cuda:N``.
-
-        Raises:
-            InputError: not such a folder, or of another version. IntegrityError: a file was altered. ResourceError: no
-                such device.
-        """
+        """Read the folder of a finished fit, or the best fit of a run. device: where it is rendered: ``auto`` (CUDA if
+        there is one), ``cpu``, ``cuda``, ``cuda:N``; none such: ResourceError. InputError: not such a folder, or of
+        another version. IntegrityError: a file was altered."""
         from mudg.core.raster.rasterize import drawing_device
         from mudg.editing.runs import fit_at
         from mudg.gaussians.fit import load_model
@@ -116,31 +107,18 @@ class FittedScene:
         return f"FittedScene({self.method!r}, {len(self)} Gaussians, {len(self.object_ids)} objects)"
 
     def object_pose(self, track_id: str, time_s: float) -> NDArray[np.float64] | None:
-        """World pose f64[4, 4] of an object's box at a time; None where the object is not there.
-
-        Raises:
-            UsageError: no such object.
-        """
+        """World pose f64[4, 4] of an object's box at a time; None where it is not there. UsageError: no such object."""
         return self._model.dynamic_object(track_id).pose_matrix(time_s)
 
     def without(self, *track_ids: str) -> FittedScene:
-        """The scene without these objects.
-
-        Raises:
-            UsageError: an object that the scene does not have (it may be parked, and so part of the background).
-        """
+        """The scene without these objects. UsageError: one that it does not have (it may be parked, and so
+        background)."""
         return FittedScene(self._model.without_nodes(track_ids))
 
     def moved(self, track_id: str, object_from_new: ArrayLike) -> FittedScene:
-        """The scene with one object displaced in its own frame (x forward, y left, z up, metres) at all times.
-
-        Args:
-            object_from_new: rigid 4x4; the new pose is ``object_pose @ object_from_new``. A translation by (3, 0, 0)
-                moves it 3 m ahead.
-
-        Raises:
-            UsageError: no such object. InputError: the displacement is not rigid.
-        """
+        """The scene with one object displaced in its own frame (x forward, y left, z up, metres) at all times: its new
+        pose is ``object_pose @ object_from_new`` (rigid 4x4). UsageError: no such object. InputError: the displacement
+        is not rigid."""
         matrix = np.asarray(object_from_new, np.float64)
         problem = rigid_problem(matrix)
         if problem:
@@ -148,15 +126,9 @@ class FittedScene:
         return FittedScene(self._model.with_object_moved(track_id, matrix))
 
     def edited(self, script: str | Path, scene: Scene | None = None) -> FittedScene:
-        """The scene with an edit script carried out (``docs/edit.md``).
-
-        Args:
-            script: YAML file. scene: the log that it was fitted to; with it, parked objects and the vehicle can be
-                edited.
-
-        Raises:
-            InputError: the script is not valid, or asks for what cannot be done here.
-        """
+        """The scene with an edit script (``docs/edit.md``, a YAML file) carried out. scene: the log that it was fitted
+        to; with it, parked objects and the vehicle can be edited. InputError: the script is not valid, or cannot be
+        done here."""
         from mudg.editing.apply import carry_out
         from mudg.editing.script import read_edits
 
@@ -164,12 +136,8 @@ class FittedScene:
         return FittedScene(drive.model(self._model, keep_ego=True))
 
     def export_asset(self, track_id: str, out: str | Path, scene: Scene | None = None) -> Path:
-        """Write one object to a file that edit scripts can insert.
-
-        Args:
-            out: a name that ends in ``.safetensors``; replaced if it exists. scene: the log, for the sides from which
-                it was seen.
-        """
+        """Write one object to a file (``.safetensors``, replaced if it exists) that edit scripts can insert. scene: the
+        log, for the sides from which it was seen."""
         from mudg.base.run_folder import ResultFile
         from mudg.editing.apply import complete_asset, write_asset
         from mudg.editing.model import asset_of
@@ -191,11 +159,8 @@ class FittedScene:
             return compose(self._model.to(torch.device("cpu")), time_s)
 
     def save(self, folder: str | Path) -> Path:
-        """Write the scene, with its edits, as a folder that every command takes where it takes a fit.
-
-        Raises:
-            UsageError: something is there already.
-        """
+        """Write the scene, with its edits, as a folder that every command takes for a fit. UsageError: something is
+        there."""
         from mudg.base import store
         from mudg.gaussians.storage import save_model
 
@@ -210,35 +175,22 @@ class FittedScene:
         return folder
 
     def export(self, format: str, out: str | Path, **settings: Any) -> Path:
-        """Write the scene, with its edits, for another program, as ``mudg.export`` does.
-
-        Args:
-            format: ``ply``, ``spz``, ``glb``, ``usdz``, ``sog`` and so on. settings: of ``mudg export``, such as
-                ``time_s=1.5``.
-
-        Raises:
-            UsageError: no such format, or a setting that it does not have.
-        """
+        """Write the scene, with its edits, for another program, as ``mudg.export`` does. format: ``ply``, ``spz``,
+        ``glb``, ``usdz``, ``sog`` and so on. settings: such as ``time_s=1.5``. UsageError: no such format, or not its
+        setting."""
         from mudg.steps import functions
 
         with tempfile.TemporaryDirectory() as scratch:
             return functions.export(format, self.save(Path(scratch) / "fit"), out=Path(out), **settings)
 
     def render_path(self, path: Trajectory | Iterable[View]) -> Iterator[Picture]:
-        """Pictures along a path (``mudg.camera_path``), drawn one by one as they are asked for.
-
-        Raises:
-            As ``render``.
-        """
+        """Pictures along a path (``mudg.camera_path``), drawn as they are asked for. Errors as in ``render``."""
         for view in path.views if isinstance(path, Trajectory) else path:
             yield self.render(view.camera, view.world_from_cam, view.time_s)
 
     def film(self, path: Trajectory | Iterable[View], out: str | Path, fps: float = 10.0) -> Path:
         """Write an MP4 video of the colours along a path. A file that is there is replaced when the new one is whole.
-
-        Raises:
-            InputError: no views. ResourceError: no usable encoder, or the disk is full.
-        """
+        InputError: no views. ResourceError: no usable encoder, or the disk is full."""
         from mudg.formats.exporters.video import write_mp4
 
         return write_mp4(Path(out), (picture.rgb for picture in self.render_path(path)), fps)

@@ -56,7 +56,7 @@ class Ingest(Output):
         """``[FORMAT] LOG [OUT]``; the format is a setting."""
         left, values, named = list(words), dict[str, Any](), "out" in given
         of_a_log = 1 + (not named)
-        is_format = left and (left[0] in ("auto", *FORMATS) or left[0] in plugins("importer"))
+        is_format = left and (left[0] in ("auto", *FORMATS) or left[0] in plugins())
         if is_format and (len(left) > of_a_log or not Path(left[0]).exists()):
             values["format"] = left.pop(0)
         if not left:
@@ -65,7 +65,7 @@ class Ingest(Output):
         if left and not named:
             values["out"] = left.pop(0)
         if left and values["log"] != "city" and not Path(values["log"]).exists():
-            formats = ", ".join(("auto", *FORMATS, *plugins("importer")))
+            formats = ", ".join(("auto", *FORMATS, *plugins()))
             raise UsageError("no such format and no such log", expected=formats, got=values["log"])
         if left:
             raise UsageError("too many words", expected=usage(cls), got=" ".join(words))

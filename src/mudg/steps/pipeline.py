@@ -43,24 +43,13 @@ def fits_of(config: MethodConfig, guided_share: float) -> tuple[MethodConfig, Me
 
 
 def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bool = False) -> dict[str, Any]:
-    """Run the whole chain on a generated city, a dataset log or a scene, and write ``OUT/report.html``.
+    """Run the whole chain on a generated city (``"city"``), a dataset log or a scene, and write ``OUT/report.html``. A
+    finished step of the same settings and inputs is verified and reused; an interrupted one continues. A scene at
+    ``OUT/scene`` may be the source: nothing is written there then. overwrite: replace what other settings have left in
+    ``out``, each step's result when the new one is finished.
 
-    A step whose folder holds a finished result of the same settings and inputs is verified and reused; an interrupted
-    one continues. The seconds of each step are summed over all continuations. A scene at ``OUT/scene`` may be the
-    source: nothing is written there then.
-
-    Args:
-        config: settings of all verbs.
-        source: ``"city"``, the folder of a dataset log, or a scene made by ingest.
-        out: folder for everything.
-        overwrite: replace what other settings have left in ``out``, each step's result when the new one is finished.
-
-    Returns:
-        Paths of the report and the metrics, the seconds per step, and ``text``: the tables for people.
-
-    Raises:
-        InputError: no such log. UsageError: ``out`` holds a run of other settings or files of something else, or
-            touches what is read. Whatever a verb raises.
+    Returns paths of the report and the metrics, the seconds per step, and ``text``: the tables for people. InputError:
+    no such log. UsageError: ``out`` holds something else, or touches what is read. Whatever a verb raises.
     """
     import torch
 
@@ -114,8 +103,7 @@ def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: boo
 
 
 def _write_viewer(out: Path) -> Path:
-    """Write the page that shows the fitted scene in a browser. Its record is OUT/run.json: it has no description beside
-    it."""
+    """Write the page that shows the fitted scene. Its record is OUT/run.json: it has no description beside it."""
     from mudg.base.run_folder import description_path
     from mudg.viewer import view
     from mudg.viewer.report import VIEWER
@@ -201,8 +189,7 @@ def _has_semantics(scene: Path) -> bool:
 
 
 def steps_of(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> dict[str, Output]:
-    """The pipeline on a labelled scene, by the names that tables give its steps: each reads what others before it
-    write."""
+    """The pipeline on a labelled scene, by the names that tables give its steps, in order."""
     plain, guided = fits_of(config.fit, config.guided_share)
     first, last = out / "fit" / WITHOUT_DIFFUSION, out / "fit" / WITH_DIFFUSION
     fused, virtual = out / "fuse", out / "synthesize"
@@ -274,8 +261,7 @@ class _Ledger:
 
     @classmethod
     def open(cls, out: Path, config: RunConfig, source: str, overwrite: bool) -> _Ledger:
-        """Open or begin the ledger of ``out``; UsageError if it belongs to other settings, or the folder to something
-        else."""
+        """Open or begin the ledger of ``out``; UsageError if it belongs to other settings or something else."""
         asked = {"verb": "run", "source": source, **configuration.result_settings(config)}
         before: dict[str, Any] = {}
         known = out / "run.json"

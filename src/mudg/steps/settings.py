@@ -60,10 +60,8 @@ def on_device(settings: Any, device: str) -> Any:
 def with_lines(
     config: RunConfig, *, cameras: tuple[str, ...] | None = None, shifts_m: tuple[float, ...] | None = None
 ) -> RunConfig:
-    """The same settings with these cameras (empty = the first) and lateral shifts in synthesize and render.
-
-    Render always adds the recorded path, synthesize leaves it out.
-    """
+    """The same settings with these cameras (empty = the first) and lateral shifts in synthesize and render, which
+    always adds the recorded path."""
     if cameras is None and shifts_m is None:
         return config
     synthesize, render = config.synthesize, config.render

@@ -110,11 +110,8 @@ class Step:
 
     @classmethod
     def from_words(cls, words: Sequence[str], given: Mapping[str, Any]) -> dict[str, Any]:
-        """Values of fields, and of settings, by the words without a flag. given: values of fields by flags.
-
-        Raises:
-            UsageError: a word is missing or too many.
-        """
+        """Values of fields, and of settings, by the words without a flag. given: values of fields by flags. UsageError:
+        a word is missing or too many."""
         left, values, names = list(words), dict[str, Any](), positions(cls)
         for name in names:
             kind, field = hint_of(cls, name), cls.__dataclass_fields__[name]
@@ -157,14 +154,8 @@ class Step:
     def build(
         cls, values: Mapping[str, Any], settings: Mapping[str, Any] | None = None, file: Path | None = None
     ) -> Self:
-        """The step of plain values, as they come from a command line or a caller.
-
-        Args:
-            values: of the fields. settings: nested values of settings. file: YAML of settings.
-
-        Raises:
-            UsageError: a value is missing, unknown or not valid. InputError: the file cannot be read.
-        """
+        """The step of plain values, as they come from a command line or a caller, nested settings, and a YAML file of
+        those. UsageError: a value is missing, unknown or not valid. InputError: the file cannot be read."""
         from pydantic import TypeAdapter, ValidationError
 
         known = {field.name: field for field in fields(cls) if field.name != "settings"}
@@ -313,12 +304,8 @@ def refused(cls: type[Step], name: str, error: ValidationError) -> UsageError:
 
 @dataclass(frozen=True, slots=True)
 class Option:
-    """A field of a step, or one of its settings.
-
-    Args:
-        name: dotted, without the word settings. kind: its type. default: `MISSING` where it has none. text: its help.
-            own: not a setting.
-    """
+    """A field of a step, or one of its settings (not ``own``). name: dotted, without the word settings. default:
+    `MISSING` where it has none. text: its help."""
 
     name: str
     kind: Any
@@ -328,11 +315,8 @@ class Option:
 
 
 def options(cls: type[Any], base: Any = None) -> Iterator[Option]:
-    """Every flag of a step, or of another dataclass of flags, its own before its settings.
-
-    Args:
-        base: settings whose values are the defaults (None: those of their class).
-    """
+    """Every flag of a step, or of another dataclass of flags, its own before its settings. base: settings whose values
+    are the defaults (None: those of their class)."""
     texts = texts_of(cls)
     for field in in_reading_order(cls):
         yield Option(field.name, hint_of(cls, field.name), field.default, texts.get(field.name, ""), True)
@@ -388,11 +372,9 @@ def _texts_of_class(node: ast.ClassDef) -> Iterator[tuple[str, str]]:
 
 # -- the function of a verb ------------------------------------------------------------------------
 def python_function(cls: type[Step], name: str) -> Callable[..., Any]:
-    """``mudg.fit(...)`` of a step: its inputs and settings as arguments, its result returned.
-
-    A setting has the name and default that the command shows, without the dashes; a group of settings is a dictionary,
-    or its configuration. ``config`` names a YAML file that is read before the settings.
-    """
+    """``mudg.fit(...)`` of a step: its inputs and settings as arguments, its result returned. A setting has the name
+    and default that the command shows, without the dashes; a group is a dictionary, or its configuration. ``config``
+    names a YAML file that is read before."""
 
     def call(*args: Any, config: str | Path | None = None, **given: Any) -> Any:
         parameters = inspect.signature(call).parameters.values()

@@ -52,14 +52,14 @@ def import_log(name: str, source: Path, out: Path, options: ImportOptions) -> Sc
     Raises:
         UsageError: another package offers the format, and its code cannot be loaded. InputError: the log is malformed.
     """
-    read = _function("import", name) if name in FORMATS else load_plugin("importer", name)
+    read = _function("import", name) if name in FORMATS else load_plugin(name)
     with foreign_numbers(), named_once():
         return read(source, out, options)
 
 
 def known_formats() -> tuple[str, ...]:
     """``FORMATS``, and those of other packages, which are used only when they are named."""
-    return (*FORMATS, *(name for name in plugins("importer") if name not in FORMATS))
+    return (*FORMATS, *(name for name in plugins() if name not in FORMATS))
 
 
 def files_of(name: str, source: Path, options: ImportOptions) -> LogFiles:
