@@ -33,7 +33,7 @@ from mudg.sim import Instant, Session
 @pytest.fixture
 def installed(tmp_path: Path, repository: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of installed packages with one that offers the skeletons, as pip would leave it."""
-    assert plugins("importer") == {}  # nothing is offered where no package offers it
+    assert plugins() == {}  # nothing is offered where no package offers it
     folder = tmp_path / "site"
     shutil.copytree(repository / "docs" / "examples" / "extend", folder)
     info = folder / "my_package-1.2.dist-info"
