@@ -16,7 +16,6 @@ from mudg.diffusion import model_files, models, network, requests
 from mudg.diffusion.model import MDM, BatchPart, LossSettings, MDMConfig
 from mudg.diffusion.network import ConditionPixels, Refiner
 from mudg.diffusion.requests import SampleRequest
-from mudg.networks import codec
 from mudg.networks.codec import CodecConfig, PatchCodec, code_to_depth, depth_to_code, semantic_shares
 
 TINY = MDMConfig(
@@ -170,14 +169,6 @@ def test_training_and_inference_attention_agree():
     assert torch.allclose(trained, fused, atol=1e-5)
 
 
-def test_temporal_shift_moves_one_eighth_each_way():
-    x = torch.arange(3.0).view(3, 1, 1, 1).expand(3, 16, 2, 2)
-    moved = codec.temporal_shift(x, 3)
-    assert moved[:, :2].amax((1, 2, 3)).tolist() == [0, 0, 1]
-    assert moved[:, 2:4].amax((1, 2, 3)).tolist() == [1, 2, 2]
-    assert torch.equal(moved[:, 4:], x[:, 4:])
-
-
 @pytest.mark.parametrize("config", [TINY, PLAIN])
 def test_loss_falls_when_a_clip_is_learnt(config):
     torch.manual_seed(0)
@@ -210,12 +201,22 @@ def test_loss_has_gradients_everywhere():
     assert set(losses.terms) == {"rgb", "depth", "semantics"} | refined
 
 
-def test_measured_depth_is_taken():
+def test_measured_depth_is_taken_and_what_contradicts_it_costs_confidence():
     condition = some_condition(frames=1)
     depth = torch.full((1, 1, 16, 24), 120.0)
     settled = requests.settle_depth(depth, condition, 100.0)
     assert torch.equal(settled[condition.valid], condition.depth[condition.valid])
     assert bool((settled[~condition.valid] == 100.0).all())
+    condition = some_condition(frames=1)
+    same = requests.depth_agreement(condition.depth, condition)
+    assert torch.allclose(same, torch.ones_like(same))
+    valid = torch.zeros_like(condition.valid)
+    valid[..., 8, 12] = True
+    alone = replace(condition, valid=valid)
+    off = requests.depth_agreement(condition.depth * 1.5, alone)
+    assert float(off[0, 0, 8, 12]) == pytest.approx(max(0.2, 1.5**-5), rel=1e-4)
+    assert float(off[0, 0, 6, 10]) == pytest.approx(float(off[0, 0, 8, 12]))
+    assert float(off[0, 0, 0, 0]) == 1.0
 
 
 @pytest.mark.parametrize("name", sorted(model_files.EMBEDDED))
@@ -238,28 +239,6 @@ def test_every_sampler_costs_one_pass_per_step_and_repeats_itself(sampler):
     first = model.sample(condition, SampleRequest(3, sampler=sampler))
     assert len(passes) == 3
     assert torch.equal(first.rgb, model.sample(condition, SampleRequest(3, sampler=sampler)).rgb)
-
-
-def test_a_setting_that_the_sampler_does_not_take_is_refused():
-    model, condition = randomised(TINY), some_condition()
-    with pytest.raises(UsageError, match="dpm_solver does not take the setting eta"):
-        model.sample(condition, SampleRequest(2, sampler="dpm_solver", eta=0.5))
-    plain, half = (model.sample(condition, SampleRequest(3, eta=eta)).rgb for eta in (None, 0.5))
-    assert torch.equal(plain, model.sample(condition, SampleRequest(3, eta=1.0)).rgb)
-    assert not torch.equal(plain, half)
-
-
-def test_depth_that_contradicts_a_measurement_costs_confidence():
-    condition = some_condition(frames=1)
-    same = requests.depth_agreement(condition.depth, condition)
-    assert torch.allclose(same, torch.ones_like(same))
-    valid = torch.zeros_like(condition.valid)
-    valid[..., 8, 12] = True
-    alone = replace(condition, valid=valid)
-    off = requests.depth_agreement(condition.depth * 1.5, alone)
-    assert float(off[0, 0, 8, 12]) == pytest.approx(max(0.2, 1.5**-5), rel=1e-4)
-    assert float(off[0, 0, 6, 10]) == pytest.approx(float(off[0, 0, 8, 12]))
-    assert float(off[0, 0, 0, 0]) == 1.0
 
 
 def test_confidence_falls_with_change_and_distance():
@@ -314,6 +293,13 @@ def test_wrong_requests_are_refused():
     refused("multiples of 4", model.sample, some_condition(height=18), SampleRequest(1), raises=UsageError)
     refused("sampler", model.sample, some_condition(), SampleRequest(1, sampler="magic"), raises=UsageError)
     refused("guidance", model.sample, some_condition(), SampleRequest(1, guidance=2.0), raises=UsageError)
+    model, condition = randomised(TINY), some_condition()
+    with pytest.raises(UsageError, match="dpm_solver does not take the setting eta"):
+        model.sample(condition, SampleRequest(2, sampler="dpm_solver", eta=0.5))
+    plain, half = (model.sample(condition, SampleRequest(3, eta=eta)).rgb for eta in (None, 0.5))
+    assert torch.equal(plain, model.sample(condition, SampleRequest(3, eta=1.0)).rgb)
+    assert not torch.equal(plain, half)
+    refused(".", CodecConfig, near_m=5.0, far_m=5.0, raises=UsageError)
 
 
 def test_image_size_keeps_aspect_and_area():
@@ -351,16 +337,22 @@ def decoded(codec, **given):
     return codec.decode({**zeros, **given})
 
 
-def test_depth_survives_the_codec_exactly():
+def test_depth_and_uniform_classes_survive_the_codec():
     codec = PatchCodec(CodecConfig()).eval()
     depth = 2.0 + 90 * torch.rand(3, 1, 16, 24, generator=torch.Generator().manual_seed(0))
     codec.fit_depth(depth)
     with torch.no_grad():
         back = decoded(codec, depth=codec.encode_depth(depth)).depth
     assert torch.allclose(back, depth, rtol=1e-4)
+    codec = PatchCodec(CodecConfig()).eval()
+    for label in range(19):
+        ids = torch.full((1, 4, 4), label)
+        with torch.no_grad():
+            made = decoded(codec, semantics=codec.encode_semantics(ids))
+        assert torch.equal(made.semantics, ids)
 
 
-def test_colour_basis_keeps_smooth_images_and_whitens():
+def test_colour_basis_keeps_smooth_and_constant_images_and_whitens():
     codec = PatchCodec(CodecConfig()).eval()
     images = smooth_images(40)
     codec.fit_color(images)
@@ -372,9 +364,6 @@ def test_colour_basis_keeps_smooth_images_and_whitens():
     with torch.no_grad():
         back = decoded(codec, rgb=z).rgb
     assert float((back - images).square().mean()) < 2e-3
-
-
-def test_colour_latent_is_blind_to_nothing_constant():
     codec = PatchCodec(CodecConfig()).eval()
     codec.fit_color(smooth_images(40))
     flat = torch.tensor([0.2, 0.5, 0.8]).view(1, 3, 1, 1).expand(1, 3, 16, 24)
@@ -391,15 +380,6 @@ def test_shares_count_labelled_pixels_only():
     assert float(semantic_shares(torch.full((2, 2), 255)).sum()) == 0.0
 
 
-def test_uniform_classes_survive():
-    codec = PatchCodec(CodecConfig()).eval()
-    for label in range(19):
-        ids = torch.full((1, 4, 4), label)
-        with torch.no_grad():
-            made = decoded(codec, semantics=codec.encode_semantics(ids))
-        assert torch.equal(made.semantics, ids)
-
-
 @pytest.mark.parametrize("axes", [(), (2, 3)])
 def test_leading_axes_are_kept(axes):
     codec = PatchCodec(CodecConfig()).eval()
@@ -409,10 +389,6 @@ def test_leading_axes_are_kept(axes):
             {"rgb": codec.encode_rgb(rgb), "depth": codec.encode_depth(depth), "semantics": codec.encode_semantics(ids)}
         )
     assert made.rgb.shape == rgb.shape and made.depth.shape == depth.shape and made.semantics.shape == ids.shape
-
-
-def test_an_empty_depth_range_is_refused():
-    refused(".", CodecConfig, near_m=5.0, far_m=5.0, raises=UsageError)
 
 
 # ---- the refiner: what is copied, shapes ---------------------------------------------------------
@@ -458,16 +434,6 @@ def test_shut_gates_leave_what_the_codec_makes():
         made = refiner(codec, latents, given, 4)
     for stated, base in zip((made.rgb, made.depth_code, made.scores), codec.decode_raw(latents)):
         assert torch.allclose(stated, base, atol=1e-5)
-
-
-def test_shares_of_known_classes():
-    ids = torch.tensor([[3, 3, 255, 255], [3, 7, 255, 1]], dtype=torch.uint8).view(1, 1, 2, 4)
-    share = network.shares(ids)
-    assert share.shape == (1, 19, 1, 2)
-    assert share[0, 3, 0].tolist() == [0.75, 0.0]
-    assert share[0, 7, 0].tolist() == [0.25, 0.0]
-    assert share[0, 1, 0].tolist() == [0.0, 0.25]
-    assert float(share.sum()) == pytest.approx(1.25)
 
 
 def test_a_crop_is_refined_as_in_the_whole_image_away_from_its_border():

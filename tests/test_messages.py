@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 
 import pytest
+from refusals import refused
 from rich.console import Console
 from toy_scene import ToyStreet
 
@@ -53,9 +54,7 @@ SOURCES = {
 
 
 def _raised(call: object) -> MudgError:
-    with pytest.raises(MudgError) as refused:
-        call()
-    return refused.value
+    return refused(".", call, raises=MudgError)
 
 
 @pytest.mark.parametrize("source", SOURCES)
@@ -166,8 +165,7 @@ def test_no_verb_prints_what_a_track_is_called_as_it_is(tmp_path: Path, capsys: 
     ],
 )
 def test_json_that_no_file_or_float_can_hold_is_refused(text: str | bytes) -> None:
-    with pytest.raises(InputError, match="not valid JSON"):
-        store.parse_json(text, "here")
+    refused("not valid JSON", store.parse_json, text, "here")
 
 
 def test_json_at_the_limits_is_read() -> None:

@@ -75,22 +75,16 @@ def test_confusion_and_iou_by_hand():
     assert int(counts.sum()) == 4
     assert int(counts[road, car]) == 1
     assert metrics.iou_of(counts) == {"road": pytest.approx(2 / 3), "car": pytest.approx(1 / 2)}
-
-
-def test_prediction_outside_the_classes_is_wrong_not_ignored():
     truth = torch.zeros(1, 4, dtype=torch.long)
     prediction = torch.tensor([[0, 0, 255, 0]])
     assert metrics.iou_of(metrics.confusion(prediction, truth)) == {CLASSES[0]: pytest.approx(3 / 4)}
 
 
-def test_miou_is_pooled_over_the_trajectory_not_averaged_over_views():
+def test_miou_and_rmse_are_pooled_over_the_trajectory_not_averaged_over_views():
     metric = metrics.Segmentation("miou")
     for made in (torch.zeros(1, 9, dtype=torch.long), torch.ones(1, 1, dtype=torch.long)):
         add(metric, semantics=made, truth_semantics=torch.zeros_like(made))
     assert metric.value() == pytest.approx(0.9)
-
-
-def test_rmse_is_pooled_over_pixels():
     metric, ten = metrics.DepthError("rmse_m"), torch.full((1, 1, 3), 10.0)
     add(metric, depth=ten + 2, truth_depth=ten, truth_depth_valid=ten > 0)
     add(metric, depth=ten[..., :1], truth_depth=ten[..., :1])
@@ -109,9 +103,6 @@ def test_absent_modalities_are_said_in_words():
     assert {table[name] for name in ("abs_rel", "rmse_m", "delta1", "miou", "accuracy")} == {"not produced"}
     assert {table[name] for name in ("lpips", "fid", "fvd")} == {"not computed"}
     assert set(table) == set(METRICS)
-
-
-def test_nothing_compared_is_not_zero():
     assert metrics.results(metrics.build_all())["miou"] == "not produced"
 
 
@@ -130,19 +121,6 @@ def test_a_full_mask_and_none_give_the_same_similarity():
     assert metrics.ssim(made, truth, half) == pytest.approx(
         float(ssim_map(made, truth)[..., :20].double().mean()), abs=1e-6
     )
-
-
-def test_metrics_of_one_source_share_one_measurement(monkeypatch):
-    asked, found = [], metrics.depth_errors
-    monkeypatch.setattr(metrics, "depth_errors", lambda *given: asked.append(1) or found(*given))
-    depth = torch.full((1, 4, 4), 12.0)
-    of = metrics.build_all()
-    measured = metrics.measure(pair(depth=depth, truth_depth=torch.full((1, 4, 4), 10.0)), of)
-    assert len(asked) == 1
-    for name, metric in of.items():
-        metric.add(measured[name])
-    table = metrics.results(of)
-    assert (table["abs_rel"], table["rmse_m"], table["delta1"]) == pytest.approx((0.2, 2.0, 1.0))
 
 
 def test_large_images_are_measured_in_pieces_with_the_same_result(monkeypatch):

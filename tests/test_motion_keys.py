@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,9 @@ import write_av2
 import write_custom
 import write_nuplan
 from refusals import refused
+from toy_scene import ToyStreet
 
-from mudg.base.geometry import yaw_matrix
+from mudg.base.geometry import invert, yaw_matrix
 from mudg.base.types import EgoPath, Scene, Sweep, Track, View
 from mudg.formats.importers import IMPORTERS, custom
 from mudg.formats.importers.common import ImportOptions
@@ -116,9 +118,6 @@ def test_lost_packets_of_kitti_leave_their_frames_out(tmp_path: Path) -> None:
 def test_lost_rows_of_argoverse2_and_nuplan(truth: Scene, tmp_path: Path) -> None:
     """A scene that drives through the curve, without the poses of its middle."""
     pytest.importorskip("pyarrow")
-    import sqlite3
-
-    from mudg.base.geometry import invert
 
     def moved(time_s: float) -> np.ndarray:
         return on_arc(5 * time_s) @ invert(truth.ego.pose_at(time_s))
@@ -206,26 +205,7 @@ def test_flips_of_tracks_and_of_the_vehicle_are_undone_on_import(truth: Scene, t
     assert f"track {truth.tracks[0].id}" in words and "ingest turns it back" in words
 
 
-@roundtrip.needs_native
-def test_flips_of_boxes_in_another_format(truth: Scene, tmp_path: Path) -> None:
-    import sqlite3
-
-    database = write_nuplan.write_nuplan(truth, tmp_path / "log")
-    with sqlite3.connect(database) as connection:
-        last = "SELECT max(rowid) FROM lidar_box GROUP BY track_token"
-        connection.execute(f"UPDATE lidar_box SET yaw = yaw + 3.14159265358979 WHERE rowid IN ({last})")
-    connection.close()
-    scene = IMPORTERS["nuplan"](database, tmp_path / "scene", ImportOptions())
-    unflipped = write_nuplan.write_nuplan(truth, tmp_path / "plain")
-    plain = IMPORTERS["nuplan"](unflipped, tmp_path / "other", ImportOptions())
-    assert len(scene.tracks) == len(plain.tracks) > 3
-    for one, other in zip(scene.tracks, plain.tracks, strict=True):
-        assert np.allclose(one.world_from_object, other.world_from_object, atol=1e-8)
-
-
 def test_doctor_names_what_no_vehicle_does(tmp_path: Path) -> None:
-    from toy_scene import ToyStreet
-
     scene = ToyStreet(times=(0.0, 0.1)).write(tmp_path / "scene")
     plain = arc(0.0, 2.0, 0.1)
     assert not warnings(replace(scene, ego=plain), "ego path")

@@ -348,11 +348,17 @@ def test_adam_kernel_equals_torch_optim():
 # ---- starting values -----------------------------------------------------------------------------
 
 
-def test_voxel_filter_keeps_one_per_cell():
+def test_starting_points_are_one_a_cell_as_large_as_their_distance_and_on_the_box():
     xyz = np.array([[0.01, 0, 0], [0.02, 0, 0], [0.2, 0, 0], [-0.01, 0, 0]], np.float32)
     assert initial.voxel_filter(xyz, 0.1).tolist() == [0, 2, 3]
     mixed = initial.voxel_filter(np.repeat(xyz, 2, 0) + np.array([0, 50.0, 0]), np.array([0.1, 2.0] * 4))
     assert 3 < len(mixed) <= 6
+    axis = np.arange(6) * 0.25
+    grid = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3).astype(np.float32)
+    assert initial.neighbour_scale(grid) == pytest.approx(0.25, abs=1e-5)
+    xyz, rgb = initial.box_grid((4.0, 2.0, 1.5), (10, 20, 30))
+    assert (np.abs(xyz) <= 0.5 * np.array([4.0, 2.0, 1.5])).all()
+    assert (rgb == [10, 20, 30]).all()
 
 
 def test_starting_columns_show_the_points_colours():
@@ -364,18 +370,6 @@ def test_starting_columns_show_the_points_colours():
     assert (made["semantics"].argmax(1) == 1).all()
     assert torch.allclose(torch.sigmoid(made["logits"]), torch.tensor(0.1))
     assert made["sh_rest"].shape == (50, 3, 3)
-
-
-def test_neighbour_scale_of_a_grid_is_its_pitch():
-    axis = np.arange(6) * 0.25
-    grid = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3).astype(np.float32)
-    assert initial.neighbour_scale(grid) == pytest.approx(0.25, abs=1e-5)
-
-
-def test_box_grid_lies_on_the_box():
-    xyz, rgb = initial.box_grid((4.0, 2.0, 1.5), (10, 20, 30))
-    assert (np.abs(xyz) <= 0.5 * np.array([4.0, 2.0, 1.5])).all()
-    assert (rgb == [10, 20, 30]).all()
 
 
 # ---- noise of tracks -----------------------------------------------------------------------------

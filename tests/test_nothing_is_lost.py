@@ -353,16 +353,6 @@ def test_an_interrupted_replacement_keeps_the_old_result_and_continues(
     made_by(out, 2, True)  # finished: reused
 
 
-def test_a_failed_import_over_another_scene_leaves_that(world: Given, tmp_path: Path) -> None:
-    out = Ingest(log=world["log"], out=tmp_path / "out", settings=IngestConfig(test_every=2, contact_sheet=False)).run()
-    before = tree(out)
-    settings = IngestConfig(cameras=("frnt",), contact_sheet=False)
-    step = Ingest(log=world["log"], out=out, overwrite=True, settings=settings)
-    refused("no such camera", step.run, raises=UsageError)
-    assert tree(tmp_path / "out") == before
-    assert [p.name for p in tmp_path.iterdir()] == ["out"]
-
-
 def test_a_user_file_in_the_folder_of_a_failing_import_stays(
     world: Given, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

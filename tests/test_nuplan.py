@@ -312,16 +312,13 @@ def test_values_of_other_types_are_refused_in_words(column: str, source: Path, t
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
 
 
-def test_doubled_image_rows_are_refused(source: Path, tmp_path: Path) -> None:
+def test_doubled_rows_and_long_names_are_refused(source: Path, tmp_path: Path) -> None:
     connection = without_types(log(source), "image")
     connection.execute("INSERT INTO image SELECT * FROM image WHERE rowid = 2")
     connection.commit()
     connection.close()
     caught = refused("two images of one camera have the same time", ingest, log(source), tmp_path / "out")
     assert "image at" in caught.where
-
-
-def test_long_names_are_refused_whichever_table_holds_them(source: Path, tmp_path: Path) -> None:
     for table, column in (("category", "name"), ("camera", "channel"), ("log", "logfile")):
         connection = sqlite3.connect(log(source))
         kept = connection.execute(f"SELECT {column} FROM {table} LIMIT 1").fetchone()

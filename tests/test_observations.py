@@ -10,7 +10,6 @@ import pytest
 import torch
 from refusals import refused
 
-from mudg.base.errors import InputError
 from mudg.base.types import Camera, Observation, View
 from mudg.scene.observations import ObservationWriter, list_observation_sets, read_observations
 
@@ -83,26 +82,12 @@ def test_an_interrupted_folder_is_not_readable_but_its_files_are_kept(tmp_path: 
     assert len(read_observations(tmp_path / "t")) == 2
 
 
-def test_damaged_files_are_named(tmp_path: Path) -> None:
-    with ObservationWriter(tmp_path / "t", "t", "x") as writer:
-        writer.add(_observation(0))
-    png = tmp_path / "t" / "rgb" / "000000.png"
-    content = png.read_bytes()
-    png.write_bytes(content[: len(content) // 2])
-    with pytest.raises(InputError, match=r"000000\.png"):
-        read_observations(tmp_path / "t")[0]
-    png.write_bytes(content)
-
-
 BAD_ARRAYS = {
     "cut off": (lambda arrays, content: content[: len(content) // 2], "not a valid .npz file"),
     "empty": (lambda arrays, content: b"", "not a valid .npz file"),
     "altered": (lambda arrays, content: content[:200] + b"XXXX" + content[204:], "not a valid .npz file"),
     "objects": (lambda arrays, content: _npz(arrays | {"depth": np.array([{}])}), "not a valid .npz file"),
-    "another size": (
-        lambda arrays, content: _npz(arrays | {"depth": np.zeros((2, 2), np.float32)}),
-        r"float32\[2, 2\]",
-    ),
+    "another size": (lambda arrays, content: _npz(arrays | {"depth": np.zeros((2, 2), "f4")}), r"float32\[2, 2\]"),
     "another type": (lambda arrays, content: _npz(arrays | {"mask": arrays["mask"] + 0.0}), r"float64"),
     "none": (lambda arrays, content: _npz({"depth": arrays["depth"]}), "missing"),
     "a bomb": (lambda arrays, content: _npz(arrays | {"depth": np.zeros(2**24, np.float32)}), "too large"),
@@ -115,15 +100,13 @@ def _npz(arrays) -> bytes:
     return out.getvalue()
 
 
-@pytest.mark.parametrize("name", BAD_ARRAYS)
-def test_damaged_arrays_are_named(name: str, tmp_path: Path) -> None:
-    damaged, words = BAD_ARRAYS[name]
+@pytest.mark.parametrize("name", [*BAD_ARRAYS, "a picture"])
+def test_damaged_arrays_and_pictures_are_named(name: str, tmp_path: Path) -> None:
+    damaged, words = BAD_ARRAYS.get(name, (lambda _, content: content[: len(content) // 2], "."))
     with ObservationWriter(tmp_path / "t", "t", "x") as writer:
         writer.add(_observation(0))
-    path = tmp_path / "t" / "data" / "000000.npz"
-    with np.load(path, allow_pickle=False) as arrays:  # numpy itself reads what was written
+    with np.load(tmp_path / "t" / "data" / "000000.npz", allow_pickle=False) as arrays:  # numpy reads what was written
         kept = dict(arrays)
+    path = tmp_path / "t" / ("rgb/000000.png" if name == "a picture" else "data/000000.npz")
     path.write_bytes(damaged(kept, path.read_bytes()))
-    with pytest.raises(InputError, match=words) as raised:
-        read_observations(tmp_path / "t")[0]
-    assert "000000.npz" in str(raised.value)
+    assert path.name in str(refused(words, read_observations(tmp_path / "t").__getitem__, 0))

@@ -97,23 +97,16 @@ def test_a_path_is_rendered_with_another_field_of_view(run: tuple[Path, Path], t
         ("0.4 0 0 0 0 0 0 1\n0.2 0 0 0 0 0 0 1\n", "do not increase"),
         ("1 0 0 0 0 2 0 0 0 0 1 0\n", "not rigid"),
         ("0.1 0 0 0 0 0 0 1\n1 0 0 0 0 1 0 0 0 0 1 0\n", "others have none"),
+        *((json, "bad.json") for json in ("[]", '{"frames": 3}', '{"frames": [3]}')),
+        ('{"frames": [{"transform_matrix": [[1]]}]}', "bad.json"),
     ],
 )
 def test_files_that_hold_no_path_are_refused_with_the_line(
     run: tuple[Path, Path], tmp_path: Path, text: str, told: str
 ) -> None:
-    (tmp_path / "bad.txt").write_text(text)
-    scene = mudg.read_scene(run[0])
-    refused(told, read_path, tmp_path / "bad.txt", scene, scene.cameras["front"])
-
-
-@pytest.mark.parametrize(
-    "content", ["[]", '{"frames": 3}', '{"frames": [3]}', '{"frames": [{"transform_matrix": [[1]]}]}']
-)
-def test_other_json_is_refused(run: tuple[Path, Path], tmp_path: Path, content: str) -> None:
-    (tmp_path / "bad.json").write_text(content)
-    scene = mudg.read_scene(run[0])
-    refused("bad.json", read_path, tmp_path / "bad.json", scene, scene.cameras["front"])
+    file, scene = tmp_path / ("bad.json" if told == "bad.json" else "bad.txt"), mudg.read_scene(run[0])
+    file.write_text(text)
+    refused(told, read_path, file, scene, scene.cameras["front"])
 
 
 def test_a_far_path_is_drawn_with_a_warning_and_nothing_is_half_written(

@@ -30,8 +30,12 @@ def words(*more: str) -> Any:
     return app.parse(["run", "city", "--out", "x", *more])[0].settings
 
 
-def test_every_preset_has_a_row_and_no_other() -> None:
+def test_presets_are_those_that_are_named() -> None:
     assert set(PRESETS) == set(NAMES)
+    config = run_preset("paper")
+    plain, guided = pipeline.fits_of(config.fit, config.guided_share)
+    assert plain.iterations == guided.iterations == 30_000
+    assert pipeline.fits_of(config.fit, run_preset().guided_share)[1].iterations == 45_000
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -71,18 +75,13 @@ def test_the_run_yaml_of_a_preset_gives_it_back_under_any_preset(name: PresetNam
     assert words("--config", str(file)) == words("--preset", "paper", "--config", str(file)) == before
 
 
-def test_an_unknown_preset_is_refused_with_the_list(capsys: pytest.CaptureFixture[str]) -> None:
-    assert app.main(["demo", "--preset", "best"]) == 2
-    assert "quality" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("verb", ["demo", "run"])
-def test_help_names_every_preset(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_and_refusals_name_every_preset(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert app.main([verb, "--help"]) == 0
     shown = capsys.readouterr().out
-    assert "--preset" in shown
-    for name in NAMES:
-        assert name in shown
+    assert "--preset" in shown and all(name in shown for name in NAMES)
+    assert app.main(["demo", "--preset", "best"]) == 2
+    assert all(name in capsys.readouterr().err for name in ("quality",))
 
 
 def test_paper_needs_a_published_model_and_lpips_before_anything_is_written(tmp_path: Path) -> None:
@@ -91,8 +90,7 @@ def test_paper_needs_a_published_model_and_lpips_before_anything_is_written(tmp_
     refused("published-type diffusion model", mudg.run, "city", out=out, preset="paper", raises=UsageError)
     weights = replace(paper.fit, virtual=replace(paper.fit.virtual, lpips_weights=str(tmp_path / "lpips.safetensors")))
     other = replace(paper, fit=weights, synthesize=replace(paper.synthesize, model="embedded"))
-    with pytest.raises(UsageError, match="published-type models only"):
-        Run(source="city", out=out, settings=other).run()
+    refused("published-type models only", Run(source="city", out=out, settings=other).run, raises=UsageError)
     without = replace(paper, fit=weights, synthesize=replace(paper.synthesize, model=str(tmp_path / "none")))
     refused("no diffusion model here", Run(source="city", out=out, settings=without).run)
     with pytest.raises(UsageError, match="LPIPS needs a weight file"):
@@ -111,10 +109,3 @@ def test_the_same_presets_from_python(tmp_path: Path, monkeypatch: pytest.Monkey
     assert seen[2] == with_seed(run_preset(), 4)
     with pytest.raises(UsageError, match="another name of --preset fast"):
         mudg.run("city", out=tmp_path, preset="paper", fast=True)
-
-
-def test_the_published_fit_starts_from_nothing_with_all_steps() -> None:
-    config = run_preset("paper")
-    plain, guided = pipeline.fits_of(config.fit, config.guided_share)
-    assert plain.iterations == guided.iterations == 30_000
-    assert pipeline.fits_of(config.fit, run_preset().guided_share)[1].iterations == 45_000

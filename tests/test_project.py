@@ -77,14 +77,11 @@ def test_result_does_not_depend_on_the_thread_count() -> None:
     assert torch.equal(one.depth, four.depth)
 
 
-def test_equal_depths_go_to_the_lower_index() -> None:
+def test_equal_depths_go_to_the_lower_index_and_splats_cover_their_squares() -> None:
     xyz = np.array([[10, 0, 0], [10, 0, 0]], np.float32)
     got = project_points(xyz, np.array([[255, 0, 0], [0, 255, 0]], np.uint8), VIEW)
     assert int(got.index.max()) == 0
     assert int(got.valid.sum()) == 1
-
-
-def test_splat_of_one_pixel_covers_one_pixel_and_of_three_nine() -> None:
     xyz = np.array([[10, 0, 0]], np.float32)
     for side, pixels in ((1.0, 1), (2.0, 4), (3.0, 9)):
         assert int(project_points(xyz, None, VIEW, splat_px=side).valid.sum()) == pixels

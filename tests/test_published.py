@@ -317,17 +317,22 @@ def test_every_input_of_the_network_matters(model):
     assert int(moved.argmax()) == 3
 
 
-def test_many_sequences_are_attended_in_parts(monkeypatch):
+def test_sequences_and_frames_go_through_in_parts(monkeypatch, model):
     q, k, v = torch.randn(3, 13, 5, 8, generator=torch.Generator().manual_seed(0)).unbind(0)
     whole = clip.attend(q, k, v, 2)
     monkeypatch.setattr(clip, "MAX_ATTENTION_BATCH", 4)
     assert torch.allclose(clip.attend(q, k, v, 2), whole, atol=1e-6)
+    z = torch.randn(4, 4, 4, 6, generator=torch.Generator().manual_seed(1))
+    whole = model.codec.decode_image(z, 4)
+    for at_once in (1, 2, 3):
+        assert torch.allclose(model.codec.decode_image(z, at_once), whole, atol=1e-5)
 
 
-def test_other_numbers_of_frames_are_refused(model):
+def test_other_numbers_of_frames_and_parts_of_different_widths_are_refused(model):
     for count in (1, 3, 5):
         refused("fixed number", model.sample, some_condition(count), SampleRequest(1), raises=UsageError)
     refused("multiples of 4", model.sample, some_condition(height=10), SampleRequest(1), raises=UsageError)
+    refused("context", replace, TINY, text=TowerConfig(32, 2, 2), raises=UsageError)
 
 
 # training -----------------------------------------------------------------------------------------
@@ -439,10 +444,6 @@ def test_shares_of_modalities_and_missing_context(model):
 
 
 # published, command, memory ---------------------------------------------------------------------------
-
-
-def test_parts_of_different_widths_are_refused():
-    refused("context", replace, TINY, text=TowerConfig(32, 2, 2), raises=UsageError)
 
 
 def one_path(street):
@@ -689,13 +690,6 @@ def test_the_tower_goes_where_that_avoids_a_smaller_cut(full):
     assert least == pytest.approx(
         needs.parameters - needs.tower + needs.clip + needs.one_video + memory_plan.RESERVE_BYTES, rel=0.1
     )
-
-
-def test_frames_go_through_the_autoencoder_in_any_number(model):
-    z = torch.randn(4, 4, 4, 6, generator=torch.Generator().manual_seed(1))
-    whole = model.codec.decode_image(z, 4)
-    for at_once in (1, 2, 3):
-        assert torch.allclose(model.codec.decode_image(z, at_once), whole, atol=1e-5)
 
 
 def test_settings_of_the_published_kind_alone(tmp_path):

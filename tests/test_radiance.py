@@ -46,22 +46,16 @@ def tiny_field() -> RadianceField:
 # ---- space and rays ------------------------------------------------------------------------------
 
 
-def test_the_box_fills_the_inner_half_and_infinity_is_the_border():
+def test_space_and_rays_by_hand():
     center, half = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([10.0, 20.0, 5.0])
     places = torch.tensor([[1.0, 2, 3], [11, 2, 3], [1, -18, 3], [21, 2, 3], [1, 2, 1e9], [21, 22, 3]])
     wanted = torch.tensor(
         [[0.5, 0.5, 0.5], [0.75, 0.5, 0.5], [0.5, 0.25, 0.5], [0.875, 0.5, 0.5], [0.5, 0.5, 1.0], [0.875, 0.6875, 0.5]]
     )
     assert torch.allclose(fields.contract(places, center, half), wanted)
-
-
-def test_distances_are_even_to_the_middle_and_even_in_their_inverse_beyond():
     along = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0])
     found = fields.distances(along, 0.1, 200.0, 1000.0)
     assert torch.allclose(found, torch.tensor([0.1, 100.05, 200.0, 1 / (0.5 / 200 + 0.5 / 1000), 1000.0]))
-
-
-def test_weights_of_slabs_are_those_of_beer_and_lambert():
     edges = torch.tensor([[0.0, 1.0, 3.0, 4.0, 10.0]])
     density = torch.tensor([[0.5, 0.0, 2.0, 1e6]])
     first, third = 1 - math.exp(-0.5), math.exp(-0.5) * (1 - math.exp(-2.0))
@@ -178,12 +172,17 @@ def test_the_median_lies_where_half_of_the_weight_is_passed():
     assert marched.range_m.tolist() == pytest.approx([(0.2 + 2.4 + 0.5), (0.4 + 0.6 + 2.0) / 0.8, 5.0])
 
 
-def test_schedules():
+def test_schedules_and_published_sizes():
     assert loop.rate_share(1, 1000) == pytest.approx(0.01)
     assert loop.rate_share(200, 1000) == 1.0
     assert loop.rate_share(1000, 1000) == pytest.approx(0.33**4)
     assert [loop.sight_width(step, 1000) for step in (80, 81, 290, 900)] == [0.0, 6.0, 3.0, 0.6]
     assert [loop.dynamic_share(step, 1000) for step in (1, 100, 300, 500, 900)] == pytest.approx([0, 0, 0.5, 1, 1])
+    config = fit_config(method="emernerf", radiance__size="published")
+    assert SIZES[config.radiance.size].static == (10, 4, 16, 8192, 20)
+    assert loop.BUDGETS[config.radiance.size].proposals == (128, 64)
+    assert loop.BATCHES[config.radiance.size] == (8192, 8192)
+    assert fields.encoded_direction(torch.tensor([[0.0, 0.0, 1.0]])).shape == (1, fields.DIRECTION_WIDTH) == (1, 33)
 
 
 # ---- the fit -------------------------------------------------------------------------------------
@@ -311,14 +310,6 @@ def test_what_needs_gaussians_refuses_a_radiance_field(world, tmp_path):
 def load_field_of_gaussians(folder: Path) -> None:
     store.write_json(folder / "model.json", {"schema": 1})
     load_field(folder)
-
-
-def test_published_sizes_are_a_row_of_the_same_table():
-    config = fit_config(method="emernerf", radiance__size="published")
-    assert SIZES[config.radiance.size].static == (10, 4, 16, 8192, 20)
-    assert loop.BUDGETS[config.radiance.size].proposals == (128, 64)
-    assert loop.BATCHES[config.radiance.size] == (8192, 8192)
-    assert fields.encoded_direction(torch.tensor([[0.0, 0.0, 1.0]])).shape == (1, fields.DIRECTION_WIDTH) == (1, 33)
 
 
 # ---- rays ----------------------------------------------------------------------------------------

@@ -178,17 +178,6 @@ def test_colours_follow_the_viewing_direction_and_are_clamped_at_zero(config: Ra
     torch.testing.assert_close(flat, torch.full((3,), 0.25), atol=1e-5, rtol=0)
 
 
-def test_means2d_are_those_of_the_one_projection(config: RasterConfig) -> None:
-    p, view = _parameters(200), _view()
-    trace = rasterize(_gaussians(p), view, config).trace
-    uv, z = geometry.project(view, p["means"].numpy())
-    seen = trace.visible.numpy()
-    assert seen.sum() > 100
-    assert (z[seen] > 0).all()
-    np.testing.assert_allclose(trace.means2d.numpy()[seen], uv[seen], atol=2e-3)
-    assert (trace.means2d.numpy()[~seen] == 0).all()
-
-
 # ---- against the float64 specification -----------------------------------------------------------
 
 

@@ -21,7 +21,7 @@ from mudg.editing import render
 from mudg.editing.settings import RenderConfig
 from mudg.gaussians import fit
 from mudg.scene.clouds import write_fused
-from mudg.scene.observations import ObservationWriter, list_observation_sets, read_observations
+from mudg.scene.observations import list_observation_sets, read_observations
 from mudg.scene.read import read_scene
 from mudg.steps.fit import Fit
 from mudg.steps.render import RenderViews
@@ -56,7 +56,7 @@ def test_one_folder_and_video_per_trajectory(rendered):
     store.verify_manifest(rendered)
 
 
-def test_observations_hold_all_modalities(rendered):
+def test_observations_hold_all_modalities_and_lie_where_the_trajectory_says(rendered):
     seen = read_observations(rendered / "front_shift+2.0")[1]
     assert seen.kind == "virtual"
     assert seen.source == "street_gaussians"
@@ -67,9 +67,6 @@ def test_observations_hold_all_modalities(rendered):
     assert ((seen.depth > 0.1) & (seen.depth < 200))[covered].all()
     assert ((seen.confidence >= 0) & (seen.confidence <= 1)).all()
     assert seen.confidence[covered].mean() > 0.8
-
-
-def test_views_lie_where_the_trajectory_says(rendered):
     names = ("front_recorded", "front_shift+2.0")
     recorded, left = (read_observations(rendered / name).views for name in names)
     for a, b in zip(recorded, left):
@@ -117,8 +114,8 @@ def test_removing_the_car_shows_what_is_behind_it(world, tmp_path):
     row, column = int(uv[0, 1]), int(uv[0, 0])
     assert with_car.semantics[row, column] == ID["car"]
     assert seen.semantics[row, column] != ID["car"]
-    with pytest.raises(UsageError, match="no dynamic object 'tram'"):
-        RenderViews(**world, out=tmp_path / "other", settings=RenderConfig(remove_tracks=("tram",))).run()
+    other = RenderViews(**world, out=tmp_path / "other", settings=RenderConfig(remove_tracks=("tram",)))
+    refused("no dynamic object 'tram'", other.run, raises=UsageError)
 
 
 def test_any_camera_any_width(world):
@@ -129,11 +126,3 @@ def test_any_camera_any_width(world):
     assert paths[0].views[0].camera.height == 20
     refused("no camera named 'rear'", render.trajectories, scene, RenderConfig(cameras=("rear",)), raises=UsageError)
     refused("no shifts", render.trajectories, scene, RenderConfig(shifts_m=()), raises=UsageError)
-
-
-def test_writer_and_render_agree_on_finished(rendered):
-    """An observation folder counts as finished by its index only."""
-    with ObservationWriter(rendered / "front_recorded", "front_recorded", "x") as writer:
-        assert writer.done == FRAMES
-        for view in read_observations(rendered / "front_recorded").views:
-            writer.skip(view)

@@ -100,7 +100,7 @@ def outline(page: str) -> Outline:
     return parser
 
 
-def test_the_page_is_well_formed_and_loads_nothing(page: str) -> None:
+def test_the_page_is_well_formed_escapes_texts_and_loads_nothing(page: str) -> None:
     found = outline(page)
     for tag, attributes in found.tags:
         for name in ("src", "href", "poster", "srcset", "data", "action"):
@@ -109,6 +109,8 @@ def test_the_page_is_well_formed_and_loads_nothing(page: str) -> None:
     assert not re.search(r"url\(\s*['\"]?(?!data:)", page)
     assert "@import" not in page
     assert "default-src 'none'" in page
+    assert "<script>alert(1)" not in page
+    assert "&lt;toy&gt; &amp; co" in page
 
 
 def test_the_report_holds_commands_that_can_be_copied_and_work(
@@ -150,11 +152,6 @@ def test_every_control_has_a_label(page: str) -> None:
     assert len(ids) == len(set(ids))
 
 
-def test_texts_from_outside_are_escaped(page: str) -> None:
-    assert "<script>alert(1)" not in page
-    assert "&lt;toy&gt; &amp; co" in page
-
-
 EVIL = '"><script>alert(1)</script>'
 
 
@@ -184,10 +181,6 @@ def test_names_from_a_scene_cannot_become_tags(tmp_path: Path) -> None:
     assert all("alert" not in (a.get("style") or "") for _, a in outline(page).tags)
 
 
-def test_a_value_that_a_template_lacks_is_an_error() -> None:
-    refused("title", report_html.render, "labels.html.j2", raises=UndefinedError)
-
-
 def test_videos_hold_all_panels_and_play(page: str) -> None:
     import av
 
@@ -209,35 +202,26 @@ def test_panels_show_what_they_say(tmp_path: Path) -> None:
     scores = store.read_json(out / "score" / "metrics.json")
     folders = report._folders(out, scores)
     assert list(folders) == ["truth", "street_gaussians", "mudg_r", "mudg_s"]
-    course = next(c for c in scores["trajectories"] if c["shift_m"] == 0)
-    columns = report._columns(course, folders)
-    assert columns.has_truth
-    panels = {c: report._rows(columns, c) for c in columns.sets}
+    h, w = toy_views.HEIGHT, toy_views.WIDTH
+    courses = {course["shift_m"]: report._columns(course, folders) for course in scores["trajectories"]}
+    recorded, shifted = courses[0], courses[2]
+    panels, beside = ({c: report._rows(columns, c) for c in columns.sets} for columns in (recorded, shifted))
+    assert recorded.has_truth
     assert panels["truth"] == ("rgb", "depth", "semantics")
     assert panels["mudg_s"] == ("rgb", "depth", "semantics", "error")
     assert "mudg_r" not in panels
-    atlas = next(report._frames(columns, list(folders), (toy_views.WIDTH, toy_views.HEIGHT)))
-    h, w = toy_views.HEIGHT, toy_views.WIDTH
+    atlas = next(report._frames(recorded, list(folders), (w, h)))
     assert np.array_equal(atlas[:h, :w], toy_views.colors(0))
     assert abs(atlas[:h, w : 2 * w].astype(int) - np.round(toy_views.colors(0) * 0.8)).max() <= 1
     assert (atlas[h : 2 * h, :w][np.isnan(toy_views.depths())] == 0).all()
     assert tuple(atlas[2 * h, 0]) == (70, 130, 180)  # sky in the usual colour
     assert (atlas[:h, 2 * w : 3 * w] == 24).all()  # not produced
-
-
-def test_a_shifted_view_of_a_log_shows_the_recorded_path_beside_it(tmp_path: Path) -> None:
-    out = finished_run(tmp_path)
-    scores = store.read_json(out / "score" / "metrics.json")
-    folders = report._folders(out, scores)
-    course = next(c for c in scores["trajectories"] if c["shift_m"] == 2)
-    columns = report._columns(course, folders)
-    assert not columns.has_truth
-    assert columns.sets["truth"].trajectory == "front_recorded"
-    assert list(columns.indices["truth"]) == [0, 1, 2, 3]
-    panels = {c: report._rows(columns, c) for c in columns.sets}
-    assert all("error" not in rows for rows in panels.values())
-    atlas = next(report._frames(columns, list(folders), (toy_views.WIDTH, toy_views.HEIGHT)))
-    assert np.array_equal(atlas[: toy_views.HEIGHT, : toy_views.WIDTH], toy_views.colors(0))
+    assert not shifted.has_truth  # the recorded path is shown beside it
+    assert shifted.sets["truth"].trajectory == "front_recorded"
+    assert list(shifted.indices["truth"]) == [0, 1, 2, 3]
+    assert all("error" not in rows for rows in beside.values())
+    atlas = next(report._frames(shifted, list(folders), (w, h)))
+    assert np.array_equal(atlas[:h, :w], toy_views.colors(0))
 
 
 def run_of(psnr: dict[tuple[str, float], float | str], truth: str = "exact") -> dict[str, Any]:
@@ -273,24 +257,22 @@ def test_axis_ticks_enclose_the_values(low: float, high: float) -> None:
     assert np.allclose(np.diff(ticks), ticks[1] - ticks[0])
 
 
-def test_without_an_encoder_pictures_stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    out = finished_run(tmp_path)
-    monkeypatch.setattr(report, "video_encoders", list)
-    page = written(out).read_text(encoding="utf-8")
-    outline(page)
-    assert "<video" not in page
-    assert page.count("data:image/jpeg") == 2
-
-
-def test_an_unscored_run_is_said(tmp_path: Path) -> None:
-    refused("file not found", written, tmp_path)
-
-
-def test_the_budget_makes_videos_smaller(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_budget_makes_videos_smaller_and_without_an_encoder_pictures_stand_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = finished_run(tmp_path)
     large = written(out).stat().st_size
     monkeypatch.setattr(report, "BUDGET_BYTES", 1000)
     assert written(out).stat().st_size < large
+    monkeypatch.setattr(report, "video_encoders", list)
+    page = written(out).read_text(encoding="utf-8")
+    outline(page)
+    assert "<video" not in page and page.count("data:image/jpeg") == 2
+
+
+def test_an_unscored_run_and_a_value_that_a_template_lacks_are_errors(tmp_path: Path) -> None:
+    refused("file not found", written, tmp_path)
+    refused("title", report_html.render, "labels.html.j2", raises=UndefinedError)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import io
+import pickle
+import sqlite3
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,8 +22,9 @@ from pandas_pickles import write_frame
 
 from mudg.base.geometry import invert
 from mudg.base.types import EgoPath, Scene, Sweep, SweepPoints
+from mudg.formats.importers.clouds import read_cloud
 from mudg.formats.importers.pandaset import read_frame
-from mudg.scene.check import check_scene
+from mudg.scene.check import check_points, check_scene
 from mudg.scene.clouds import at_sensor
 from mudg.scene.read import read_points
 
@@ -200,8 +203,6 @@ def test_zeros_that_a_format_moved_lie_at_the_sensor_when_they_were_measured(tmp
 
 def test_doctor_finds_points_at_the_sensor_and_at_one_largest_range(tmp_path: Path) -> None:
     scene = roundtrip.small_log(tmp_path / "scene")
-    from mudg.scene.check import check_points
-
     sweep: Sweep = scene.sweeps[0]
     points = read_points(scene, sweep)
     assert not list(check_points(scene, sweep, points))
@@ -216,9 +217,6 @@ def test_doctor_finds_points_at_the_sensor_and_at_one_largest_range(tmp_path: Pa
 
 
 def test_zeros_of_merged_lidars_lie_at_their_mounts(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    import pickle
-    import sqlite3
-
     truth = bad_logs.city(bad_logs.shared(tmp_path_factory) / "truth")
     database = write_nuplan.write_nuplan(truth, tmp_path / "log")
     ego = truth.ego.pose_at(truth.sweeps[0].time_s)
@@ -236,8 +234,6 @@ def test_zeros_of_merged_lidars_lie_at_their_mounts(tmp_path: Path, tmp_path_fac
 
 def test_bytes_of_an_archive_are_numbers(tmp_path: Path) -> None:
     """An archive of the neutral layout whose coordinates are whole numbers has no-return rows, too."""
-    from mudg.formats.importers.clouds import read_cloud
-
     buffer = io.BytesIO()
     np.savez(buffer, xyz=np.array([[0, 0, 0], [1, 2, 3]], np.int32))
     (tmp_path / "cloud.npz").write_bytes(buffer.getvalue())

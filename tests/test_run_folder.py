@@ -320,18 +320,13 @@ def test_a_crash_at_any_point_of_the_exchange_loses_nothing(
         assert set(contents(folder)) == {"manifest.json", "mine.md", "out.txt", "rows/2.txt", "run.yaml"}
 
 
-def test_a_reader_between_the_renames_is_told_what_happened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = finished(tmp_path / "r").path
-    crashed(folder, monkeypatch, ("rename", 2))
-    assert not folder.exists()
-    refused("repeat the command that wrote it", store.digest, folder)
-
-
-def test_the_old_result_comes_back_where_the_new_one_does_not_verify(
+def test_what_a_crash_between_the_renames_left_is_told_and_undone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = finished(tmp_path / "r").path
     crashed(folder, monkeypatch, ("rename", 2))
+    assert not folder.exists()
+    refused("repeat the command that wrote it", store.digest, folder)
     (store.staging_path(folder) / "out.txt").write_text("damaged")
     assert run(folder).complete and contents(folder)["out.txt"] == "result 1"
 

@@ -114,8 +114,10 @@ def help_of(page: str, asked: str) -> str:
     return said.getvalue()
 
 
-def test_short_help_is_help() -> None:
+def test_short_help_is_help_and_every_part_of_a_verb_has_a_page() -> None:
     assert help_of("ingest kitti", "-h") == help_of("ingest kitti", "--help")
+    assert set(steps.step_class("ingest").parts) == {"city", *FORMATS}
+    assert set(steps.step_class("bench").parts) == {*bench.BENCHES, bench.SHIFT, bench.REAL, bench.PAPER, bench.LOOP}
 
 
 @pytest.mark.parametrize("verb", steps.VERBS)
@@ -147,8 +149,3 @@ def test_parts_of_verbs_have_pages_of_their_own(
     assert f"usage: mudg {page}" in said and "--quiet" in said
     listed = {line.split()[0].replace("[no-]", "") for line in said.splitlines() if line.startswith("  --")}
     assert set(shown) <= listed and not set(others) & listed
-
-
-def test_every_part_that_a_verb_takes_has_a_page() -> None:
-    assert set(steps.step_class("ingest").parts) == {"city", *FORMATS}
-    assert set(steps.step_class("bench").parts) == {*bench.BENCHES, bench.SHIFT, bench.REAL, bench.PAPER, bench.LOOP}

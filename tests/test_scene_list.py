@@ -1,7 +1,6 @@
 """Lists of scenes and streamed clips: what is drawn, what is kept, what is left out."""
 
 import collections
-import json
 import os
 import shutil
 import threading
@@ -18,7 +17,7 @@ from mudg.base import config as configuration
 from mudg.base import seeds, store
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.location import Location
-from mudg.diffusion import learn
+from mudg.diffusion import learn, log_clips, shard_sources
 from mudg.diffusion.shard_sources import (
     FolderOfShards,
     ListedScene,
@@ -141,37 +140,32 @@ def test_a_training_on_a_list_resumes_bit_equal(clips, tmp_path):
         Learn(out=tmp_path / "parts", settings=from_list(text)).run()
     Learn(out=tmp_path / "parts", settings=from_list(text)).run()
     assert losses_of(tmp_path / "whole") == losses_of(tmp_path / "parts")
-    names = [p.name for p in (tmp_path / "whole" / "model").glob("*.safetensors")]
-    assert names and all(
-        (tmp_path / "whole" / "model" / n).read_bytes() == (tmp_path / "parts" / "model" / n).read_bytes()
-        for n in names
+    whole, parts = (
+        {path.name: path.read_bytes() for path in (tmp_path / name / "model").glob("*.safetensors")}
+        for name in ("whole", "parts")
     )
+    assert whole and whole == parts
     assert not (tmp_path / "whole" / "cache").exists()
-    with pytest.raises(UsageError, match="lies in an input"):
-        Learn(out=tmp_path / "scenes" / "1" / "out", settings=from_list(text)).run()
-    with pytest.raises(UsageError, match="list of scenes says"):
-        Learn(out=tmp_path / "both", settings=tiny(clips, scenes=(text,))).run()
+    inside = Learn(out=tmp_path / "scenes" / "1" / "out", settings=from_list(text))
+    refused("lies in an input", inside.run, raises=UsageError)
+    both = Learn(out=tmp_path / "both", settings=tiny(clips, scenes=(text,)))
+    refused("list of scenes says", both.run, raises=UsageError)
 
 
 def test_streamed_clips_give_the_same_losses(clips, address, tmp_path):
     Learn(out=tmp_path / "local", settings=tiny(clips, log_every=1, steps=2)).run()
-    Learn(
-        out=tmp_path / "streamed",
-        settings=tiny(address.text, log_every=1, steps=2, cache=str(tmp_path / "cache"), cache_gb=1e-6),
-    ).run()
+    settings = tiny(address.text, log_every=1, steps=2, cache=str(tmp_path / "cache"), cache_gb=1e-6)
+    Learn(out=tmp_path / "streamed", settings=settings).run()
     assert losses_of(tmp_path / "local") == losses_of(tmp_path / "streamed")
     assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 1  # all others had to go
-    assert json.loads((tmp_path / "local" / "metrics.json").read_text()) == json.loads(
-        (tmp_path / "streamed" / "metrics.json").read_text()
-    )
+    local, streamed = (store.read_json(tmp_path / name / "metrics.json") for name in ("local", "streamed"))
+    assert local == streamed
 
 
 def test_the_command_takes_an_address_of_clips(address, tmp_path, capsys):
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text(configuration.dump_yaml(tiny(address.text, steps=2)))
-    assert app.main(["learn", "--config", str(recipe), "--out", str(tmp_path / "a"), "--quiet"]) == 0, (
-        capsys.readouterr().err
-    )
+    assert app.main(["learn", "--config", str(recipe), "--out", str(tmp_path / "a"), "--quiet"]) == 0
     assert app.main(["learn", "--data.textures", "s3://bucket/textures", "--out", str(tmp_path / "c"), "--quiet"]) == 2
     assert "a path of this machine" in capsys.readouterr().err
 
@@ -201,8 +195,7 @@ def test_what_arrives_is_verified(clips, address, tmp_path):
     assert not (tmp_path / "two").exists()
     with pytest.raises(InputError, match="another number of clips(.|\n)*clips-per-city 2"):
         StreamedShards(address, ShardCache(tmp_path / "c", 10**9), 5).path(0)
-    inner = FolderOfShards.open(Location.of(f"{address}"))
-    assert inner.key == folder.key
+    assert FolderOfShards.open(Location.of(f"{address}")).key == folder.key
 
 
 def test_drawing_ahead_draws_what_would_be_drawn(address, tmp_path):
@@ -226,8 +219,6 @@ def test_drawing_ahead_draws_what_would_be_drawn(address, tmp_path):
 
 def test_a_listed_log_is_cut_when_it_is_drawn(tmp_path, monkeypatch):
     """Made once; how many clips there are is not counted again."""
-    from mudg.diffusion import log_clips, shard_sources
-
     calls = collections.Counter()
     windows = [log_clips.LogWindow("front", ("a",), False)] * 3
     monkeypatch.setattr(shard_sources.log_clips, "log_source", lambda text: log_clips.LogSource(tmp_path, tmp_path))

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import torch
 from fit_settings import fit_to, fitted_bytes, interrupted, small_fit, written_clouds_and_views
+from refusals import refused
 from toy_world import CAR_SIZE, camera, car_pose, fused_cloud, truth, view_at, write_scene
 
-from mudg.base.errors import InputError, NumericsError
+from mudg.base.errors import NumericsError
 from mudg.base.types import FusedCloud, PointCloud, Scene, Track
 from mudg.core import metrics
 from mudg.core.raster.rasterize import RasterConfig
@@ -25,7 +26,6 @@ from mudg.scene.clouds import write_fused
 from mudg.scene.observations import ObservationWriter
 from mudg.scene.read import read_scene
 from mudg.scene.write import SceneWriter
-from mudg.steps.fit import Fit
 
 SIZE, FRAMES = (60, 40), 6
 EVERYTHING = {
@@ -86,13 +86,8 @@ def test_interrupted_and_resumed_equals_uninterrupted_with_everything_on(world, 
         replace(step, out=tmp_path / "parts").run()
     parts = replace(step, out=tmp_path / "parts").run()
     assert fitted_bytes(parts) == fitted_bytes(whole)
-    assert set(fitted_bytes(whole)) == {
-        "gaussians.safetensors",
-        "nodes.safetensors",
-        "appearance.safetensors",
-        "model.json",
-    }
-
+    tensors = {f"{name}.safetensors" for name in ("gaussians", "nodes", "appearance")}
+    assert set(fitted_bytes(whole)) == tensors | {"model.json"}
     model = fit.load_model(whole)
     walker = next(node for node in model.nodes if node.name == "walker")
     assert isinstance(walker, DeformableNode)
@@ -100,25 +95,11 @@ def test_interrupted_and_resumed_equals_uninterrupted_with_everything_on(world, 
     assert model.nodes[1].offsets["shift"].detach().abs().max().item() > 0
 
 
-def test_a_saved_scene_renders_as_the_fitted_one(world, tmp_path):
-    folder = fit_to(world, tmp_path / "fit", settings(iterations=6), observations=(world["virtual"],)).run()
-    model = fit.load_model(folder)
-    fit.save_model(model, tmp_path)
-    again = fit.load_model(tmp_path)
-    view = view_at(0.45, camera(width=SIZE[0], height=SIZE[1]))
-    for mine, theirs in ((fit.render_view(m, view, RasterConfig()) for m in (model, again)),):
-        assert torch.equal(mine.rgb, theirs.rgb)
-
-
 def test_everything_on_without_tracks_and_with_one_frame(tmp_path):
     write_scene(tmp_path / "scene", frames=1, width=SIZE[0], height=SIZE[1], labels=False, tracks=False)
     write_fused(tmp_path / "fuse", FusedCloud(fused_cloud(1, semantics=False).static, {}), {})
-    folder = Fit(
-        scene=tmp_path / "scene",
-        fused=tmp_path / "fuse",
-        out=tmp_path / "fit",
-        settings=settings("street_gaussians", iterations=4),
-    ).run()
+    world = {"scene": tmp_path / "scene", "fuse": tmp_path / "fuse"}
+    folder = fit_to(world, tmp_path / "fit", settings("street_gaussians", iterations=4)).run()
     view = view_at(0.0, camera(width=48, height=32))
     seen, exact = fit.render_view(fit.load_model(folder), view, RasterConfig()).rgb, truth(view).rgb
     plain = exact.mean((1, 2), keepdim=True).expand_as(exact)
@@ -134,12 +115,8 @@ def test_an_object_seen_once_whose_track_has_one_key(world, tmp_path, label):
     points = fused_cloud(2).objects["car"]
     few = PointCloud(points.xyz[:3], points.rgb[:3], "object", None)
     write_fused(tmp_path / "fuse", FusedCloud(fused_cloud(2).static, {"car": few}), {})
-    folder = Fit(
-        scene=tmp_path / "scene",
-        fused=tmp_path / "fuse",
-        out=tmp_path / "fit",
-        settings=settings("street_gaussians", iterations=8),
-    ).run()
+    world = {"scene": tmp_path / "scene", "fuse": tmp_path / "fuse"}
+    folder = fit_to(world, tmp_path / "fit", settings("street_gaussians", iterations=8)).run()
     model = fit.load_model(folder)
     moving = model.table.labels["node"] > 0
     assert (compose(model, 0.3).opacity[moving] > 0).any()
@@ -161,11 +138,10 @@ def test_no_sky_at_all_and_nothing_but_sky(world, share):
     behind = state.model.sky.coarse_picture(view).detach()
     exact = truth(view).rgb
     plain = exact.mean((1, 2), keepdim=True).expand_as(exact)
-    assert (
-        float(behind.std((1, 2)).max()) < 1e-6
-        if share == 0
-        else metrics.psnr(behind, exact) > metrics.psnr(plain, exact) + 4.0
-    )
+    if share:
+        assert metrics.psnr(behind, exact) > metrics.psnr(plain, exact) + 4.0
+    else:
+        assert float(behind.std((1, 2)).max()) < 1e-6
 
 
 def test_a_picture_that_is_not_finite_is_named(world, tmp_path, monkeypatch):
@@ -185,11 +161,8 @@ def test_a_picture_that_is_not_finite_is_named(world, tmp_path, monkeypatch):
 def test_a_virtual_picture_that_is_not_finite_is_refused_when_written(tmp_path):
     seen = truth(view_at(0.0, camera(width=12, height=8)))
     seen.rgb[1, 2, 3] = float("nan")
-    with (
-        pytest.raises(InputError, match=r"not finite[\s\S]*000000"),
-        ObservationWriter(tmp_path / "v", "v", "test") as writer,
-    ):
-        writer.add(seen)
+    with ObservationWriter(tmp_path / "v", "v", "test") as writer:
+        refused(r"not finite[\s\S]*000000", writer.add, seen)
 
 
 def test_mirrored_points_appear_where_nothing_was_measured():

@@ -16,7 +16,6 @@ from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import FusedCloud, Observation, PointCloud, View
 from mudg.core.metrics import METRICS
-from mudg.core.pictures import resize_nearest
 from mudg.editing.settings import ScoreConfig
 from mudg.networks import featnets
 from mudg.scoring import score
@@ -136,12 +135,6 @@ def test_methods_of_other_sizes_are_compared_at_the_cameras_size(tmp_path: Path,
     assert value(document, "a", "front_recorded", "psnr") == pytest.approx(expected, abs=1e-3)
 
 
-def test_nearest_resize_mixes_nothing() -> None:
-    ids = torch.tensor([[[0, 1], [2, 3]]])
-    assert resize_nearest(ids, 4, 4).tolist() == [[[0, 0, 1, 1], [0, 0, 1, 1], [2, 2, 3, 3], [2, 2, 3, 3]]]
-    assert resize_nearest(torch.arange(16).reshape(1, 4, 4), 2, 2).tolist() == [[[5, 7], [13, 15]]]
-
-
 def test_only_views_that_all_methods_have_are_compared(tmp_path: Path, scene: Path) -> None:
     full = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
     part = toy_views.write_views(scene, tmp_path / "b", "b", (0.0,))
@@ -153,17 +146,14 @@ def test_only_views_that_all_methods_have_are_compared(tmp_path: Path, scene: Pa
     assert {r["views"] for r in document["results"]} == {1}
 
 
-def test_methods_must_stand_in_the_same_place(tmp_path: Path, scene: Path) -> None:
+def test_what_cannot_be_compared_is_refused(tmp_path: Path, scene: Path) -> None:
     here = toy_views.write_views(scene, tmp_path / "a", "a", (2.0,))
     there = toy_views.write_views(scene, tmp_path / "b", "b", (3.0,))
     (there / "front_shift+3.0").rename(there / "front_shift+2.0")
     with pytest.raises(InputError, match="different positions"):
         Score(scene=scene, views={"a": here, "b": there}, out=tmp_path / "score", settings=PLAIN).run()
-
-
-def test_nothing_to_score_is_said(tmp_path: Path, scene: Path) -> None:
     with pytest.raises(UsageError):
-        Score(scene=scene, views={}, out=tmp_path / "score", settings=PLAIN).run()
+        Score(scene=scene, views={}, out=tmp_path / "score1", settings=PLAIN).run()
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="none of the folders"):
         Score(scene=scene, views={"a": tmp_path / "empty"}, out=tmp_path / "score2", settings=PLAIN).run()
@@ -215,7 +205,7 @@ def test_distances_average_both_sides_and_mark_the_best() -> None:
     assert score_tables.best_of(METRICS["flicker"].better, flicker, "flicker") == {"near it"}
 
 
-def test_baseline_fills_holes_with_the_nearest_point(scene: Path) -> None:
+def test_baseline_fills_holes_with_the_nearest_point_and_sees_nothing_behind(scene: Path) -> None:
     """Two walls of points, red at 10 m on the left and green at 20 m on the right."""
     view = View(toy_views.CAMERA, toy_views.EGO_FROM_CAM, 0.0)
     rows, columns = np.mgrid[2 : toy_views.HEIGHT : 4, 4:12:4]
@@ -231,9 +221,6 @@ def test_baseline_fills_holes_with_the_nearest_point(scene: Path) -> None:
     for column, depth in ((0, 10.0), (-1, 20.0)):
         assert torch.allclose(seen.depth[0, :, column], torch.tensor(depth))
     assert set(seen.semantics.unique().tolist()) == {0, 13}
-
-
-def test_baseline_of_a_view_that_sees_nothing() -> None:
     view = View(toy_views.CAMERA, toy_views.EGO_FROM_CAM, 0.0)
     xyz, rgb = np.array([[-5.0, 0, 1]], np.float32), np.zeros((1, 3), np.uint8)
     behind = PointCloud(xyz, rgb, "world", np.zeros(1, np.uint8))

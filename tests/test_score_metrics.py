@@ -25,7 +25,6 @@ from mudg.core import metrics
 from mudg.diffusion import model_files as files
 from mudg.editing.settings import ScoreConfig
 from mudg.networks.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance, lpips_shapes
-from mudg.scoring import score
 from mudg.scoring import tables as score_tables
 from mudg.steps.render import Score
 
@@ -73,8 +72,14 @@ def scrambled(rgb, seed=0):
     return moved.reshape(4, 6, 8, 8, 3, 4, 4).permute(4, 0, 2, 5, 1, 3, 6).reshape(3, 128, 192)
 
 
-def test_equal_pictures_are_0_apart(pictures, distance):
+def test_equal_pictures_are_0_apart_only_masked_in_pixels_count_and_odd_sizes_work(pictures, distance):
     assert distance(pictures[0], pictures[0]) == 0.0
+    truth = pictures[0][:, :125, :187]
+    spoilt = truth.clone()
+    spoilt[:, :, 120:] = 0.5
+    mask = torch.zeros(1, 125, 187, dtype=torch.bool)
+    mask[..., :40] = True
+    assert distance(spoilt, truth, mask) < 1e-6 < distance(spoilt, truth)
 
 
 @pytest.mark.parametrize(
@@ -98,15 +103,6 @@ def test_degradations_are_ordered_as_people_see_them_where_psnr_is_not(pictures,
     # Of a picture a tenth darker and one with visible blocks, PSNR takes the blocks.
     assert metrics.psnr(jpeg(truth, 20), truth) > metrics.psnr(darker, truth)
     assert distance(jpeg(truth, 20), truth) > 2 * apart["darker"]
-
-
-def test_only_masked_in_pixels_count_and_odd_sizes_work(pictures, distance):
-    truth = pictures[0][:, :125, :187]
-    spoilt = truth.clone()
-    spoilt[:, :, 120:] = 0.5
-    mask = torch.zeros(1, 125, 187, dtype=torch.bool)
-    mask[..., :40] = True
-    assert distance(spoilt, truth, mask) < 1e-6 < distance(spoilt, truth)
 
 
 def lpips(prediction, truth, **more):
@@ -271,13 +267,6 @@ def test_a_recorded_log_has_a_perceptual_distance_but_no_flicker_and_no_dynamic_
     values = scored("other", config)
     assert values["a"]["perceptual"] == score_tables.NOT_REQUESTED
     assert values["a"]["lpips"] == pytest.approx(0.0, abs=1e-6) != values["b"]["lpips"]
-
-
-def test_evenly_spread_views():
-    assert score.evenly(range(6), 8) == [0, 1, 2, 3, 4, 5]
-    assert score.evenly(range(24), 3) == [4, 12, 20]
-    assert score.evenly([3, 7, 11], 1) == [7]
-    assert score.evenly([], 4) == score.evenly(range(4), 0) == []
 
 
 # ---- the other networks of LPIPS -----------------------------------------------------------------

@@ -20,13 +20,10 @@ def pages_of(menu: Any) -> list[str]:
     return [page for entry in (menu.values() if isinstance(menu, dict) else menu) for page in pages_of(entry)]
 
 
-def test_the_menu_names_every_page_once(repository: Path) -> None:
+def test_the_menu_names_every_page_once_and_the_front_page_links_to_it(repository: Path) -> None:
     menu = tomllib.loads((repository / "zensical.toml").read_text(encoding="utf-8"))["project"]["nav"]
     there = sorted(page.relative_to(repository / "docs").as_posix() for page in (repository / "docs").rglob("*.md"))
     assert sorted(pages_of(menu)) == there
-
-
-def test_the_front_page_links_to_every_page(repository: Path) -> None:
     text = (repository / "docs" / "index.md").read_text(encoding="utf-8")
     pages = (page.relative_to(repository / "docs").as_posix() for page in (repository / "docs").rglob("*.md"))
     assert not [page for page in pages if page != "index.md" and f"]({page})" not in text]

@@ -16,12 +16,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import splat_readers as slow
+import torch
 import toy_splats
 from PIL import Image
 from refusals import refused
 
 from mudg.base.errors import ResourceError
+from mudg.base.geometry import matrix_from_quaternion
+from mudg.core import harmonics
 from mudg.core.harmonics import basis
+from mudg.core.raster.torch_twin import sh_basis
 from mudg.formats.splats import binary, formats, gltf, ply, sog, spz, usd
 from mudg.formats.splats.cloud import SplatCloud, SplatScene, joined
 
@@ -151,7 +155,7 @@ def test_axes_come_back_and_are_those_of_the_format(name: str, axes: formats.Axe
     assert up.tolist() == ([0, -1, 0] if formats.FORMATS[name].axes.startswith("RD") else [0, 1, 0])
 
 
-def test_a_turned_cloud_looks_as_from_the_other_side() -> None:
+def test_a_turned_cloud_looks_as_from_the_other_side_and_joined_ones_keep_their_classes() -> None:
     cloud, pose = toy_splats.cloud(6, 3, 2), toy_splats.geometry.yaw_matrix(0.8, (1, 2, 3))
     moved = cloud.moved(pose)
     d = np.random.default_rng(0).normal(size=(9, 3))
@@ -160,9 +164,6 @@ def test_a_turned_cloud_looks_as_from_the_other_side() -> None:
     before, after = seen(d, cloud.sh), seen(d @ pose[:3, :3].T, moved.sh)
     assert np.abs(before - after).max() < 1e-5
     assert np.abs(moved.moved(np.linalg.inv(pose)).means - cloud.means).max() < 1e-5
-
-
-def test_joining_takes_the_highest_degree_and_keeps_classes() -> None:
     both = joined([toy_splats.cloud(2, 1, classes=True), toy_splats.cloud(3, 2)])
     assert both.degree == 2 and both.class_ids is not None and both.class_ids[2:].tolist() == [255] * 3
     assert not both.sh[:2, 4:].any()
@@ -255,18 +256,60 @@ def test_a_fit_that_draws_antialiased_says_so_where_it_can() -> None:
     scene = toy_splats.scene()
     request = formats.WriteRequest(SplatScene("toy", scene.nodes, facts={"drawing": {"antialias": True}}), 0.5)
     assert zlib.decompress(formats.FORMATS["spz"].write(request), 31)[14] == 1
-    assert (
-        json.loads(zipfile.ZipFile(io.BytesIO(formats.FORMATS["sog"].write(request))).read("meta.json"))["antialias"]
-        is True
-    )
+    about = json.loads(zipfile.ZipFile(io.BytesIO(formats.FORMATS["sog"].write(request))).read("meta.json"))
+    assert about["antialias"] is True
     assert formats.losses("splat", request)[-1] == "how the fit draws Gaussians (antialias True)"
     assert not any("draws" in sentence for sentence in formats.losses("spz", request))
 
 
-def test_names_of_prims_are_valid_and_differ() -> None:
+def test_names_of_prims_are_valid_and_times_of_animations_rise() -> None:
     assert usd.prim_names(["a-1", "a_1", "7", ""]) == ["a_1", "a_1_2", "_7", "node"]
-
-
-def test_times_of_animations_rise_and_are_not_negative() -> None:
     made = gltf.rising(np.array([-0.1, 0.0, 1e-50, 5.0, 5.0 + 1e-9]))
     assert (np.diff(made) > 0).all() and made[0] == 0
+
+
+# -- harmonics: the basis of the rasterisers, and exact rotation ------------------------------------
+
+
+def directions(count: int = 50) -> np.ndarray:
+    d = np.random.default_rng(1).normal(size=(count, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def turn(seed: int) -> np.ndarray:
+    return matrix_from_quaternion(np.random.default_rng(seed).normal(size=4))
+
+
+def test_the_basis_is_that_of_the_rasterisers() -> None:
+    d = directions()
+    assert np.abs(harmonics.basis(d, 3) - sh_basis(torch.from_numpy(d), 3).numpy()).max() < 1e-9  # measured 1.4e-14
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_rotated_harmonics_look_from_rotated_directions_as_the_old_ones_did(degree: int) -> None:
+    rotation, d = turn(degree), directions()
+    sh = np.random.default_rng(2).normal(size=(4, (degree + 1) ** 2, 3))
+    rows = slice(degree**2, (degree + 1) ** 2)
+    before = harmonics.basis(d, degree)[:, rows] @ sh[0, rows]
+    mixed = harmonics.band_rotation(rotation, degree) @ sh[0, rows]
+    after = harmonics.basis(d @ rotation.T, degree)[:, rows] @ mixed
+    assert np.abs(after - before).max() < 1e-12  # float64 rounding
+    made = harmonics.rotated(sh.astype(np.float32), rotation)
+    seen = np.einsum("dk,nkc->dnc", harmonics.basis(d @ rotation.T, degree), made)
+    assert np.abs(seen - np.einsum("dk,nkc->dnc", harmonics.basis(d, degree), sh)).max() < 1e-5
+
+
+@pytest.mark.parametrize("band", [1, 2, 3])
+def test_rotations_of_a_band_are_orthogonal_and_compose(band: int) -> None:
+    first, second = turn(7), turn(8)
+    one, two, both = (harmonics.band_rotation(r, band) for r in (first, second, second @ first))
+    assert np.abs(one @ one.T - np.eye(2 * band + 1)).max() < 1e-12
+    assert np.abs(two @ one - both).max() < 1e-12
+
+
+@pytest.mark.parametrize("band", [1, 2, 3])
+def test_a_turn_about_z_mixes_opposite_orders_by_its_multiples(band: int) -> None:
+    turn_z = matrix_from_quaternion([np.cos(0.35), 0, 0, np.sin(0.35)])
+    order = np.arange(-band, band + 1)
+    wanted = np.diag(np.cos(order * 0.7)) + np.fliplr(np.diag(-np.sin(order * 0.7)))
+    assert np.abs(harmonics.band_rotation(turn_z, band) - wanted).max() < 1e-12

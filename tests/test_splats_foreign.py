@@ -168,12 +168,17 @@ def test_the_filter_of_mip_splatting_goes_into_sizes_and_opacities(column: str, 
         assert cloud.opacity[n] == pytest.approx(opacity, abs=1e-5)
 
 
-def test_flat_gaussians_of_2dgs_are_read_flat() -> None:
+def test_flat_gaussians_rotations_of_any_length_and_classes_of_others() -> None:
     cloud = read(ply(rows(scale_2=None)), axes="world")
     assert np.allclose(cloud.log_scales[:, :2], [[row["scale_0"], row["scale_1"]] for row in ROWS])
     assert (np.exp(cloud.log_scales[:, 2]) <= 1e-6).all()
     normal = shape(cloud, 1) @ [1, 0, 0]  # the second is turned so that z becomes x
     assert np.abs(normal).max() < 1e-11
+    long = {f"rot_{n}": [7.5 * row[f"rot_{n}"] for row in ROWS] for n in range(4)}
+    assert np.allclose(read(ply(rows(**long))).quats, read(ply()).quats, atol=1e-6)
+    assert read(ply(rows(**{"class": [2, 5, 6]}), kinds={"class": "uchar"})).class_ids is None
+    ids = read(ply(rows(**{"class": [2.0, 255.0, 6.0]}))).class_ids
+    assert ids is not None and ids.tolist() == [2, 255, 6]
 
 
 def test_usual_values_are_not_worth_a_word(capsys: pytest.CaptureFixture[str]) -> None:
@@ -188,11 +193,6 @@ def test_usual_values_are_not_worth_a_word(capsys: pytest.CaptureFixture[str]) -
     ):
         read(content, name)
     assert "warning" not in capsys.readouterr().err
-
-
-def test_rotations_of_any_length_are_brought_to_1() -> None:
-    long = {f"rot_{n}": [7.5 * row[f"rot_{n}"] for row in ROWS] for n in range(4)}
-    assert np.allclose(read(ply(rows(**long))).quats, read(ply()).quats, atol=1e-6)
 
 
 # -- other elements and columns --------------------------------------------------------------------
@@ -219,12 +219,6 @@ def test_lists_before_the_gaussians_are_walked_over() -> None:
     body = b"\1" + struct.pack("<Hd", 1, 2.5) + b"\0" + b"\2" + struct.pack("<H", 0) + b"\3abc"
     body += b"\3" + struct.pack("<H2d", 2, 1, 1) + b"\0"
     assert np.array_equal(read(ply(before=(lines, body)), axes="world").means, PLACES)
-
-
-def test_classes_of_others_are_no_train_ids() -> None:
-    assert read(ply(rows(**{"class": [2, 5, 6]}), kinds={"class": "uchar"})).class_ids is None
-    ids = read(ply(rows(**{"class": [2.0, 255.0, 6.0]}))).class_ids
-    assert ids is not None and ids.tolist() == [2, 255, 6]
 
 
 def test_fields_of_others_are_passed_over_and_listed_once(capsys: pytest.CaptureFixture[str]) -> None:

@@ -30,11 +30,13 @@ def test_atomic_path_leaves_the_old_file_when_the_writer_fails(tmp_path: Path) -
     assert target.read_text() == "old" and [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
 
-def test_written_files_follow_the_umask(tmp_path: Path) -> None:
+def test_written_files_follow_the_umask_and_json_refuses_to_write_nan(tmp_path: Path) -> None:
     store.write_safetensors(tmp_path / "a.safetensors", {"x": np.zeros(3)})
     mask = os.umask(0)
     os.umask(mask)
     assert (tmp_path / "a.safetensors").stat().st_mode & 0o777 == 0o666 & ~mask
+    refused(r"x\.y\[1\]", store.write_json, tmp_path / "a.json", {"x": {"y": [1.0, float("nan")]}})
+    assert not (tmp_path / "a.json").exists()
 
 
 def test_unwritable_folder_is_a_resource_error(tmp_path: Path) -> None:
@@ -46,11 +48,6 @@ def test_unwritable_folder_is_a_resource_error(tmp_path: Path) -> None:
 def test_json_is_strict(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.json").write_text(text)
     refused(r"a\.json", store.read_json, tmp_path / "a.json")
-
-
-def test_json_refuses_to_write_nan_and_names_the_field(tmp_path: Path) -> None:
-    refused(r"x\.y\[1\]", store.write_json, tmp_path / "a.json", {"x": {"y": [1.0, float("nan")]}})
-    assert not (tmp_path / "a.json").exists()
 
 
 def test_safetensors_round_trip_and_truncation(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ def made_up(height: int = 4, width: int = 6, **given: np.ndarray) -> Evidence:
 # --- evidence -------------------------------------------------------------------------------------
 
 
-def test_evidence_of_a_street_is_what_was_built() -> None:
+def test_evidence_of_a_street_is_what_was_built_and_tells_ground_beyond_a_kerb() -> None:
     given, truth = given_at(STREET)
     found = gather(given)
     _, _, depth = STREET.image(given.view)
@@ -60,25 +60,17 @@ def test_evidence_of_a_street_is_what_was_built() -> None:
     car = truth == ID["car"]
     inside = (found.box == 1) & found.in_box
     assert found.box_labels.tolist() == [ID["car"]] and (inside & car).sum() / (inside | car).sum() > 0.75
-
-
-def test_evidence_tells_ground_beyond_a_kerb() -> None:
-    given, truth = given_at(STREET)
-    found = gather(given)
-    near = (found.away_deg < 0.3) & (found.depth_m < 20)
+    near &= found.depth_m < 20
     road, wall = (truth == ID["road"]) & near, (truth == ID["building"]) & near & (found.height_m > 1)
     assert found.reachable[road].mean() > 0.95 and not found.reachable[wall].any() and (found.raised_m[wall] == 0).all()
 
 
-def test_without_returns_evidence_says_so_and_keeps_outlines() -> None:
+def test_returns_and_nearer_surfaces_decide_what_boxes_show() -> None:
     found = gather(given_at(STREET, lidar=False)[0])
     assert np.isnan(found.depth_m).all() and (found.away_deg == 90).all() and not found.in_box.any()
     assert (found.box == 1).any()
     planes = dict(zip(PLANES, encode(found), strict=False))
     assert not planes["measured at all"].any() and (planes["distance to a return"] == 1).all()
-
-
-def test_a_nearer_surface_hides_a_box() -> None:
     given, truth = given_at(replace(STREET, car_start=(40.0, 0.0)))
     assert not (truth == ID["car"]).any() and not (gather(given).box > 0).any()
 
@@ -217,22 +209,7 @@ def test_every_pixel_gets_scores_at_any_size() -> None:
         assert found.shape == (len(CLASSES), height, width) and found.sum(0) == pytest.approx(1, abs=1e-5)
 
 
-def test_temperature_flattens_and_keeps_the_order() -> None:
-    net = StreetNet(TINY).eval()
-    rng = np.random.default_rng(0)
-    with torch.no_grad():
-        for parameter in net.parameters():
-            parameter.copy_(torch.from_numpy(rng.normal(0, 0.05, parameter.shape).astype(np.float32)))
-    rgb = rng.integers(0, 256, (64, 64, 3), np.uint8)
-    planes = rng.normal(0, 1, (PLANE_COUNT, 64, 64)).astype(np.float32)
-    sharp = net.probabilities(rgb, planes)
-    net.config = replace(TINY, temperature=2.0)
-    flat = net.probabilities(rgb, planes)
-    assert (sharp.argmax(0) == flat.argmax(0)).all() and (flat.max(0) <= sharp.max(0) + 1e-6).all()
-    assert np.log(flat[0] / flat[1]) == pytest.approx(np.log(sharp[0] / sharp[1]) / 2, abs=1e-3)
-
-
-def test_the_shipped_network_knows_a_street_it_never_saw() -> None:
+def test_the_shipped_network_knows_a_street_it_never_saw_also_without_lidar() -> None:
     given, truth = given_at(STREET)
     labels = labeller("embedded")(given)
     assert overlap(labels.semantics, truth, "road") > 0.9 and overlap(labels.semantics, truth, "car") > 0.75
@@ -240,9 +217,6 @@ def test_the_shipped_network_knows_a_street_it_never_saw() -> None:
     assert ((labels.confidence > 0) & (labels.confidence <= 1)).all() and (labels.depth[labels.sky] == 100).all()
     again = labeller("embedded")(given)
     assert (again.semantics == labels.semantics).all() and (again.confidence == labels.confidence).all()
-
-
-def test_the_shipped_network_works_without_lidar_and_boxes() -> None:
     given, truth = given_at(STREET, lidar=False, boxes=False)
     labels = labeller("embedded")(given)
     assert overlap(labels.semantics, truth, "sky") > 0.9 and np.isnan(labels.depth[~labels.sky]).all()
@@ -290,8 +264,7 @@ def test_damaged_folders_end_in_words(tmp_path: Path) -> None:
     spoilt = bytearray(weights.read_bytes())
     spoilt[-1] ^= 1
     weights.write_bytes(spoilt)
-    with pytest.raises(IntegrityError):
-        street_net.load(tmp_path / "good")
+    refused(".", street_net.load, tmp_path / "good", raises=IntegrityError)
 
 
 # --- training -------------------------------------------------------------------------------------

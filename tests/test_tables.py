@@ -1,7 +1,5 @@
 """Tables of text: one renderer for Markdown, CSV and pages."""
 
-import pytest
-
 from mudg.base import html
 from mudg.base.html import PUBLISHED, TextCell, TextLine, TextTable, best_of, markdown, markdown_table
 
@@ -37,10 +35,7 @@ def test_a_page_escapes_cells_and_marks_lines():
     assert '<tr class="published">' in text and "<h3>2 m</h3>" in text and "<h3>&lt;i&gt;</h3>" in text
 
 
-@pytest.mark.parametrize(("better", "best"), [("higher", ["b"]), ("lower", ["a"]), ("one", ["c"])])
-def test_the_best_of_a_column(better, best):
-    assert best_of(better, {"a": 0.4, "b": 1.3, "c": 0.9}) == best and best_of(better, {"a": 1.0}) == []
-
-
-def test_equal_numbers_are_all_best():
+def test_the_best_of_a_column():
+    for better, best in (("higher", ["b"]), ("lower", ["a"]), ("one", ["c"])):
+        assert best_of(better, {"a": 0.4, "b": 1.3, "c": 0.9}) == best and best_of(better, {"a": 1.0}) == []
     assert best_of("lower", {"a": 0.1, "b": 0.1, "c": 0.2}) == ["a", "b"]

@@ -26,7 +26,7 @@ from mudg.baselines import pvg
 from mudg.baselines.bezier import BezierNode, bernstein, distance_change, fit_path
 from mudg.baselines.omnire import DeformationField, DeformedNode
 from mudg.baselines.pvg import VibrationNode, starting_columns
-from mudg.baselines.s3gaussian import SHORT_GAIN, HexPlaneNode, plane_smoothness
+from mudg.baselines.s3gaussian import HexPlaneNode, plane_smoothness
 from mudg.baselines.timed import FlatNetwork, waves
 from mudg.core import losses, metrics
 from mudg.core.grids import PlaneSizes
@@ -277,25 +277,6 @@ def test_the_field_moves_and_recolors_what_lies_in_its_box():
     assert torch.autograd.gradcheck(at, [value.clone().requires_grad_() for value in (*columns, means)], fast_mode=True)
     seen = node.with_values(view=view_at(0.6, camera())).asked(torch.tensor([[1.0, 1, 0.5], [-2, 2, 0.5]]).double())
     assert set(seen.tolist()) <= {0, 1}
-
-
-def test_features_of_a_short_run_begin_near_one_and_the_factor_is_kept():
-    sizes = PlaneSizes(4, 2, 5, 3, 2)
-    places = torch.rand(400, 4, generator=torch.Generator().manual_seed(7)) * 2 - 1
-    plain, short = (HexPlaneNode.fresh([0, 0, 0, 0], [1, 1, 1, 1], sizes, 1, gain) for gain in (1.0, SHORT_GAIN))
-    assert torch.allclose(short.features(places), 37.037 * plain.features(places), rtol=1e-4)
-    assert float(short.features(places).detach().mean()) == pytest.approx(1.0, abs=0.3)
-    facts, tensors = short.state()
-    assert torch.equal(HexPlaneNode.from_state(facts, tensors).features(places), short.features(places))
-
-
-def test_what_is_far_from_the_frustum_is_not_asked():
-    node = HexPlaneNode.fresh([-99, -99, -9, 0], [99, 99, 9, 1], PlaneSizes(1, 1, 2, 2, 2), 1)
-    view = view_at(0.0, camera())
-    center, look = view.world_from_cam[:3, 3], view.world_from_cam[:3, 2]
-    means = torch.from_numpy(np.stack([center + 20 * look, center - 20 * look])).float()
-    assert node.asked(means).tolist() == [0, 1]
-    assert node.with_values(view=view).asked(means).tolist() == [0]
 
 
 def test_the_losses_of_s3gaussian_by_hand():

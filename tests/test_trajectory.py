@@ -98,14 +98,11 @@ def test_a_shift_goes_to_the_vehicles_left_and_is_level(name):
     assert move(scene, camera, shift_m, 1).tolist() == pytest.approx(expected)
 
 
-def test_names_and_origin():
+def test_names_and_errors_in_words():
     scene = circle(3)
     paths = (trajectory.recorded(scene, "front"), *(trajectory.shifted(scene, "front", m) for m in (2.0, -4.0)))
     assert [path.name for path in paths] == ["front_recorded", "front_shift+2.0", "front_shift-4.0"]
     assert paths[2].origin == "shifted"
-
-
-def test_errors_in_words():
     scene = circle(3)
     refused("no camera named 'rear'", trajectory.recorded, scene, "rear", raises=UsageError)
     refused("shift_m", trajectory.shifted, scene, "front", math.nan, raises=UsageError)

@@ -53,11 +53,22 @@ def test_view_refuses_nan_and_copies_its_pose() -> None:
         view.world_from_cam[0, 3] = 1
 
 
-def test_track_refuses_unsorted_times_and_flat_boxes() -> None:
+def test_tracks_points_and_tensors_of_other_shapes_are_refused() -> None:
     poses = np.stack([np.eye(4), np.eye(4)])
     refused("increasing", Track, "a", "car", np.ones(3), np.array([1.0, 1.0]), poses)
     refused("positive", Track, "a", "car", np.array([1.0, 0, 1]), np.array([0.0, 1.0]), poses)
     refused("at least one", Track, "a", "car", np.ones(3), np.zeros(0), np.zeros((0, 4, 4)))
+    refused("rgb", PointCloud, np.zeros((3, 3), np.float32), np.zeros((2, 3), np.uint8), "world")
+    refused("xyz", SweepPoints, np.zeros((3, 3)), np.zeros(3, np.float32), np.zeros(3, np.float32))
+    zeros = torch.zeros
+    color, one, known = zeros(2, 3, 6, 8), zeros(2, 1, 6, 8), torch.ones(2, 1, 6, 8, dtype=torch.bool)
+    condition = Condition((VIEW, VIEW), color, one, known, zeros(3, 6, 8))
+    classes = zeros(2, 6, 8, dtype=torch.long)
+    Clip(condition, color, one, known, classes)
+    refused("clip.depth", Clip, condition, color, color, known, classes)
+    with pytest.raises(InputError, match="observation.rgb"):
+        Observation(VIEW, zeros(3, 5, 8), None, None, torch.ones(1, 6, 8), known[0], "virtual", "x")
+    refused("gaussians.quats", Gaussians, *[zeros(3, 3)] * 3, zeros(3), zeros(3, 1, 3), None, zeros(3))
 
 
 def test_a_pose_that_is_not_rigid_is_named_with_owner_field_and_place() -> None:
@@ -73,23 +84,6 @@ def test_a_pose_that_is_not_rigid_is_named_with_owner_field_and_place() -> None:
             make()
         assert caught.value.where == where
     refused("do not pair up", EgoPath, [0.0, 1.0], [good])
-
-
-def test_point_arrays_are_checked() -> None:
-    refused("rgb", PointCloud, np.zeros((3, 3), np.float32), np.zeros((2, 3), np.uint8), "world")
-    refused("xyz", SweepPoints, np.zeros((3, 3)), np.zeros(3, np.float32), np.zeros(3, np.float32))
-
-
-def test_tensor_types_check_shapes() -> None:
-    zeros = torch.zeros
-    color, one, known = zeros(2, 3, 6, 8), zeros(2, 1, 6, 8), torch.ones(2, 1, 6, 8, dtype=torch.bool)
-    condition = Condition((VIEW, VIEW), color, one, known, zeros(3, 6, 8))
-    classes = zeros(2, 6, 8, dtype=torch.long)
-    Clip(condition, color, one, known, classes)
-    refused("clip.depth", Clip, condition, color, color, known, classes)
-    with pytest.raises(InputError, match="observation.rgb"):
-        Observation(VIEW, zeros(3, 5, 8), None, None, torch.ones(1, 6, 8), known[0], "virtual", "x")
-    refused("gaussians.quats", Gaussians, *[zeros(3, 3)] * 3, zeros(3), zeros(3, 1, 3), None, zeros(3))
 
 
 def test_scene_look_ups_name_what_there_is() -> None:

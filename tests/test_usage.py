@@ -27,16 +27,13 @@ def wait_until(reached: float) -> None:
         pass
 
 
-def test_processor_time_counts_work_and_not_waiting() -> None:
+def test_processor_time_counts_work_also_of_children_and_not_waiting() -> None:
     meter = Meter()
     time.sleep(0.3)
     wait_until(time.process_time() + 0.2)
     found = meter.stop()
     assert found.seconds >= 0.5 and 0.15 < found.processor_s < found.seconds - 0.2
     assert meter.usage() == found  # stopped
-
-
-def test_processor_time_of_children_that_have_ended_counts() -> None:
     meter = Meter()
     subprocess.run([sys.executable, "-c", "import time\nwhile time.process_time() < 0.4: pass"], check=True)
     assert meter.stop().processor_s > 0.35
@@ -142,18 +139,15 @@ def test_the_thread_of_a_meter_ends_with_it() -> None:
     assert watching() == before
 
 
-def test_sizes_are_those_of_a_folder_or_of_one_file(tmp_path: Path) -> None:
-    for name, size in (("a/b.txt", 300), ("a/c/d.txt", 40)):
-        store.write_text(tmp_path / name, "x" * size)
-    assert usage.folder_bytes(tmp_path) == 340 and usage.folder_bytes(tmp_path / "a" / "b.txt") == 300
-    assert usage.folder_bytes(tmp_path / "missing") == 0
-
-
-def test_later_parts_add_up_and_the_peak_is_the_highest() -> None:
+def test_later_parts_add_up_the_peak_is_the_highest_and_sizes_are_those_of_files(tmp_path: Path) -> None:
     assert Usage(1.0, 2.0, 30).then(Usage(4.0, 5.0, 20)) == Usage(5.0, 7.0, 30)
     assert Usage(1.0, 2.0, None).then(Usage(1.0, 1.0, 7)).peak_bytes == 7
     assert Usage.of_record(Usage(1.5, 2.5, 9).record()) == Usage(1.5, 2.5, 9)
     assert Usage.of_record({"seconds": 3}) == Usage(3.0, 0.0, None)
+    for name, size in (("a/b.txt", 300), ("a/c/d.txt", 40)):
+        store.write_text(tmp_path / name, "x" * size)
+    assert usage.folder_bytes(tmp_path) == 340 and usage.folder_bytes(tmp_path / "a" / "b.txt") == 300
+    assert usage.folder_bytes(tmp_path / "missing") == 0
 
 
 def test_a_run_folder_notes_what_it_took_over_all_its_runs(tmp_path: Path) -> None:

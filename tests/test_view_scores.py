@@ -100,14 +100,11 @@ def test_lidar_points_measure_depth_and_color_beside_the_path_of_a_log(log_score
     assert parts["lidar_abs_rel_dynamic"] == pytest.approx(0.1, abs=0.02)
 
 
-def test_classes_carried_by_points_agree_with_those_of_the_truth_and_not_with_one_class(log_scores: dict) -> None:
+def test_classes_and_lanes_of_a_log_are_carried_over_by_points_and_ground(log_scores: dict) -> None:
     for here in ("front_recorded", HERE):
         assert value(log_scores, "right", here, "agreement") > 0.8
         assert value(log_scores, "gray", here, "agreement") < 0.35
     assert "agreement" in {anchor["metric"] for anchor in log_scores["anchors"]}
-
-
-def test_lanes_of_a_log_are_carried_over_by_the_ground(log_scores: dict) -> None:
     assert value(log_scores, "right", HERE, "lane_correlation") > 0.8
     assert value(log_scores, "right", HERE, "lane_psnr") > 20
     assert value(log_scores, "gray", HERE, "lane_psnr") < 15
@@ -116,12 +113,9 @@ def test_lanes_of_a_log_are_carried_over_by_the_ground(log_scores: dict) -> None
     assert value(log_scores, "right", HERE, "warp_error") == score_tables.NO_TRUTH
 
 
-def test_a_still_video_does_not_flicker(log_scores: dict) -> None:
+def test_a_still_video_does_not_flicker_and_missing_files_name_their_flags(log_scores: dict) -> None:
     assert value(log_scores, "gray", HERE, "temporal_flickering") == 1.0
     assert 0.8 < value(log_scores, "right", HERE, "temporal_flickering") < 0.99
-
-
-def test_missing_files_name_their_flags(log_scores: dict) -> None:
     text = score_tables.markdown(log_scores)
     for flag in "detections lanes dino-weights clip-weights video-features lpips-vgg-weights".split():
         assert f"--{flag}" in text
@@ -303,14 +297,6 @@ def wall_pair(number: int, rgb: torch.Tensor, object_at: float | None = None) ->
     return Pair(rgb, None, None, rgb, depth, None, ids, view=view, facts=ViewFacts(instance=instance))
 
 
-def test_temporal_flickering_by_hand() -> None:
-    metric = view_metrics.TemporalFlickering()
-    assert metric.value() is None
-    for tone in (0, 51, 0):
-        metric.add(metric.source(Pair(torch.full((3, 4, 4), tone / 255), *[None] * 6)))
-    assert metric.value() == pytest.approx((255 - 51) / 255)
-
-
 def test_warp_error_follows_vehicles_by_their_boxes() -> None:
     """A vehicle of random colours moves by two columns: nothing changes where it is followed."""
     noise = torch.rand(3, 16, 24, generator=torch.Generator().manual_seed(0))
@@ -339,7 +325,12 @@ def test_warp_error_follows_vehicles_by_their_boxes() -> None:
     assert darker.value() == pytest.approx(0.1, abs=1e-5)
 
 
-def test_without_boxes_vehicles_do_not_count() -> None:
+def test_vehicles_without_boxes_do_not_count_and_flickering_by_hand() -> None:
     pairs = [wall_pair(n, torch.zeros(3, 16, 24), 8) for n in (0, 1)]
     frames = [metrics.TrueFrame.of(p.view, p.truth_depth, p.truth_semantics) for p in pairs]
     assert not metrics.pixel_motion(*frames).same[:, 8:12].any()
+    metric = view_metrics.TemporalFlickering()
+    assert metric.value() is None
+    for tone in (0, 51, 0):
+        metric.add(metric.source(Pair(torch.full((3, 4, 4), tone / 255), *[None] * 6)))
+    assert metric.value() == pytest.approx((255 - 51) / 255)

@@ -34,9 +34,11 @@ from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera
 from mudg.core.trajectory import at_shift
+from mudg.editing.script import read_edits
 from mudg.formats.paths import read_path
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import raster_of, render_view
+from mudg.gaussians.storage import save_model
 from mudg.scene.read import read_scene
 from mudg.viewer import live, view
 from mudg.viewer import page as viewer_page
@@ -62,12 +64,18 @@ def rotations(codes: np.ndarray) -> np.ndarray:
     return whole
 
 
-def test_rotations_lose_less_than_a_quarter_of_a_degree() -> None:
+def test_rotations_sections_and_json_of_a_page() -> None:
     quats = np.random.default_rng(0).normal(size=(2000, 4))
     quats[0] = (0, 0, 0, -3)
     unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     apart = 2 * np.arccos(np.clip(np.abs((rotations(smallest_three(quats)) * unit).sum(1)), 0, 1))
     assert np.degrees(apart).max() < 0.25
+    blob, directory = blob_of({"a": np.arange(3, dtype=np.uint8), "b": np.arange(2, dtype=np.float32)})
+    assert directory == {"a": [0, "u1", 3], "b": [4, "f4", 2]}
+    assert np.frombuffer(blob, np.float32, 2, 4).tolist() == [0, 1]
+    text = viewer_page.script_json({"name": "</script><script>alert(1)</script><!--"})
+    assert "<" not in text and ">" not in text
+    assert json.loads(text)["name"].startswith("</script>")
 
 
 def test_places_and_sizes_are_kept_within_their_steps() -> None:
@@ -124,17 +132,6 @@ def test_every_gaussian_is_in_one_chunk_and_the_first_ones_matter_most() -> None
         assert worth[one].min() >= worth[following].max()
 
 
-def test_the_first_picture_of_a_small_scene_is_of_half_a_chunk() -> None:
-    model = toy_fitted(degree=0)
-    visible = pack_scene(model, 0.0).layout.visible
-    half = -(-visible // 2)
-    assert pack_scene(model, 0.0, chunk_rows=half).layout.size == half // 2
-    assert pack_scene(model, 0.0, chunk_rows=half - 1).layout.size == half - 1
-    packed = pack_scene(model, 0.0, chunk_rows=visible)
-    assert [packed.chunk(k)[1]["level"] for k in range(len(packed.layout))] == [0, 1, 1][: len(packed.layout)]
-    assert packed.facts["chunk_rows"] == visible // 2
-
-
 def test_colours_and_displacements_are_kept_within_their_steps() -> None:
     model = toy_fitted(degree=0)
     packed = pack_scene(model, 0.0)
@@ -170,18 +167,6 @@ def test_more_than_a_page_holds_is_refused() -> None:
     refused("--budget", pack_scene, toy_fitted(degree=0), 0.0, chunk_rows=2, raises=UsageError)
 
 
-def test_sections_begin_at_multiples_of_four() -> None:
-    blob, directory = blob_of({"a": np.arange(3, dtype=np.uint8), "b": np.arange(2, dtype=np.float32)})
-    assert directory == {"a": [0, "u1", 3], "b": [4, "f4", 2]}
-    assert np.frombuffer(blob, np.float32, 2, 4).tolist() == [0, 1]
-
-
-def test_json_in_a_page_cannot_end_its_element() -> None:
-    text = viewer_page.script_json({"name": "</script><script>alert(1)</script><!--"})
-    assert "<" not in text and ">" not in text
-    assert json.loads(text)["name"].startswith("</script>")
-
-
 # the page -----------------------------------------------------------------------------------------
 
 
@@ -195,14 +180,11 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Toy:
     return root, fit, model
 
 
-def test_the_page_names_no_place_of_this_machine(toy: Toy) -> None:
+def test_the_page_names_no_place_of_this_machine_and_is_not_replaced_without_being_asked(toy: Toy) -> None:
     text = (toy[0] / "page.html").read_text(encoding="utf-8")
     assert str(toy[0]) not in text
     assert "http://" not in text and "https://" not in text
     assert "<script>alert" not in text
-
-
-def test_a_page_is_not_replaced_without_being_asked(toy: Toy) -> None:
     with pytest.raises(UsageError, match="exists"):
         view.run_page(PageConfig(), toy[1], toy[0] / "page.html", scene=toy[0] / "scene")
     with pytest.raises(UsageError, match="scene of this fit is not known"):
@@ -371,11 +353,6 @@ def test_the_sign_tells_how_much_of_a_view_is_determined_and_how_much_is_empty(
 
 
 @pytest.mark.slow
-def test_the_page_loads_nothing(opened: Browser) -> None:
-    assert all(address.startswith(("file://", "blob:", "data:")) for address in opened.requests)
-
-
-@pytest.mark.slow
 def test_a_link_shows_the_same(opened: Browser) -> None:
     opened.run("location.hash = '#m=recorded&c=front&t=0.6&l=depth&s=1.5&v=difference-scene&o=boxes'; 1")
     opened.wait("window.mudg.state.layer === 'depth' && window.mudg.sharp")
@@ -492,21 +469,18 @@ def test_who_is_here_for_the_first_time_gets_a_hint(toy: Toy, tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_hidden_objects_are_gone(opened: Browser, toy: Toy) -> None:
+def test_hidden_objects_are_gone_are_an_edit_script_and_nothing_is_loaded(
+    opened: Browser, toy: Toy, tmp_path: Path
+) -> None:
     with_car = opened.measure(["class"], camera="front", t=0.4)["class"]
     without = opened.measure(["class"], camera="front", t=0.4, hidden=["car-1"])["class"]
     assert (with_car == ID["car"]).sum() > 20
     assert (without == ID["car"]).sum() == 0
-
-
-@pytest.mark.slow
-def test_what_is_hidden_is_an_edit_script(opened: Browser, tmp_path: Path) -> None:
-    from mudg.editing.script import read_edits
-
     module = "import('mudg/share').then((share) => share.editScript({hidden: new Set(['car-1', 'a \"b\"'])}))"
     (tmp_path / "edits.yaml").write_text(opened.run(module), encoding="utf-8")
     (edit,) = read_edits(tmp_path / "edits.yaml").edits
     assert (edit.verb, list(edit.settings.ids)) == ("remove", ['a "b"', "car-1"])
+    assert all(address.startswith(("file://", "blob:", "data:")) for address in opened.requests)
 
 
 @pytest.mark.slow
@@ -690,8 +664,6 @@ def test_other_machines_need_a_token() -> None:
 
 
 def test_fits_of_different_logs_are_not_compared(toy: Toy, tmp_path: Path) -> None:
-    from mudg.gaussians.storage import save_model
-
     save_model(replace(toy[2], facts={**toy[2].facts, "scene": "another"}), tmp_path / "fit")
     refused("another", view.find_shown, PageConfig(), toy[1], toy[0] / "scene", tmp_path / "fit")
 

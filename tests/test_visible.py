@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refused
 
-from mudg.base.errors import InputError
 from mudg.base.geometry import CAM_FROM_EGO_AXES, invert, unproject
 from mudg.base.types import Camera, View
 from mudg.city.config import CityConfig
@@ -26,11 +26,17 @@ def points_at(pixels: list[tuple[int, int, float]]) -> np.ndarray:
     return unproject(VIEW, uv, np.array([z for _, _, z in pixels])).astype(np.float32)
 
 
-def test_the_nearest_point_of_a_pixel_is_drawn_and_empty_pixels_are_missing() -> None:
+def test_the_nearest_point_of_a_pixel_is_drawn_whatever_the_order_and_empty_pixels_are_missing() -> None:
     depth = visible_depth(VIEW, points_at([(5, 6, 20.0), (5, 6, 10.0), (50, 30, 7.0)]), RULES["sweep"])
     assert depth[6, 5] == pytest.approx(10.0, abs=1e-4)
     assert depth[30, 50] == pytest.approx(7.0, abs=1e-4)
     assert np.isfinite(depth).sum() == 2
+    rng = np.random.default_rng(1)
+    xyz = rng.uniform([2, -15, -8], [40, 15, 8], (3000, 3)).astype(np.float32)
+    one = visible_depth(VIEW, xyz, RULES["sweep"], gap_deg=0.6)
+    shuffled = np.concatenate([rng.permutation(xyz), np.full((5, 3), np.nan, np.float32)])
+    assert np.array_equal(one, visible_depth(VIEW, shuffled, RULES["sweep"], gap_deg=0.6), equal_nan=True)
+    refused("wrong shape", visible_depth, VIEW, np.zeros((4, 2)), RULES["sweep"])
 
 
 @pytest.mark.parametrize(("near", "hidden"), [((11, 9), True), ((9,), False), ((11,), False)])
@@ -83,21 +89,6 @@ def test_the_filters_equal_loops(sides: str, reach: tuple[int, int]) -> None:
     nearest[rng.random(nearest.shape) < 0.7] = np.inf
     rule = HidingRule(ratio=0.1, slack_m=0.3, sides=sides, widen=(0.5, 0.5))
     assert np.array_equal(nearer_depth(nearest, rule, reach), slow_nearer(nearest, rule, reach))
-
-
-def test_the_order_of_points_and_what_is_not_finite_do_not_matter() -> None:
-    rng = np.random.default_rng(1)
-    xyz = np.stack([rng.uniform(2, 40, 3000), rng.uniform(-15, 15, 3000), rng.uniform(-8, 8, 3000)], 1).astype(
-        np.float32
-    )
-    one = visible_depth(VIEW, xyz, RULES["sweep"], gap_deg=0.6)
-    shuffled = np.concatenate([rng.permutation(xyz), np.full((5, 3), np.nan, np.float32)])
-    assert np.array_equal(one, visible_depth(VIEW, shuffled, RULES["sweep"], gap_deg=0.6), equal_nan=True)
-
-
-def test_points_of_another_shape_are_refused() -> None:
-    with pytest.raises(InputError, match="wrong shape"):
-        visible_depth(VIEW, np.zeros((4, 2)), RULES["sweep"])
 
 
 def test_in_a_city_most_hidden_returns_go_and_nearly_all_others_stay() -> None:

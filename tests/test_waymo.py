@@ -643,6 +643,5 @@ def test_one_log_of_a_folder_is_chosen_by_name(bare: made.Log, tmp_path: Path) -
     assert RECOGNISERS["waymo"](folder / f"{names[0]}.tfrecord")
     assert not RECOGNISERS["waymo"](tmp_path)
     for options in ({"poses": tmp_path}, {"boxes": tmp_path}, {"untwist": "no"}):
-        with pytest.raises(UsageError):
-            ingest(folder, tmp_path / "other", **options)
+        refused(".", ingest, folder, tmp_path / "other", raises=UsageError, **options)
     refused("no Waymo log found", ingest, tmp_path / "scene", tmp_path / "other")

@@ -94,13 +94,10 @@ def test_a_curve_and_its_inverse_give_back_the_light(curve: relight.ToneCurve) -
     np.testing.assert_allclose(curve.decode(curve.encode(light)), light, atol=2e-6)
 
 
-def test_the_srgb_curve_has_its_known_values() -> None:
+def test_srgb_has_its_known_values_and_a_filmic_camera_is_inverted_where_nothing_was_clipped() -> None:
     assert relight.srgb_encode(np.array([0.0, 0.0031308, 0.18, 1.0])) == pytest.approx(
         [0, 0.04045, 0.46135, 1], abs=2e-5
     )
-
-
-def test_a_filmic_camera_is_inverted_where_nothing_was_clipped() -> None:
     curve = relight.FilmicResponse(0.6, (1.02, 1.0, 0.97), saturation=0.9, contrast=1.05, vignette=0.3).curve()
     light = np.random.default_rng(1).uniform(0.05, 1.2, (12, 16, 3))
     shown = curve.encode(light)
@@ -159,11 +156,19 @@ def test_new_light_is_exposed_as_a_camera_would(time: str, share: float) -> None
     assert relight.ground_level(target) == pytest.approx(share * relight.ground_level(sunny()), rel=0.01)
 
 
-def test_range_is_longer_than_depth_beside_the_axis() -> None:
+def test_range_is_longer_than_depth_and_the_mirror_view_sees_mirrored_points_upside_down() -> None:
     view = forward_view()
     distance = euclidean_range(view, np.full((HEIGHT, WIDTH), 10.0))
     corner = np.array([(0.5 - 30) / 50, (0.5 - 20) / 50, 1.0])
     assert distance[0, 0] == pytest.approx(10 * np.linalg.norm(corner))
+    view = forward_view(0.3, 0.1)
+    points = np.array([[8.0, 1.0, 2.0], [15, -3, 0.5], [6, 2, 1.0]])
+    below = points * [1, 1, -1] + [0, 0, 2 * 0.2]
+    seen, depth = geometry.project(view, below)
+    mirrored, mirror_depth = geometry.project(mirror_view(view, 0.2), points)
+    np.testing.assert_allclose(mirror_depth, depth)
+    np.testing.assert_allclose(mirrored[:, 0], seen[:, 0])
+    np.testing.assert_allclose(HEIGHT - mirrored[:, 1], seen[:, 1])
 
 
 def test_a_height_map_sees_a_wall_on_one_side() -> None:
@@ -176,17 +181,6 @@ def test_a_height_map_sees_a_wall_on_one_side() -> None:
     assert heights.free(near, np.array([1.0, 0, 0.5])).tolist() == [False]
     assert heights.free(near, np.array([-1.0, 0, 0.5])).tolist() == [True]
     assert heights.free(near, np.array([0, 0, -1.0])).tolist() == [False]
-
-
-def test_the_mirror_view_sees_mirrored_points_upside_down() -> None:
-    view = forward_view(0.3, 0.1)
-    points = np.array([[8.0, 1.0, 2.0], [15, -3, 0.5], [6, 2, 1.0]])
-    below = points * [1, 1, -1] + [0, 0, 2 * 0.2]
-    seen, depth = geometry.project(view, below)
-    mirrored, mirror_depth = geometry.project(mirror_view(view, 0.2), points)
-    np.testing.assert_allclose(mirror_depth, depth)
-    np.testing.assert_allclose(mirrored[:, 0], seen[:, 0])
-    np.testing.assert_allclose(HEIGHT - mirrored[:, 1], seen[:, 1])
 
 
 def test_planes_of_different_sizes_are_refused() -> None:
@@ -221,9 +215,20 @@ def test_the_hash_is_that_of_the_generated_city() -> None:
 # --- fog ------------------------------------------------------------------------------------------
 
 
-def test_contrast_falls_to_a_twentieth_at_the_visibility() -> None:
+def test_fog_by_hand() -> None:
     share = air.transmittance(np.array([150.0]), np.array([0.0]), 1.5, FogSettings(visibility_m=150))
     assert share[0] == pytest.approx(0.05, rel=0.01)
+    settings = FogSettings(visibility_m=300, top_m=50)
+    depth = air.optical_depth(np.array([np.inf, 10.0, np.inf]), np.array([1.0, 1.0, 0.0]), 2.0, settings)
+    assert depth == pytest.approx([0.01 * 48, 0.1, np.inf])
+    from_above = air.optical_depth(np.array([100.0]), np.array([-1.0]), 80.0, settings)
+    assert from_above == pytest.approx([0.01 * 70])
+    color, haze = np.random.default_rng(2).uniform(0, 1, (50, 3)), np.array([0.7, 0.7, 0.8])
+    a, b = np.full(50, 0.6), np.full(50, 0.5)
+    np.testing.assert_allclose(
+        air.veiled(air.veiled(color, a, haze), b, haze), air.veiled(color, a * b, haze), atol=1e-6
+    )
+    np.testing.assert_allclose(air.unveiled(air.veiled(color, a, haze), a, haze), color, atol=1e-6)
 
 
 def test_fog_that_fades_with_height_agrees_with_integration() -> None:
@@ -235,21 +240,6 @@ def test_fog_that_fades_with_height_agrees_with_integration() -> None:
         assert found == pytest.approx(expected, rel=1e-6)
     towards_sky = air.optical_depth(np.array([np.inf]), np.array([0.5]), 5.0, settings)[0]
     assert towards_sky == pytest.approx(0.03 * np.exp(-5 / 30) * 30 / 0.5)
-
-
-def test_uniform_fog_ends_at_its_top() -> None:
-    settings = FogSettings(visibility_m=300, top_m=50)
-    depth = air.optical_depth(np.array([np.inf, 10.0, np.inf]), np.array([1.0, 1.0, 0.0]), 2.0, settings)
-    assert depth == pytest.approx([0.01 * 48, 0.1, np.inf])
-    from_above = air.optical_depth(np.array([100.0]), np.array([-1.0]), 80.0, settings)
-    assert from_above == pytest.approx([0.01 * 70])
-
-
-def test_two_layers_of_haze_are_one() -> None:
-    color, air = np.random.default_rng(2).uniform(0, 1, (50, 3)), np.array([0.7, 0.7, 0.8])
-    a, b = np.full(50, 0.6), np.full(50, 0.5)
-    np.testing.assert_allclose(air.veiled(air.veiled(color, a, air), b, air), air.veiled(color, a * b, air), atol=1e-6)
-    np.testing.assert_allclose(air.unveiled(air.veiled(color, a, air), a, air), color, atol=1e-6)
 
 
 # --- wet ground and snow --------------------------------------------------------------------------
@@ -293,7 +283,7 @@ def test_wet_road_is_darker_below_the_camera_and_changes_nothing_else() -> None:
     assert sure.min() > 0
 
 
-def test_snow_lies_on_level_open_ground_only() -> None:
+def test_snow_lies_on_level_open_ground_only_and_wheels_leave_two_tracks() -> None:
     view = forward_view()
     scene = street(view)
     cover = ground.snow_cover(scene, view, 1.0, 4)
@@ -302,9 +292,6 @@ def test_snow_lies_on_level_open_ground_only() -> None:
     assert not cover[scene.sky].any()
     covered_over = replace(scene, openness=np.zeros_like(scene.openness))
     assert not ground.snow_cover(covered_over, view, 1.0, 4).any()
-
-
-def test_wheels_leave_two_tracks() -> None:
     path = np.array([[0.0, 0, 0], [10, 0, 0]])
     xy = np.array([[5, 0.75], [5, -0.75], [5, 0.0], [5, 1.2]])
     assert ground.wheel_tracks(xy, path).tolist() == [1, 1, 0, 0]
@@ -350,13 +337,10 @@ def test_a_shadow_is_found_from_a_rough_guess() -> None:
     assert ((guess > 0.5) == (truth > 0.5))[road].mean() < 0.97
 
 
-def test_a_lamp_gives_fifty_lux_below_it_and_none_above() -> None:
+def test_lamps_and_headlights() -> None:
     up = np.array([[0.0, 0, 1]])
     assert relight.lamp_light(np.zeros((1, 3)), up, np.array([[0, 0, 8.0]]))[0, 0] == pytest.approx(1.0)
     assert relight.lamp_light(np.array([[0, 0, 9.0]]), -up, np.array([[0, 0, 8.0]]))[0, 0] == 0
-
-
-def test_headlights_cut_off_above_the_horizon() -> None:
     vehicle = geometry.yaw_matrix(0.0, (0, 0, 0.65))
     wall = np.array([[-1.0, 0, 0]] * 3)
     places = np.array([[20.0, 0, 0.1], [20, 0, 2.0], [-5, 0, 0.1]])
@@ -368,12 +352,18 @@ def test_headlights_cut_off_above_the_horizon() -> None:
 # --- all together ---------------------------------------------------------------------------------
 
 
-def test_defaults_change_nothing() -> None:
+def test_defaults_change_nothing_and_fallen_snow_no_sky_without_end() -> None:
     view = forward_view()
     scene = street(view)
     shown = weather.apply(scene, Conditions(), view, 0.0, 1)
     np.testing.assert_array_equal(shown.color, scene.color)
     assert (shown.confidence == 1).all()
+    view = forward_view()
+    scene = street(view)
+    far = np.full_like(scene.depth, np.inf)  # below the horizon, too: nothing was seen there
+    scene = from_render(view, scene.color, far, np.full_like(scene.classes, ID["sky"]))
+    shown = weather.apply(scene, conditions(snow=SnowSettings(cover=0.7)), view, 0.4, 7)
+    np.testing.assert_allclose(shown.color, scene.color, atol=1e-6)
 
 
 def conditions(**weather_settings: object) -> Conditions:
@@ -405,15 +395,6 @@ def test_every_effect_is_finite_repeatable_and_visible(name: str) -> None:
     assert np.abs(first.color - scene.color).mean() > 0.005
     shown = first.display(weather.curve_of(CASES[name].response))
     assert 0 <= shown.min() <= shown.max() <= 1
-
-
-def test_snow_that_has_fallen_leaves_a_sky_without_end_as_it_is() -> None:
-    view = forward_view()
-    scene = street(view)
-    far = np.full_like(scene.depth, np.inf)  # below the horizon, too: nothing was seen there
-    scene = from_render(view, scene.color, far, np.full_like(scene.classes, ID["sky"]))
-    shown = weather.apply(scene, conditions(snow=SnowSettings(cover=0.7)), view, 0.4, 7)
-    np.testing.assert_allclose(shown.color, scene.color, atol=1e-6)
 
 
 def test_settings_go_through_plain_values_and_refuse_what_is_out_of_range() -> None:
@@ -503,15 +484,10 @@ def test_two_cameras_see_the_same_drops() -> None:
     assert rows(air.places(SIZE, FALL, left, 6.0, 100)) != rows(a)
 
 
-def test_drops_fall_with_their_speed() -> None:
-    now, later = view_at(time_s=3.0), view_at(time_s=3.02)
-    a = air.places(SIZE, FALL, now, 5.0, 1)
-    b = air.places(SIZE, FALL, later, 5.0, 1)
+def test_drops_fall_with_their_speed_and_are_as_many_as_the_volume_holds() -> None:
+    a, b = (air.places(SIZE, FALL, view_at(time_s=time_s), 5.0, 1) for time_s in (3.0, 3.02))
     shared = rows(a + FALL * 0.02) & rows(b)
     assert len(shared) > 0.8 * len(a)
-
-
-def test_the_number_of_drops_is_that_of_the_volume() -> None:
     view = view_at()
     counts = []
     for key in range(12):

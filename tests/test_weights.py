@@ -74,14 +74,8 @@ def test_every_published_tensor_is_accounted_for(published_keys, wanted):
         name: shape for name, shape in published_keys.items() if name not in weights.UNUSED
     }
     assert len(published) + len(set(published_keys) & weights.UNUSED) == 2524
-
-
-def test_the_map_of_names_is_one_to_one(wanted):
     assert len(set(weights.published_names(wanted).values())) == len(wanted)
     refused("lacks a tensor", weights.published_names, ["net.nothing"])
-
-
-def test_published_counts_of_parameters(published_keys):
     count = lambda prefix: sum(
         int(torch.Size(shape).numel()) for name, shape in published_keys.items() if name.startswith(prefix)
     )
@@ -216,7 +210,7 @@ def test_rescale_stays_exact_in_half_precision(tmp_path, complete, monkeypatch):
     assert len(list((tmp_path / "out").glob("weights_*.safetensors"))) > 1
 
 
-def test_dynamicrafter_is_widened(tmp_path):
+def test_dynamicrafter_is_widened_and_the_small_one_refused_with_the_reason(tmp_path):
     state = dynamicrafter_checkpoint()
     model = converted(tmp_path, {"state_dict": state})
     kernel, wide = state[ENTER], model.net.down[0].conv.weight
@@ -226,9 +220,6 @@ def test_dynamicrafter_is_widened(tmp_path):
     for name, value in model.net.time.state_dict().items():
         assert torch.equal(model.net.label.state_dict()[name], value)
     assert "12" in json.loads((tmp_path / "out" / "model.json").read_text())["facts"]["adapted"]
-
-
-def test_small_dynamicrafter_is_refused_with_the_reason(tmp_path):
     state = dynamicrafter_checkpoint()
     state["model.diffusion_model.framestride_embed.0.weight"] = torch.zeros(1)
     refused("predicts noise", converted, tmp_path, {"state_dict": state})
