@@ -110,7 +110,7 @@ class Marigold:
         usual = GUIDED_STEPS if options.guided else int(index.get("default_denoising_steps") or PLAIN_STEPS)
         longest_px = int(index.get("default_processing_resolution") or PROCESSING_PX)
         steps, guided = options.steps or usual, options.guided
-        return cls(parts, space=space, steps=steps, guided=guided, longest_px=longest_px, place=compute)
+        return cls(parts, space=space, steps=steps, guided=guided, longest_px=longest_px, compute=compute)
 
     def __call__(self, inputs: DepthInput) -> Prediction:
         """Depth of one image at the image's size, up to scale and shift (to what is near the LiDAR's with guidance)."""
