@@ -37,7 +37,7 @@ def test_lists_are_apart_from_each_other_and_from_all_training_cities():
     assert not set(development) & set(reported)
     for seeds_ in (development, reported):
         turns = [city_logs.turn_deg(city_logs.log_config(seed)) for seed in seeds_]
-        assert sum(turn >= city_logs.CHOICE.curved_deg for turn in turns) == len(turns) / 2
+        assert sum(turn >= city_logs.CURVED_DEG for turn in turns) == len(turns) / 2
     trained = {seeds.key(0, city, "city") & 0x7FFFFFFF for city in range(5000)}
     scored = {
         city_clips.city_config(city_clips.CityClipRules(), c).seed for of in city_clips.LISTS.values() for c in of

@@ -70,7 +70,7 @@ def test_scenes_that_lack_things_get_a_sheet_too(tmp_path: Path, lacking: str) -
     if lacking != "one frame":
         assert sheets.contact_sheet(replace(scene, **{lacking: ()})).height > sheets.TOP_HEIGHT_PX
         return
-    assert sheets.contact_sheet(scene).size == (sheets.WIDTH_PX, sheets.WIDTH_PX // 2 + sheets.TOP_HEIGHT_PX)
+    assert sheets.contact_sheet(scene).size == (sheets.WIDTH_PX, sheets.TILE_WIDTH_PX // 2 + sheets.TOP_HEIGHT_PX)
     cameras = {name: replace(scene.cameras["front"], name=name) for name in "abcd"}  # single images share rows
     pose = scene.frames[0].view.world_from_cam
     frames = tuple(replace(scene.frames[0], view=View(camera, pose, 0.0)) for camera in cameras.values())

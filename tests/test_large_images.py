@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from toy_fitted import write_toy_run
 
+import mudg
 from mudg.base.errors import ResourceError
 from mudg.base.types import Camera, Condition, Trajectory, View
 from mudg.core import metrics
@@ -78,12 +81,11 @@ def test_bands_need_what_lies_around_them_and_nothing_has_no_distance(monkeypatc
     assert math.isnan(small_distance()(empty))
 
 
-def test_a_view_that_cannot_fit_is_refused_before_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    camera = Camera("front", 1_000_000, 562_500, 8e5, 8e5, 5e5, 2.8e5)
-    path = Trajectory("front", (View(camera, np.eye(4), 0.0),), None)
+def test_a_view_that_cannot_fit_is_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, fit, *_ = write_toy_run(tmp_path)
     monkeypatch.setattr(render.memory, "free_bytes", lambda: 64 << 30)
-    with pytest.raises(ResourceError, match="1000000 x 562500 pixels needs more memory") as refused:
-        render._require_memory([path])
+    with pytest.raises(ResourceError, match="1000000 x 600000 pixels needs more memory") as refused:
+        mudg.render(scene, fit, out=tmp_path / "views", width_px=1_000_000)
     assert "TiB" in refused.value.expected and refused.value.got == "64.0 GiB free"
     assert "--width-px" in refused.value.remedy
 

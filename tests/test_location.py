@@ -152,6 +152,7 @@ def test_files_are_saved_read_listed_and_removed(root: Location) -> None:
     with pytest.raises(InputError):
         (root / "a").load()
     if root.local is None:
+        (root / "a").save(b"1")
         refused("whole bucket", Location.of("memory://bucket").remove, raises=UsageError)
 
 

@@ -618,7 +618,7 @@ def product_texts(repository: Path, package_dir: Path) -> list[Path]:
     return sorted(texts)
 
 
-SIMULATED = ("sim", "simulate", "datasets", "simulator", "loop", "serve", "dataset", "sweeps", "returns")
+SIMULATED = ("sim", "simulate", "datasets", "simulator", "loop", "serve", "dataset", "sweeps", "returns", "sensor")
 """Folders and files that speak of a simulator's sessions."""
 
 

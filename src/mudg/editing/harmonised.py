@@ -214,7 +214,7 @@ class Harmoniser:
         width, height = model.image_size(*size, 0)
         rules = ConditionRules(width, height, *size, images_per_view=EDITED_IMAGES_PER_VIEW, published=alone)
         render, vacated = functools.partial(render_planes, sources.fitted), vacated_at(sources.plan)
-        shown = ConditionSources(sources.cloud, sources.tracks, sources.photos, rules, render, None, vacated)
+        shown = ConditionSources(sources.cloud, sources.tracks, sources.photos, rules, render, vacated)
         self._maker = ViewMaker(model, shown, settings, None if alone else self._start_at)
         self._parts: dict[int, tuple[Observation, Touched]] = {}
         """Renders of the window that is being made, by the number of their view, and what edits touch in them."""

@@ -223,7 +223,7 @@ def demo(
     Args:
         out: Folder to write. Repeat the same command to resume an interrupted demo.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
-        preset: Settings to start from. fast: smaller images, fewer frames and iterations. default: about 6 minutes on 2 cores. quality: 30,000 iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type model (docs/presets.md).
+        preset: Settings to start from. fast: smaller images, fewer frames and iterations. default: minutes on two cores. quality: 30,000 iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type model (docs/presets.md).
         fast: The same as --preset fast, 3 m to each side: one to two minutes on 2 cores.
         seed: Seed of the city and of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config).
         shifts_m: Lateral shifts in metres, positive to the left (not given: 2, 3 and 4 m to both sides; --fast: 3 m). They apply to synthesize, render and score.

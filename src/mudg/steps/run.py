@@ -65,7 +65,7 @@ class Demo(Run):
     out: Annotated[Path, Flag()] = Path("mudg_demo")
     """Folder to write. Repeat the same command to resume an interrupted demo."""
     preset: PresetName | None = None
-    """Settings to start from. fast: smaller images, fewer frames and iterations. default: about 6 minutes on 2 cores.
+    """Settings to start from. fast: smaller images, fewer frames and iterations. default: minutes on two cores.
     quality: 30,000 iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type
     model (docs/presets.md)."""
     fast: bool = False
