@@ -29,6 +29,7 @@ from mudg.baselines.emernerf import load_field, observe
 from mudg.core import trajectory
 from mudg.core.pictures import panels_of, side_by_side
 from mudg.core.raster.rasterize import drawing_device
+from mudg.core.shutter import readout_of
 from mudg.diffusion.inputs import InWeather
 from mudg.diffusion.synthesize import JobInputs
 from mudg.editing import harmonised
@@ -112,7 +113,7 @@ def write_views(
     else:
         device = drawing_device(config.device, "render", config.raster)
         loaded, fitted, drive = edited or _edited(scene, model, None)
-        draw, source = _scene_drawer(config, fitted.to(device))
+        draw, source = _scene_drawer(config, fitted.to(device), loaded)
         if config.repair:
             inputs = JobInputs(scene, cast("Path", fused), model)
             draw = mixing(harmonised.RenderMixer(inputs, config.harmonize, config.device), draw)
@@ -182,7 +183,7 @@ def _repaired(
     without the edits."""
     before = load_model(model)
     recorded = scene_seen_by(read_scene(scene), before.facts)
-    usual, _ = _scene_drawer(config, before.to(fitted.device))
+    usual, _ = _scene_drawer(config, before.to(fitted.device), recorded)
     sources = EditedSources.of(drive, fitted, recorded)
     repair = harmonised.Harmoniser(sources, config.harmonize, _size(recorded, config), config.device)
     return RepairedViews(repair, lambda view: (usual(view), draw(view)))
@@ -204,12 +205,15 @@ def _size(scene: Scene, config: RenderConfig) -> tuple[int, int]:
     return camera.width, camera.height
 
 
-def _scene_drawer(config: RenderConfig, fitted: SceneModel) -> tuple[Drawer, str]:
-    """What draws the views of a scene of Gaussians, and its name."""
+def _scene_drawer(config: RenderConfig, fitted: SceneModel, scene: Scene) -> tuple[Drawer, str]:
+    """What draws the views of a scene of Gaussians, and its name. Rolling shutters of recorded views are followed, but
+    for repairs, which know global ones alone."""
     if config.remove_tracks:
         fitted = fitted.without_nodes(config.remove_tracks)
     source, raster = str(fitted.facts.get("method", "fit")), raster_of(fitted, config.raster)
-    return lambda view: render_view(fitted, view, raster, source), source
+    still = config.repair or config.harmonize.on
+    rolls = lambda view: None if still else readout_of(scene, view)
+    return lambda view: render_view(fitted, view, raster, source, rolls(view)), source
 
 
 def _field_drawer(config: RenderConfig, model: Path, device: torch.device) -> tuple[Drawer, str]:
@@ -227,7 +231,7 @@ def trajectories(scene: Scene, config: RenderConfig, path: Path | None = None) -
     if path is not None:
         camera = scene.frames_of(cameras[0])[0].view.camera
         found = read_path(path, scene, camera)
-        return (Trajectory(found.name, tuple(_optics(view, config) for view in found.views), found.origin),)
+        return (Trajectory(found.name, tuple(_optics(_still(view), config) for view in found.views), found.origin),)
     if not config.shifts_m and not config.paths:
         what, remedy = "nothing to render: no shifts were given", "at least one of --shifts-m; 0 is the recorded path"
         raise UsageError(what, remedy=remedy)
@@ -235,9 +239,13 @@ def trajectories(scene: Scene, config: RenderConfig, path: Path | None = None) -
     for camera in cameras:
         paths += [trajectory.at_shift(scene, camera, shift_m) for shift_m in config.shifts_m]
         paths += [trajectory.named(scene, camera, name) for name in config.paths]
-    return tuple(
-        Trajectory(found.name, tuple(_optics(view, config) for view in found.views), found.origin) for found in paths
-    )
+    optics = lambda path, view: _optics(view if path.origin == "recorded" else _still(view), config)
+    return tuple(Trajectory(path.name, tuple(optics(path, view) for view in path.views), path.origin) for path in paths)
+
+
+def _still(view: View) -> View:
+    """A view whose camera has a global shutter."""
+    return replace(view, camera=replace(view.camera, readout_s=0.0, shutter="global"))
 
 
 def _optics(view: View, config: RenderConfig) -> View:
