@@ -177,6 +177,8 @@ def test_shutters_and_the_same_bytes(package: Package) -> None:
     assert [end - begin for begin, end in front] == [20_000, 20_000]
     told = next(iter(rolling.rig["camera_calibrations"].values()))["camera_model"]["parameters"]
     assert told["shutter_type"] == "ROLLING_TOP_TO_BOTTOM"
+    camera = Camera("a", 64, 48, 50.0, 51.0, 31.0, 25.0, (), 0.02, "left_to_right")
+    assert usd.intrinsics(camera)["shutter_type"] == "ROLLING_LEFT_TO_RIGHT"
     assert usd.to_alpasim(toy_splats.scene(1), drive(), ground()) == package.content
     other = toy_splats.scene(1)
     moved = replace(other, nodes=(replace(other.nodes[0], cloud=toy_splats.cloud(4)), *other.nodes[1:]))

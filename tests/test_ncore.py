@@ -158,7 +158,7 @@ def test_the_same_log_gives_the_same_bytes(truth: Scene, recording: Path, tmp_pa
 def test_shutters_masks_classes_and_sensors_that_move(truth: Scene, tmp_path: Path) -> None:
     """What the city lacks: a rolling shutter, a camera that shakes on the vehicle, the bonnet, classes of points."""
     rng = np.random.default_rng(2)
-    cameras = {**truth.cameras, "front": replace(truth.cameras["front"], readout_s=0.03)}
+    cameras = {**truth.cameras, "front": replace(truth.cameras["front"], readout_s=0.03, shutter="bottom_to_top")}
     bonnet = np.zeros((64, 96), bool)
     bonnet[50:, 20:70] = True
 
@@ -180,8 +180,9 @@ def test_shutters_masks_classes_and_sensors_that_move(truth: Scene, tmp_path: Pa
         labelled = tuple(replace(frame, labels={"ego": frame.image}) for frame in shaken.frames)
         write_ncore(tmp_path, LogRecords(replace(shaken, frames=labelled), records(truth).picture, points))
     scene = ingest(tmp_path, tmp_path / "back")
+    assert scene.cameras["front"].shutter == "bottom_to_top"
     assert scene.cameras["front"].readout_s == 0.03 and scene.cameras["front_left"].readout_s == 0.0
-    assert any("rolling top to bottom shutter" in note for note in scene.source.notes)
+    assert any("rolling bottom to top shutter" in note for note in scene.source.notes)
     shift = scene.frames[0].view.time_s - shaken.frames[0].view.time_s
     world = scene.frames[0].view.world_from_cam @ geometry.invert(shaken.frames[0].view.world_from_cam)
     for a, b in zip(shaken.frames, scene.frames, strict=True):
@@ -234,6 +235,7 @@ def test_other_peoples_recordings(truth: Scene, tmp_path: Path, capsys: pytest.C
     ]
     name = "camera_front_wide"
     assert list(scene.cameras) == [name] and scene.cameras[name].readout_s == pytest.approx(0.02)
+    assert scene.cameras[name].shutter == "left_to_right"
     assert all(word in "\n".join(scene.source.notes) for word in ("rectified", "left to right"))
     assert scene.source.licence.startswith("not stated")
     tree = package().transformations.PoseGraphInterpolator

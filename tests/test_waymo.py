@@ -64,6 +64,7 @@ def test_round_trip(
     roundtrip.assert_same_log(scene, truth, labels=made.LABELS, cloud_m=2e-4, dt_s=1e-6, box_pose=0.03, intensity=1e-4)
     assert scene.ego.world_from_ego[0] == pytest.approx(np.eye(4), abs=1e-12)
     assert scene.frames[0].view.camera.readout_s == pytest.approx(made.READOUT_S, abs=1e-6)
+    assert scene.frames[0].view.camera.shutter == "left_to_right"
     assert any("points fall where the log says" in note and "front 0." in note for note in scene.source.notes)
     assert any(form in note and "Day, sunny, location_sf" in note for note in scene.source.notes)
     assert {scene.split[f"front/00000{n}"] for n in (0, 1, 2, 3)} == {"train"}

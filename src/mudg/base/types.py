@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 Matrix = NDArray[np.float64]
 TrajectoryOrigin = Literal["recorded", "shifted"]
 ObservationKind = Literal["recorded", "virtual"]
+Shutter = Literal["global", "top_to_bottom", "left_to_right", "bottom_to_top", "right_to_left"]
 
 # checks of the constructors; a refusal is an InputError whose place is ``OWNER: FIELD`` -------------------------------
 
@@ -196,6 +197,7 @@ class Camera:
         fx, fy, cx, cy: intrinsics in pixels; the centre of the top-left pixel is (0.5, 0.5).
         distortion: coefficients of the original lens, kept for the record; images in a scene are rectified.
         readout_s: duration of the rolling shutter, 0 for a global shutter.
+        shutter: the direction in which a rolling shutter reads the image; "global" also where it is not known.
     """
 
     name: str
@@ -207,6 +209,7 @@ class Camera:
     cy: float
     distortion: tuple[float, ...] = ()
     readout_s: float = 0.0
+    shutter: Shutter = "global"
 
     def __post_init__(self) -> None:
         owner = f"camera {self.name!r}"

@@ -27,6 +27,7 @@ from mudg.baselines.emernerf import load_field, observe
 from mudg.core import trajectory
 from mudg.core.pictures import panels_of, side_by_side
 from mudg.core.raster.rasterize import drawing_device
+from mudg.core.shutter import readout_of
 from mudg.diffusion.synthesize import JobInputs
 from mudg.editing import harmonised
 from mudg.editing.apply import FACT, Drawer, EditedDrive, carry_out, in_weather, scene_seen_by, weather_of
@@ -107,7 +108,7 @@ def write_views(
     else:
         device = drawing_device(config.device, "render", config.raster)
         loaded, fitted, drive = edited or _edited(scene, model, None)
-        draw, source = _scene_drawer(config, fitted.to(device))
+        draw, source = _scene_drawer(config, fitted.to(device), loaded)
         if config.repair:
             inputs = JobInputs(scene, cast("Path", fused), model)
             mixer, plain = harmonised.RenderMixer(inputs, config.harmonize, config.device), draw
@@ -159,19 +160,22 @@ def _repaired(
     without the edits."""
     before = load_model(model)
     recorded = scene_seen_by(read_scene(scene), before.facts)
-    usual, _ = _scene_drawer(config, before.to(fitted.device))
+    usual, _ = _scene_drawer(config, before.to(fitted.device), recorded)
     sources = EditedSources.of(drive, fitted, recorded)
     camera = trajectories(recorded, config)[0].views[0].camera
     repair = harmonised.Harmoniser(sources, config.harmonize, (camera.width, camera.height), config.device)
     return RepairedViews(repair, lambda view: (usual(view), draw(view)))
 
 
-def _scene_drawer(config: RenderConfig, fitted: SceneModel) -> tuple[Drawer, str]:
-    """What draws the views of a scene of Gaussians, and its name."""
+def _scene_drawer(config: RenderConfig, fitted: SceneModel, scene: Scene) -> tuple[Drawer, str]:
+    """What draws the views of a scene of Gaussians, and its name. Rolling shutters of recorded views are followed, but
+    for repairs, which know global ones alone."""
     if config.remove_tracks:
         fitted = fitted.without_nodes(config.remove_tracks)
     source, raster = str(fitted.facts.get("method", "fit")), raster_of(fitted, config.raster)
-    return lambda view: render_view(fitted, view, raster, source), source
+    still = config.repair or config.harmonize.on
+    rolls = lambda view: None if still else readout_of(scene, view)
+    return lambda view: render_view(fitted, view, raster, source, rolls(view)), source
 
 
 def trajectories(scene: Scene, config: RenderConfig, path: Path | None = None) -> tuple[Trajectory, ...]:
@@ -190,7 +194,13 @@ def trajectories(scene: Scene, config: RenderConfig, path: Path | None = None) -
         for camera in cameras:
             paths += [trajectory.at_shift(scene, camera, shift_m) for shift_m in config.shifts_m]
             paths += [trajectory.named(scene, camera, name) for name in config.paths]
-    return tuple(Trajectory(one.name, tuple(_optics(view, config) for view in one.views), one.origin) for one in paths)
+    optics = lambda path, view: _optics(view if path.origin == "recorded" else _still(view), config)
+    return tuple(Trajectory(one.name, tuple(optics(one, view) for view in one.views), one.origin) for one in paths)
+
+
+def _still(view: View) -> View:
+    """A view whose camera has a global shutter."""
+    return replace(view, camera=replace(view.camera, readout_s=0.0, shutter="global"))
 
 
 def _optics(view: View, config: RenderConfig) -> View:

@@ -101,9 +101,11 @@ def write_messages(name: str, records: messages.LogRecords, out: Path) -> dict[s
         store.atomic_write(out / messages.BAG_METADATA, messages.bag_metadata(topics, span))
         largest, what, count = out / messages.BAG_FILE, "messages", sum(number for _, number in topics.values())
     else:
-        rolling = ", ".join(name for name, camera in records.scene.cameras.items() if camera.readout_s > 0)
+        rolling = ", ".join(
+            name for name, camera in records.scene.cameras.items() if ncore_package.unknown_shutter(camera)
+        )
         if rolling:
-            unknown = f"a scene does not know which way the shutters of {rolling} roll"
+            unknown = f"the scene does not say which way the shutters of {rolling} roll"
             log.warn(f"export: {unknown}; ncore says downwards")
         largest, what, count = ncore.write_ncore(out, records)[0], "boxes", len(records.scene.tracks)
     log.info(f"export: {_counts(records)}, {count} {what}, {largest.stat().st_size / 1e6:.2f} MB in {out}")

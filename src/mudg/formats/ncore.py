@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from mudg.base.errors import ResourceError
 from mudg.base.geometry import from_rotation_translation
+from mudg.base.types import Camera
 
 Matrix = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -127,3 +128,18 @@ def _beyond(step_us: int, before: Matrix, last: Matrix, beyond_us: int) -> Matri
     turn = Rotation.from_matrix(last[:3, :3]) * Rotation.from_matrix(before[:3, :3]).inv()
     rotation = Rotation.from_rotvec(share * turn.as_rotvec()) * Rotation.from_matrix(last[:3, :3])
     return from_rotation_translation(rotation.as_matrix(), last[:3, 3] + share * (last[:3, 3] - before[:3, 3]))
+
+
+# shutters -----------------------------------------------------------------------------------------
+
+
+def unknown_shutter(camera: Camera) -> bool:
+    """Whether a camera has a rolling shutter of which the scene does not say the direction."""
+    return camera.readout_s > 0 and camera.shutter == "global"
+
+
+def shutter_type(camera: Camera) -> str:
+    """The package's name of a camera's shutter; downwards where the scene does not say the direction."""
+    if camera.readout_s <= 0:
+        return "GLOBAL"
+    return f"ROLLING_{'top_to_bottom' if unknown_shutter(camera) else camera.shutter}".upper()

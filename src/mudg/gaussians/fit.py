@@ -37,7 +37,7 @@ from mudg.core.raster.rasterize import RasterConfig, drawing_device, rasterize
 from mudg.gaussians import storage, views
 from mudg.gaussians.appearance import Appearance
 from mudg.gaussians.densify import DensifySettings, DensifyStats, densify_if_due, shorten_needles
-from mudg.gaussians.model import CERTAINTY, SceneModel, compose, composite_sky, sky_lift
+from mudg.gaussians.model import CERTAINTY, SceneModel, compose_as_read, composite_sky, sky_lift
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.perception import Perception, perception_of
 from mudg.gaussians.poses import refine_poses
@@ -312,7 +312,7 @@ def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[Learn
     model = recipe.drawn_model(state.model, view, step, config) if recorded else state.model
     growing = recorded and isinstance(state.schedule, DensifySettings) and step <= state.schedule.stop
     with_classes = not recorded or step % config.loss.semantic_every == 0
-    gaussians = compose(model, view.view.time_s, with_classes)
+    gaussians = compose_as_read(model, view.view, view.readout, with_classes)
     pose = state.appearance.world_from_cam(view.view, view.name) if recorded else None
     render = rasterize(gaussians, view.view, raster, absgrad=growing, world_from_cam=pose)
     if recorded:

@@ -32,11 +32,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mudg.base import geometry
 from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import CLASSES, ID
 from mudg.base.types import Gaussians, View
 from mudg.core import native_ops
+from mudg.core.shutter import Readout, as_read, moved_by
 from mudg.core.table import Table
 from mudg.gaussians.nodes import NodeRows, RigidNode, SkyNode, StaticNode
 
@@ -242,6 +244,24 @@ def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussia
         extra=table["semantics"] if semantics and model.classes else None,
         node=table.labels["node"],
     )
+
+
+def compose_as_read(model: SceneModel, view: View, readout: Readout | None, semantics: bool = True) -> Gaussians:
+    """``compose`` at a view's time. With a read-out, every Gaussian is where the view's camera, standing still, sees it
+    as its rolling shutter did (``core/shutter.py``); how an object deforms meanwhile is left out."""
+    gaussians = compose(model, view.time_s, semantics)
+    if readout is None:
+        return gaussians
+    still, parts = readout.motion(view), []
+    for node, means in zip(model.nodes, gaussians.means.split(model.counts())):
+        motion = still
+        if isinstance(node, RigidNode):
+            begin, now, end = (node.pose_matrix(time_s) for time_s in (readout.begin_s, view.time_s, readout.end_s))
+            if now is not None:
+                first, last = (now if pose is None else pose for pose in (begin, end))
+                motion = readout.motion(view, first @ geometry.invert(now), last @ geometry.invert(now))
+        parts.append(moved_by(means, torch.from_numpy(motion).to(means)))
+    return replace(gaussians, means=as_read(gaussians.means, torch.cat(parts), view))
 
 
 def composite_sky(model: SceneModel, view: View, rgb: Tensor, alpha: Tensor) -> Tensor:

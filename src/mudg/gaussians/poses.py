@@ -35,7 +35,7 @@ from mudg.core.harmonics import left_product_matrix
 from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.gaussians import nodes
 from mudg.gaussians.appearance import Appearance
-from mudg.gaussians.model import SceneModel, compose, composite_sky
+from mudg.gaussians.model import SceneModel, compose_as_read, composite_sky
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.rendering import outline_mask
 from mudg.gaussians.views import StoredView
@@ -116,7 +116,7 @@ def _add_evidence(
 ) -> None:
     """Add what one recorded view tells about the objects in it."""
     time_s = stored.view.time_s
-    here = compose(model, time_s, semantics=False)
+    here = compose_as_read(model, stored.view, stored.readout, semantics=False)
     rows = {index: (here.node == index).nonzero()[:, 0] for index in outlines}
     poses = {index: model.nodes[index].pose_matrix(time_s) for index in outlines}
     color = _picture(model, here, stored, raster, appearance)

@@ -15,7 +15,8 @@ from torch import Tensor
 from mudg.base import geometry, palette
 from mudg.base.types import Gaussians, Observation, Render, RenderPlanes, View
 from mudg.core.raster.rasterize import Backend, RasterConfig, rasterize
-from mudg.gaussians.model import SceneModel, compose, composite_semantics, composite_sky
+from mudg.core.shutter import Readout
+from mudg.gaussians.model import SceneModel, compose, compose_as_read, composite_semantics, composite_sky
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.settings import DrawingConfig
 
@@ -110,13 +111,17 @@ COVERED = 0.5
 
 
 @torch.no_grad()
-def render_view(model: SceneModel, view: View, raster: RasterConfig, source: str = "") -> Observation:
-    """Render one view of a fitted scene as an observation of kind "virtual", on the CPU.
+def render_view(
+    model: SceneModel, view: View, raster: RasterConfig, source: str = "", readout: Readout | None = None
+) -> Observation:
+    """Render one view of a fitted scene as an observation of kind "virtual", on the CPU. ``readout``: as the view's
+    rolling shutter shows it; None: as a global one does.
 
     Where coverage is below ``COVERED``: no depth (NaN), and semantics sky if the scene has a sky; what is classed as
     sky has no depth. Confidence is the coverage (1 where the sky is a valid answer).
     """
-    return _brought_back(_observed(model, rasterize(compose(model, view.time_s), view, raster), view, source))
+    drawn = rasterize(compose_as_read(model, view, readout), view, raster)
+    return _brought_back(_observed(model, drawn, view, source))
 
 
 @torch.no_grad()

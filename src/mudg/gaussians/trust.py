@@ -24,7 +24,7 @@ from mudg.base import geometry, log, seeds
 from mudg.base.types import Render, View
 from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.gaussians.appearance import Appearance
-from mudg.gaussians.model import SceneModel, compose, composite_sky
+from mudg.gaussians.model import SceneModel, compose, compose_as_read, composite_sky
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.start import StartPoints, voxel_filter
 from mudg.gaussians.views import StoredView, TrainView, heads_of
@@ -99,7 +99,7 @@ def weight_sums(
     """``[4, N]``: over the pixels of one view, the blending weights of every Gaussian times each of
     ``difference_images``."""
     with torch.no_grad():
-        gaussians = compose(model, view.view.time_s, semantics=False)
+        gaussians = compose_as_read(model, view.view, view.readout, semantics=False)
         pose = None if appearance is None else appearance.world_from_cam(view.view, view.name)
     features = torch.zeros(len(gaussians), 4, device=model.device, requires_grad=True)
     render = rasterize(replace(gaussians, extra=features), view.view, raster, world_from_cam=pose)

@@ -33,6 +33,7 @@ from mudg.core.fusion import largest_beam_gap
 from mudg.core.pictures import resize_area, resize_nearest
 from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import ProjectConfig, project_sparse, visible_depth
+from mudg.core.shutter import Readout, points_as_read, readout_of
 from mudg.networks.featnets import WHOLE_PIXELS
 from mudg.scene.labels import read_label
 from mudg.scene.observations import ObservationSet, list_observation_sets, read_observations
@@ -77,6 +78,7 @@ class TrainView:
     sky: Tensor | None
     depth: Tensor | None
     lidar: LidarPixels | None
+    readout: Readout | None = None
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,7 @@ class ViewHead:
     view: View
     kind: ObservationKind
     labelled: bool
+    readout: Readout | None = None
 
 
 @dataclass(frozen=True)
@@ -104,11 +107,12 @@ class StoredView:
     lidar: LidarPixels | None = None
     depth: NDArray[np.float32] | None = None
     confidence: NDArray[np.uint8] | None = None
+    readout: Readout | None = None
 
     @property
     def head(self) -> ViewHead:
         """The view without its pixels."""
-        return ViewHead(self.name, self.view, self.kind, self.channels is not None)
+        return ViewHead(self.name, self.view, self.kind, self.channels is not None, self.readout)
 
     def train_ids(
         self, row: NDArray[np.integer], column: NDArray[np.integer], classes: Sequence[int]
@@ -136,6 +140,7 @@ class StoredView:
             sky=None if self.sky is None else sent(self.sky)[None],
             depth=None if self.depth is None else sent(self.depth)[None],
             lidar=None if self.lidar is None else self.lidar.to(device),
+            readout=self.readout,
         )
 
 
@@ -242,7 +247,8 @@ def load_recorded(
         sky = semantics == ID["sky"] if sky is None and semantics is not None else sky
         mask = None if ego is None else ~ego.astype(bool)
         sure = None if confidence is None else (confidence * 255).round().astype(np.uint8)
-        return StoredView(frame.id, view, "recorded", rgb, channels, sky, mask, lidar, confidence=sure)
+        readout = readout_of(scene, view)
+        return StoredView(frame.id, view, "recorded", rgb, channels, sky, mask, lidar, None, sure, readout)
 
     order = sorted(range(len(frames)), key=lambda index: frames[index].view.time_s)
     without_lidar = 0
@@ -367,7 +373,9 @@ class _SweepCache:
                 found = self._world(nearest)
                 clouds.append(self._points_at(found, nearest, view.time_s))
                 gap_deg = max(gap_deg, found.gap_deg)
-        return lidar_pixels(view, np.concatenate(clouds), gap_deg) if clouds else None
+        if not clouds:
+            return None
+        return lidar_pixels(view, points_as_read(self._scene, view, np.concatenate(clouds)), gap_deg)
 
     def _world(self, sweep: Sweep) -> _WorldSweep:
         with self._lock:
@@ -538,7 +546,8 @@ class ViewFile(Sequence[StoredView]):
             size = -(-pixels // 8) if kind.kind == "b" else pixels * kind.itemsize
             part, at = content[at : at + size], at + size
             planes[name] = (np.unpackbits(part, count=pixels) if kind.kind == "b" else part).view(kind).reshape(shape)
-        return StoredView(slot.head.name, slot.head.view, slot.head.kind, lidar=lidar, **planes)
+        head = slot.head
+        return StoredView(head.name, head.view, head.kind, lidar=lidar, readout=head.readout, **planes)
 
     def __iter__(self) -> Iterator[StoredView]:
         for index in range(len(self)):

@@ -21,7 +21,7 @@ from pydantic import BeforeValidator, Field
 from mudg.base import store
 from mudg.base.errors import InputError, short
 from mudg.base.records import Number, StrictRecord, after, checked_by, named_by, parse_record, place, refuse_unknown
-from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Source, Sweep, Track, View, increasing_problem
+from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Shutter, Source, Sweep, Track, View, increasing_problem
 
 FORMAT: Final = "mudg-scene"
 TRACKS_FORMAT: Final = "mudg-tracks"
@@ -159,6 +159,7 @@ class _CameraEntry(StrictRecord):
     cy: Number
     distortion: list[Number] = []
     readout_s: Number = 0.0
+    shutter: Shutter = "global"
 
 
 class _FrameEntry(StrictRecord):
@@ -239,7 +240,7 @@ def parse_camera(name: str, value: object, where: str) -> Camera:
             expected = f"{least:g} to {most:g} {'s' if key == 'readout_s' else 'pixels'}"
             raise InputError(what, where=place(where, key), expected=expected, got=f"{value:g}", remedy=remedy)
     intrinsics = (record.fx, record.fy, record.cx, record.cy)
-    return Camera(name, width, height, *intrinsics, tuple(record.distortion), record.readout_s)
+    return Camera(name, width, height, *intrinsics, tuple(record.distortion), record.readout_s, record.shutter)
 
 
 def parse_frame(value: object, where: str, cameras: Mapping[str, Camera]) -> Frame:
@@ -428,7 +429,8 @@ def tracks_to_json_text(tracks: Iterable[Track]) -> str:
 def camera_to_json(camera: Camera) -> dict[str, Any]:
     """A camera without its name; ``parse_camera`` reads it."""
     values = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
-    return {**values, "distortion": list(camera.distortion), "readout_s": camera.readout_s}
+    rolling = {} if camera.shutter == "global" else {"shutter": camera.shutter}
+    return {**values, "distortion": list(camera.distortion), "readout_s": camera.readout_s, **rolling}
 
 
 def _poses_to_json(poses: NDArray[np.float64]) -> list[list[float]]:

@@ -30,6 +30,7 @@ from mudg.core.lidar import OwnedPoints, PointTruth, ShownFrame
 from mudg.core.pictures import resize_nearest, resize_rgb
 from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import visible_depth
+from mudg.core.shutter import points_as_read
 from mudg.labels.annotate import nearest_sweeps
 from mudg.scene.labels import read_label
 from mudg.scene.observations import ObservationWriter, list_observation_sets, read_observations
@@ -170,7 +171,7 @@ def _lidar_depth(scene: Scene, view: View) -> Tensor | None:
         return None
     clouds = [(sweep, read_points(scene, sweep).xyz) for sweep in sweeps]
     placed = [geometry.transform_points(sweep.world_from_lidar, xyz) for sweep, xyz in clouds]
-    world = np.concatenate(placed).astype(np.float32)
+    world = points_as_read(scene, view, np.concatenate(placed).astype(np.float32))
     gap_deg = max(largest_beam_gap(xyz) for _, xyz in clouds)
     return torch.from_numpy(visible_depth(view, world, HIDING_RULES["sweep"], gap_deg=gap_deg, far_m=MAX_LIDAR_M))[None]
 
@@ -212,7 +213,8 @@ class LogPoints:
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """Colours u8[N + 1, 3] that points have in a recorded image, and where it shows them
         (``points_seen.carried``)."""
-        return lidar.carried(frame.view, read_image(self.scene, frame), world, points.gap_deg)
+        shown = points_as_read(self.scene, frame.view, world)
+        return lidar.carried(frame.view, read_image(self.scene, frame), shown, points.gap_deg)
 
     def truth_at(self, view: View, frame: Frame | None) -> PointTruth | None:
         """What the points of the sweeps taken with a view say about it; None without such sweeps. ``frame``: the
@@ -221,7 +223,7 @@ class LogPoints:
         if points is None or not len(points.xyz):
             return None
         world = self.placed(points, view.time_s)
-        depth, index = lidar.visible(view, world, points.gap_deg)
+        depth, index = lidar.visible(view, points_as_read(self.scene, view, world), points.gap_deg)
         color, colored = np.zeros((len(world) + 1, 3), np.uint8), np.zeros(len(world) + 1, bool)
         ids = np.append(points.ids, np.uint8(palette.UNLABELLED))
         if frame is not None:
@@ -230,7 +232,8 @@ class LogPoints:
                 label = np.asarray(read_label(self.scene, frame, "semantics"), np.uint8)
                 camera = frame.view.camera
                 label = resize_nearest(label, camera.height, camera.width)
-                values, known = lidar.carried(frame.view, label, world, points.gap_deg)
+                shown = points_as_read(self.scene, frame.view, world)
+                values, known = lidar.carried(frame.view, label, shown, points.gap_deg)
                 ids = np.where(known, values, np.uint8(palette.UNLABELLED))
         dynamic = np.append(points.owner != STATIC, False)[index]
         return PointTruth(depth, dynamic, color[index], colored[index], ids[index])

@@ -19,9 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import UNLABELLED
-from mudg.base.types import Camera, Gaussians, Observation, Scene, View
+from mudg.base.types import Camera, Gaussians, Observation, Scene, Shutter, View
 from mudg.core.pictures import to_bytes
-from mudg.core.raster.rasterize import MAX_EXTRA_CHANNELS, Shutter, drawing_device, rasterize
+from mudg.core.raster.rasterize import MAX_EXTRA_CHANNELS, drawing_device, rasterize
 from mudg.diffusion.settings import HarmonizeConfig
 from mudg.diffusion.synthesize import JobInputs
 from mudg.editing.apply import carry_out

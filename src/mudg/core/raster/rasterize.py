@@ -7,8 +7,9 @@ its transmittance would fall to 1e-4; colours are spherical harmonics plus 0.5, 
 
 Pinhole cameras. ``Camera.distortion`` describes the lens before rectification; images in a scene are rectified, so a
 picture drawn here belongs to the rectified camera and the coefficients play no part. A camera with ``readout_s`` > 0 is
-drawn as a global shutter at the view's time, which is said once per camera, unless ``RasterConfig.shutter`` names the
-direction of its shutter and ``world_from_cam`` holds its poses at the first and the last row.
+drawn as a global shutter at the view's time (``core/shutter.py`` moves the Gaussians to where a rolling one sees them),
+unless ``RasterConfig.shutter`` names the direction of its shutter and ``world_from_cam`` holds its poses at the first
+and the last row.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from mudg import native
 from mudg.base import log
 from mudg.base.devices import choose_device
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.base.types import Gaussians, Render, View
+from mudg.base.types import Gaussians, Render, Shutter, View
 from mudg.core.raster import cpu as raster_cpu
 from mudg.core.raster import gsplat_cuda, torch_twin
 from mudg.core.raster import gsplat_cuda as gsplat_package
@@ -34,7 +35,6 @@ from mudg.core.raster.request import Request
 Backend = Literal["auto", "cpu", "torch", "gsplat"]
 Projection = Literal["linear", "unscented"]
 Primitive = Literal["ellipsoid", "disc"]
-Shutter = Literal["global", "top_to_bottom", "left_to_right", "bottom_to_top", "right_to_left"]
 MAX_EXTRA_CHANNELS: Final = 28
 MAX_SH_DEGREE: Final = 3
 ONLY_GSPLAT: Final = {"packed": False, "projection": "linear", "primitive": "ellipsoid", "shutter": "global"}
@@ -280,10 +280,10 @@ def _check_views(views: tuple[View, ...], config: RasterConfig) -> None:
                 expected=f"{size[0]}x{size[1]}",
                 got=f"{camera.width}x{camera.height}",
             )
-        if camera.readout_s > 0 and config.shutter == "global":
+        if camera.readout_s > 0 and camera.shutter == config.shutter == "global":
             log.info_once(
-                f"rasterizer: the rolling shutter of camera {camera.name!r} ({camera.readout_s} s) is not followed; "
-                "drawn as a global shutter at the view's time"
+                f"rasterizer: the rolling shutter of camera {camera.name!r} ({camera.readout_s} s) is not followed, "
+                "as its direction is unknown; drawn as a global shutter at the view's time"
             )
 
 

@@ -39,6 +39,7 @@ from mudg.formats.ncore import (
     close,
     euler_of,
     package,
+    shutter_type,
 )
 from mudg.scene.labels import read_label
 
@@ -279,12 +280,10 @@ def sensor_ids(cameras: Iterable[str], lidars: Iterable[str]) -> dict[str, str]:
 
 
 def camera_model(data: Any, camera: Camera) -> Any:
-    """The intrinsics of a pinhole camera, f32. A scene does not know which way a shutter rolls: downwards is
-    written."""
-    shutter = data.ShutterType.ROLLING_TOP_TO_BOTTOM if camera.readout_s > 0 else data.ShutterType.GLOBAL
+    """The intrinsics of a pinhole camera, f32."""
     return data.OpenCVPinholeCameraModelParameters(
         resolution=np.array([camera.width, camera.height], np.uint64),
-        shutter_type=shutter,
+        shutter_type=data.ShutterType[shutter_type(camera)],
         external_distortion_parameters=None,
         principal_point=np.array([camera.cx, camera.cy], np.float32),
         focal_length=np.array([camera.fx, camera.fy], np.float32),

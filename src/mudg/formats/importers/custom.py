@@ -19,7 +19,7 @@ from pydantic import Field, WrapValidator
 from mudg.base import log, store
 from mudg.base.errors import InputError, MudgError, UsageError
 from mudg.base.records import Number, StrictRecord, checked_by, named_by, parse_record, place
-from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Source, Sweep, SweepPoints, Track, View
+from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Shutter, Source, Sweep, SweepPoints, Track, View
 from mudg.formats.importers import common
 from mudg.formats.importers.clouds import Cloud, read_cloud
 from mudg.formats.importers.common import ImportOptions
@@ -99,6 +99,7 @@ class LogCameraEntry(StrictRecord):
     distortion: DistortionEntry | None = None
     pixel_centre: Number = 0.0
     readout_s: Number = 0.0
+    shutter: Shutter = "global"
 
 
 class LogLidar(StrictRecord):
@@ -280,7 +281,7 @@ def _parse_camera(name: str, value: object, where: str) -> LogCamera:
         where, got = place(where, "pixel_centre"), f"{entry.pixel_centre:g}"
         raise InputError("pixel centre makes no sense", where=where, expected=expected, got=got)
     coefficients = entry.distortion.coefficients if entry.distortion is not None else []
-    plain = {key: getattr(entry, key) for key in ("width", "height", "fx", "fy", "readout_s")}
+    plain = {key: getattr(entry, key) for key in ("width", "height", "fx", "fy", "readout_s", "shutter")}
     middle = {key: getattr(entry, key) + 0.5 - entry.pixel_centre for key in ("cx", "cy")}
     camera = schema.parse_camera(name, {**plain, **middle, "distortion": coefficients}, where)
     return LogCamera(camera, _lens(entry.distortion, place(where, "distortion")), np.asarray(entry.ego_from_camera))

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ from mudg.base import log, memory, store
 from mudg.base.errors import InputError, MudgError
 from mudg.base.geometry import all_rigid, from_rotation_translation
 from mudg.base.palette import CLASSES, UNLABELLED
-from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
+from mudg.base.types import Camera, EgoPath, Scene, Shutter, Source, SweepPoints, Track
 from mudg.formats.importers import common
 from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
 from mudg.formats.importers.drive_log import BoxTracks, CameraOptics, DriveLog, ImageRecord, SweepRecord, write_log
@@ -575,10 +575,12 @@ def _optics(recording: _OpenRecording, camera: str, name: str, spans: Times, not
     if exposure_us > _MOST_EXPOSURE_US:
         what = "images take longer than a shutter can"
         raise InputError(what, where=where, got=f"{exposure_us:g} us", expected="at most a second")
-    recorded = Camera(name, width, height, fx, fy, cx, cy, readout_s=exposure_us / MICRO)
+    shutter = model.shutter_type.name.lower().removeprefix("rolling_")
+    rolls = {"readout_s": exposure_us / MICRO, "shutter": shutter if shutter in get_args(Shutter) else "global"}
+    recorded = Camera(name, width, height, fx, fy, cx, cy, **rolls)
     if exposure_us:
-        shutter = model.shutter_type.name.lower().replace("_", " ")
-        notes.append(f"camera {name}: {shutter} shutter; a view is that of the middle")
+        words = model.shutter_type.name.lower().replace("_", " ")
+        notes.append(f"camera {name}: {words} shutter; a view is that of the middle")
     return CameraOptics(recorded, None if plain else _lens(model, recorded), _mask(recording, camera, recorded))
 
 

@@ -26,7 +26,7 @@ from mudg.base.palette import CLASSES
 from mudg.base.types import Camera, Scene, View
 from mudg.core.edit import HeightMap
 from mudg.formats.exporters.opendrive import opendrive
-from mudg.formats.ncore import MICRO, PoseKeys
+from mudg.formats.ncore import MICRO, PoseKeys, shutter_type
 from mudg.formats.splats import binary, ply
 from mudg.formats.splats.cloud import Floats, SplatCloud, SplatNode, SplatScene, each_once
 from mudg.scene.road import Road
@@ -394,7 +394,7 @@ def intrinsics(camera: Camera) -> dict[str, Any]:
     """A pinhole camera as NCore tells it: principal point from the corner of the image."""
     return {
         "resolution": [camera.width, camera.height],
-        "shutter_type": "ROLLING_TOP_TO_BOTTOM" if camera.readout_s > 0 else "GLOBAL",
+        "shutter_type": shutter_type(camera),
         "external_distortion_parameters": None,
         "principal_point": [camera.cx, camera.cy],
         "focal_length": [camera.fx, camera.fy],

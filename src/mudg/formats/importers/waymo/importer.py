@@ -35,7 +35,7 @@ from mudg.base import log
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import CAM_FROM_EGO_AXES, invert, transform_points, yaw_matrix, yaw_of
 from mudg.base.palette import ID, UNLABELLED
-from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints
+from mudg.base.types import Camera, EgoPath, Scene, Shutter, Source, SweepPoints
 from mudg.formats.importers import common
 from mudg.formats.importers.common import ImportOptions, LogFiles
 from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
@@ -398,7 +398,13 @@ _MIN_ROWS_SHARE: Final = 0.05
 MAX_POSE_SHIFT_S: Final = 0.05
 DIRECTIONS: Final = ("in an unknown direction", "downwards", "left to right", "upwards", "right to left", "not at all")
 """How a camera reads its image, by the data set's number."""
-
+SHUTTERS: Final[Mapping[int, Shutter]] = {
+    1: "top_to_bottom",
+    2: "left_to_right",
+    3: "bottom_to_top",
+    4: "right_to_left",
+}
+"""The same as scenes say it; what is not here is unknown."""
 GLOBAL_SHUTTER: Final = 5
 EGO_CLASS: Final = 1
 SKY_CLASS: Final = 25
@@ -592,7 +598,8 @@ def recorded_camera(calibration: records.CameraCalibration, shot: records.Camera
     fx, fy, cx, cy, *coefficients = calibration.intrinsic
     name, width, height = calibration.name, calibration.width, calibration.height
     readout = 0.0 if calibration.direction == GLOBAL_SHUTTER else readout_s(shot)
-    camera = Camera(name, width, height, fx, fy, cx, cy, tuple(coefficients), readout)
+    shutter = SHUTTERS.get(calibration.direction, "global")
+    camera = Camera(name, width, height, fx, fy, cx, cy, tuple(coefficients), readout, shutter)
     return camera, brown_conrady(*coefficients) if any(coefficients) else None
 
 
