@@ -50,7 +50,7 @@ from mudg.diffusion.model import MDM
 from mudg.diffusion.requests import SampleRequest, generated
 from mudg.diffusion.settings import HarmonizeConfig, SynthesizeConfig
 from mudg.diffusion.views import windows
-from mudg.editing.apply import Drawer, EditedDrive, carry_out, complete_asset, write_asset
+from mudg.editing.apply import Drawer, EditedDrive, carry_out, complete_asset, drawer, write_asset
 from mudg.editing.harmonised import repairing
 from mudg.editing.model import linear_of
 from mudg.editing.recorded import EditedImages, write_edited_scene
@@ -125,13 +125,11 @@ def seam(model: MDM, config: BenchConfig, request: SampleRequest) -> dict[str, A
     tail: dict[Any, torch.Tensor] = {}
     spans = windows(len(views), model.config.window, usual.overlap)
     for number, span in enumerate(spans):
-        seen = [views[i] for i in span]
+        seen, shared = [views[i] for i in span], len(frames) - span.start
         condition = build_conditions(record.cloud, record.world.tracks(), seen, record.recorded, sizes, sources)[0]
-        shared = len(frames) - span.start
         known = {m: z[-shared:] for m, z in tail.items()} if tail else None
         made = generated(model, condition, replace(request, steps=usual.steps, index=number, known=known))
-        frames += list(made.rgb[shared if tail else 0 :])
-        tail = dict(made.latents)
+        frames, tail = [*frames, *made.rgb[shared:]], dict(made.latents)
     rgb = torch.stack([torch.from_numpy(t.rgb.copy()).permute(2, 0, 1) for t in truths])
     depth = torch.stack([torch.from_numpy(t.depth.copy())[None] for t in truths]).clamp(max=1000.0)
     ids = torch.stack([torch.from_numpy(t.semantics.astype("int64")) for t in truths])
@@ -277,7 +275,8 @@ def pose_errors(truth: NDArray[np.float64], keys: NDArray[np.float64], free: boo
 
 
 def row_of(truth: Scene, given: Scene, model: SceneModel) -> dict[str, Any]:
-    """Errors of every object that was seen at four keys or more, and PSNR on dynamic objects in held-out frames."""
+    """Errors of every object that was seen at four keys or more, and PSNR over all pixels of dynamic objects in the
+    held-out frames together (NaN where there are none)."""
     objects, keys_seen = [], seen_keys(truth)
     for node in model.nodes:
         if not isinstance(node, RigidNode) or len(keys_seen[node.name]) < FEWEST_KEYS:
@@ -290,17 +289,12 @@ def row_of(truth: Scene, given: Scene, model: SceneModel) -> dict[str, Any]:
             for place, free in ((name, True), (f"{name}_absolute", False)):
                 row[f"{place}_m"], row[f"{place}_rad"] = pose_errors(exact, keys, free)
         objects.append(row)
-    return {"objects": objects, "psnr_moving": moving_psnr(truth, model)}
-
-
-def moving_psnr(scene: Scene, model: SceneModel) -> float:
-    """PSNR over all pixels of dynamic objects in the held-out frames together; NaN where there are none."""
-    errors = []
-    for frame in scene.frames_in("test"):
-        moving = torch.from_numpy(read_label(scene, frame, "dynamic").astype(bool))
-        truth = torch.from_numpy(read_image(scene, frame)).permute(2, 0, 1).float() / 255
-        errors.append((fit.render_view(model, frame.view, raster_of(model)).rgb - truth)[:, moving].flatten())
-    return metrics.psnr_of_errors(torch.cat(errors) if errors else torch.zeros(0))
+    errors = [torch.zeros(0)]
+    for frame in truth.frames_in("test"):
+        moving = torch.from_numpy(read_label(truth, frame, "dynamic").astype(bool))
+        photo = torch.from_numpy(read_image(truth, frame)).permute(2, 0, 1).float() / 255
+        errors.append((render_view(model, frame.view, raster_of(model)).rgb - photo)[:, moving].flatten())
+    return {"objects": objects, "psnr_moving": metrics.psnr_of_errors(torch.cat(errors))}
 
 
 def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -432,22 +426,19 @@ def measure_edits(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
 
 
 def case_of(config: BenchConfig, city: int, out: Path) -> EditCase:
-    """A city, the scene fitted to it, and the vehicle that is edited."""
+    """A city, the scene fitted to it, and the vehicle that is edited: of those with a node of their own the one that
+    shows the most pixels. InputError: there is none."""
     scene = city_scene(city, out / "cities" / str(city))
     settings = fit_settings(config, "fixed")
     state = fitted(scene, cloud_of(scene), settings, out / "fits" / f"{city}_edit")
     fit.add_certainty(state, settings)
-    return EditCase(city, CityWorld.from_source(scene.source), scene, state.model, most_visible(scene, state.model))
-
-
-def most_visible(scene: Scene, model: SceneModel) -> str:
-    """The vehicle with a node of its own that shows the most pixels. InputError: the city has none."""
     shown = (np.bincount(read_label(scene, frame, "instance").ravel(), minlength=4096) for frame in scene.frames)
     pixels = np.sum(list(shown), 0)
-    names = [name for name in model.node_names() if name.startswith(("car", "truck", "bus"))]
+    names = [name for name in state.model.node_names() if name.startswith(("car", "truck", "bus"))]
     if not names:
         raise InputError("no vehicle moves in this city", where=scene.id)
-    return max(names, key=lambda name: pixels[int(name.rsplit("-", 1)[1])])
+    name = max(names, key=lambda name: pixels[int(name.rsplit("-", 1)[1])])
+    return EditCase(city, CityWorld.from_source(scene.source), scene, state.model, name)
 
 
 # ---- an edited city against its truth ----
@@ -512,12 +503,6 @@ def _compared(
     overlaps = [float(a / b) if b else None for a, b in counts]
     pixels = int(sum(map(len, errors["inside"])))
     return {"pixels": pixels, **psnr, "outside": away, "overlap": overlaps[0], "overlap_before": overlaps[1]}
-
-
-def drawer(model: SceneModel) -> Drawer:
-    """What draws views of a fitted scene."""
-    raster = raster_of(model)
-    return lambda view: render_view(model, view, raster)
 
 
 def drawn_pixels(model: SceneModel, name: str, view: View) -> NDArray[np.bool_]:
@@ -677,8 +662,13 @@ def _repaired_rows(config: BenchConfig, case: EditCase, name: str, out: Path) ->
     images = replace(images, repaired={name: iter(frames.values()) for name in case.scene.cameras})
     refitted = _refitted(config, case, drive, images, out / "edited" / f"{case.city}_{name.replace(' ', '_')}")
     ways = [drawer(edited), lambda view: frames[view.time_s], drawer(refitted)]
-    if name == "remove":
-        ways.append(drawer(_never_there(config, case, truth, out)))
+    if name == "remove":  # a fit, with the same settings, of the city in which the object was never there
+        folder, own = out / "cities" / f"{case.city}_without", fit_settings(config, "fixed")
+        if not (folder / "scene.json").is_file():
+            write_world(truth, folder)
+        scene = read_scene(folder)
+        never = fitted(scene, cloud_of(scene), own, out / "fits" / f"{case.city}_without")
+        ways.append(drawer(never.model))
     row, usual = {"city": case.city, "object": case.name, "edit": name}, drawer(case.model)
     return [{**row, "way": way, **_compared(case, truth, draw, usual)} for way, draw in zip(REPAIRS, ways)]
 
@@ -708,12 +698,3 @@ def _refitted(config: BenchConfig, case: EditCase, drive: EditedDrive, images: E
     views, classes = fit.recorded_views(settings, scene, None, start)
     state = fit.continued_state(whole_run(settings), start, views, classes)
     return optimised(state, whole_run(settings), out / "fit").model
-
-
-def _never_there(config: BenchConfig, case: EditCase, world: CityWorld, out: Path) -> SceneModel:
-    """A fit, with the same settings, of the city in which the object was never there."""
-    folder = out / "cities" / f"{case.city}_without"
-    if not (folder / "scene.json").is_file():
-        write_world(world, folder)
-    scene, settings = read_scene(folder), fit_settings(config, "fixed")
-    return fitted(scene, cloud_of(scene), settings, out / "fits" / f"{case.city}_without").model

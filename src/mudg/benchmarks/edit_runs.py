@@ -26,7 +26,7 @@ from mudg.base.html import TextTable, cells, markdown_table
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Frame, FusedCloud, Observation, Scene, Track, View
 from mudg.benchmarks.chain import finished, render_page, wall
-from mudg.benchmarks.cities import drawer, drawn_pixels
+from mudg.benchmarks.cities import drawn_pixels
 from mudg.benchmarks.settings import BenchConfig
 from mudg.core import lidar, metrics, pictures, street_scores, view_metrics
 from mudg.core import metrics as flicker
@@ -193,7 +193,7 @@ def _videos(case: RunCase, drive: apply.EditedDrive) -> tuple[Video, Video, bool
     """The unedited and the edited video, and whether weather or light changes."""
     conditions = conditions_of(drive.script.canonical())
     made = drive.model(case.model)
-    plain, draw = drawer(case.model), drawer(made)
+    plain, draw = apply.drawer(case.model), apply.drawer(made)
     if conditions is not None:
         draw = apply.in_weather(draw, apply.weather_of(draw, conditions, case.scene))
     new = next(iter(drive.plan.inserted), case.lead)

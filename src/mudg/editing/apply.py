@@ -609,6 +609,11 @@ SEED: Final = 0
 Drawer = Callable[[View], Observation]
 
 
+def drawer(model: SceneModel) -> Drawer:
+    """What draws views of a fitted scene."""
+    return functools.partial(render_view, model, raster=raster_of(model))
+
+
 def weather_of(draw: Drawer, conditions: Conditions, scene: Scene) -> InWeather:
     """Weather for all views of a drive, with its light and ground. ``draw``: the views as they are, with depth and
     classes. ``scene``: its recorded views tell the light of the drive, its path where wheels went and how fast the

@@ -8,7 +8,6 @@ other; and the drive that ``synthesize --edits`` reads in place of the recorded 
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,14 +22,13 @@ from mudg.diffusion.published import is_published
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.diffusion.synthesize import DriveInputs, JobInputs
 from mudg.diffusion.views import recorded_images
-from mudg.editing.apply import EditedDrive, carry_out, weather_of
+from mudg.editing.apply import EditedDrive, carry_out, drawer, weather_of
 from mudg.editing.harmonised import check_paths, repairing
 from mudg.editing.recorded import EditedImages, cleared_cloud, photos_of_edited, vacated_at, write_edited_scene
 from mudg.editing.runs import RunParts
 from mudg.editing.script import EditScript, conditions_of
 from mudg.editing.settings import EditConfig
 from mudg.gaussians.model import SceneModel
-from mudg.gaussians.rendering import raster_of, render_view
 from mudg.gaussians.storage import load_model, model_of_scene, save_model
 from mudg.scene.clouds import read_fused, write_fused
 from mudg.scene.read import read_scene
@@ -140,7 +138,7 @@ def edited_drive(script: EditScript, config: SynthesizeConfig, inputs: JobInputs
     edited, fit = drive.scene or scene, None if fit is None else drive.model(fit)
     conditions, weather = conditions_of(script.canonical()), None
     if conditions is not None and fit is not None and shows_weather(config, script, True):
-        weather = weather_of(functools.partial(render_view, fit, raster=raster_of(fit)), conditions, edited)
+        weather = weather_of(drawer(fit), conditions, edited)
     recorded, cloud = photos_of_edited(recorded_images(scene, config), drive.plan), drive.cloud or cloud
     return DriveInputs(edited, cleared_cloud(cloud, drive.plan), recorded, fit, vacated_at(drive.plan), weather)
 

@@ -21,8 +21,6 @@ DESCRIPTION_FILE: Final = "model.json"
 KIND: Final = "score network"
 _LISTED: Final = 8
 
-Names = Mapping[str, str]
-
 
 @dataclass(frozen=True)
 class ScoreNetwork:
@@ -34,7 +32,7 @@ class ScoreNetwork:
     flag: str
     check: Callable[[Mapping[str, Tensor], str], object]
     named: Callable[[Mapping[str, Tensor]], dict[str, Tensor]]
-    published: Names
+    published: Mapping[str, str]
 
 
 def _lpips(trunk: LpipsTrunk, flag: str) -> ScoreNetwork:
@@ -42,10 +40,7 @@ def _lpips(trunk: LpipsTrunk, flag: str) -> ScoreNetwork:
     return ScoreNetwork(flag, lambda state, where: LpipsFeatures(state, where, trunk), named, {})
 
 
-def _without_counts(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {name: value for name, value in state.items() if not name.endswith("num_batches_tracked")}
-
-
+_without_counts = lambda state: {name: own for name, own in state.items() if not name.endswith("num_batches_tracked")}
 _I3D_SHA256: Final = "bec6519f66ea534e953026b4ae2c65553c17bf105611c746d904657e5860a5e2"
 _FID_FILES: Final = {inception.KNOWN_SHA256: "pt_inception-2015-12-05-6726825d.pth"}
 

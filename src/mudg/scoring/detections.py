@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -25,7 +25,6 @@ from mudg.base.types import Scene, Track, View
 from mudg.city.world import CityWorld
 from mudg.core import street_scores
 from mudg.core.fusion import points_in_box
-from mudg.editing.settings import ScoreConfig
 from mudg.scene.read import read_points
 from mudg.scoring import tables as score_tables
 from mudg.scoring.truth import SAME_SWEEP_S
@@ -229,33 +228,3 @@ def read_mask(path: Path) -> NDArray[np.uint8]:
             return np.asarray(picture.convert("L"))
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
         raise InputError("a lane mask cannot be decoded", where=str(path), got=str(error)) from error
-
-
-@dataclass(frozen=True)
-class Detections:
-    """What was given of boxes and lanes."""
-
-    boxes: BoxDetections | None
-    lanes: LaneDetections | None
-
-    @property
-    def rows(self) -> Mapping[str, tuple[str, Callable[[ViewImages], dict[str, Any] | str]]]:
-        """Metric -> entry of a result, and what computes it."""
-        found: dict[str, tuple[str, Callable[[ViewImages], dict[str, Any] | str]]] = {}
-        if self.boxes is not None:
-            found["nta_iou"] = ("nta", self.boxes.of)
-        if self.lanes is not None:
-            found["ntl_iou"] = ("ntl", self.lanes.of)
-        return found
-
-    def record(self) -> dict[str, Any]:
-        """How the numbers were made, for metrics.json."""
-        given = {"nta_iou": self.boxes, "ntl_iou": self.lanes}
-        return {name: source.record() for name, source in given.items() if source is not None}
-
-
-def detections_of(config: ScoreConfig, scene: Scene) -> Detections:
-    """What reads the files that a configuration names. InputError: a file is missing or malformed, or the log has no
-    lane lines."""
-    boxes = BoxDetections(scene, Path(config.detections), config.as_published) if config.detections else None
-    return Detections(boxes, LaneDetections(scene, Path(config.lanes)) if config.lanes else None)

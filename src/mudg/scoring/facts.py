@@ -57,8 +57,11 @@ class FactMaker:
         frame = self._frame_at(view)
         points = self._points.truth_at(view, frame)
         if truth is not None and truth.instance is not None:
-            agents = visible_agents(view, self._vehicles, truth.instance)
-            return ViewFacts(points, agents, exact_lanes(truth), truth.instance)
+            agents, seen, lanes = visible_agents(view, self._vehicles, truth.instance), truth.seen, None
+            if truth.marking is not None and seen.semantics is not None and seen.depth is not None:
+                ids, depth, rgb = seen.semantics.numpy(), seen.depth[0].numpy(), seen.rgb.numpy()
+                lanes = exact_lanes(ids, depth, truth.marking, rgb)
+            return ViewFacts(points, agents, lanes, truth.instance)
         return ViewFacts(points, None, None if frame is None else self._carried_lanes(view, frame))
 
     def recorded(self, camera: str) -> dict[str, float]:
@@ -113,40 +116,27 @@ class FactMaker:
         for frame in self._scene.frames_of(camera):
             if not {"depth", "semantics", "instance"} <= frame.labels.keys():
                 return {}
-            seen = recorded_truth(self._scene, frame)
-            pair = recorded_pair(frame.view, seen, world, self._vehicles)
+            depth, ids, instance = (read_label(self._scene, frame, name) for name in ("depth", "semantics", "instance"))
+            rgb = (np.asarray(read_image(self._scene, frame)) / np.float32(255)).astype(np.float32)
+            depth, ids = np.asarray(depth, np.float32), np.asarray(ids, np.uint8)
+            seen = CityTruth(rgb, depth, ids, np.asarray(instance, np.int32))
+            planes, classes = torch.from_numpy(rgb).permute(2, 0, 1), torch.from_numpy(ids.astype(np.int64))
+            lanes = exact_lanes(ids, depth, world.markings(frame.view, seen), planes.numpy())
+            facts = ViewFacts(agents=visible_agents(frame.view, self._vehicles, seen.instance), lanes=lanes)
+            pair = Pair(planes, None, classes, planes, None, None, classes, view=frame.view, facts=facts)
             for metric in found.values():
                 metric.add(metric.source(pair))
         values = {name: metric.value() for name, metric in found.items()}
         return {name: round(value, 6) for name, value in values.items() if value is not None}
 
 
-def recorded_truth(scene: Scene, frame: Frame) -> CityTruth:
-    """A recorded image of a generated city with its exact labels."""
-    depth, ids, instance = (read_label(scene, frame, name) for name in ("depth", "semantics", "instance"))
-    rgb = (np.asarray(read_image(scene, frame)) / np.float32(255)).astype(np.float32)
-    return CityTruth(rgb, np.asarray(depth, np.float32), np.asarray(ids, np.uint8), np.asarray(instance, np.int32))
-
-
-def recorded_pair(view: View, seen: CityTruth, world: CityWorld, vehicles: tuple[tuple[int, Track], ...]) -> Pair:
-    """A recorded image of a generated city held against the exact truth of its own view."""
-    rgb, ids = torch.from_numpy(seen.rgb).permute(2, 0, 1), torch.from_numpy(seen.semantics.astype(np.int64))
-    road = (seen.semantics == ID["road"]) & (seen.depth < street_scores.LANE_FAR_M)
-    marking = world.markings(view, seen) & road
-    lanes = LaneFacts(road, marking, street_scores.lane_band(marking), rgb.numpy(), exact=True)
-    facts = ViewFacts(agents=visible_agents(view, vehicles, seen.instance), lanes=lanes)
-    return Pair(rgb, None, ids, rgb, None, None, ids, view=view, facts=facts)
-
-
-def exact_lanes(truth: ViewTruth) -> LaneFacts | None:
-    """Markings of a view with exact truth."""
-    seen = truth.seen
-    if truth.marking is None or seen.semantics is None or seen.depth is None:
-        return None
-    depth = seen.depth[0].numpy()
-    road = (seen.semantics.numpy() == ID["road"]) & (depth > 0) & (depth < street_scores.LANE_FAR_M)
-    marking = truth.marking & road
-    return LaneFacts(road, marking, street_scores.lane_band(marking), seen.rgb.numpy(), exact=True)
+def exact_lanes(
+    ids: NDArray[Any], depth: NDArray[np.float32], painted: NDArray[np.bool_], rgb: NDArray[np.float32]
+) -> LaneFacts:
+    """Markings of a view with exact classes and depth [H, W], paint bool[H, W] and colours f32[3, H, W]."""
+    road = (ids == ID["road"]) & (depth > 0) & (depth < street_scores.LANE_FAR_M)
+    marking = painted & road
+    return LaneFacts(road, marking, street_scores.lane_band(marking), rgb, exact=True)
 
 
 def known_of(facts: ViewFacts) -> set[str]:
@@ -218,19 +208,19 @@ class Reference:
 def trajectories_of(config: ScoreConfig, scene: Scene, methods: Mapping[str, Path]) -> list[ScoredTrajectory]:
     """The trajectories that some method has, by camera and distance. InputError: there are none, or methods disagree
     about a trajectory's views."""
+
+    def order(name: str) -> tuple[str, float, str]:
+        found = _NAME.fullmatch(name)
+        return (found["camera"], float(found["shift"] or 0), name) if found else (name, 1e9, name)
+
     read = lambda folder: {n: read_observations(path) for n, path in list_observation_sets(folder).items()}
     sets = {method: read(folder) for method, folder in methods.items()}
-    names = sorted({name for found in sets.values() for name in found}, key=_order)
+    names = sorted({name for found in sets.values() for name in found}, key=order)
     if not names:
         where, expected = ", ".join(map(str, methods.values())), "output of mudg render or mudg synthesize"
         raise InputError("none of the folders holds rendered views", where=where, expected=expected)
     having = {name: {m: found[name] for m, found in sets.items() if name in found} for name in names}
     return [_matched(config, scene, name, of) for name, of in having.items()]
-
-
-def _order(name: str) -> tuple[str, float, str]:
-    found = _NAME.fullmatch(name)
-    return (found["camera"], float(found["shift"] or 0), name) if found else (name, 1e9, name)
 
 
 def _matched(config: ScoreConfig, scene: Scene, name: str, sets: Mapping[str, ObservationSet]) -> ScoredTrajectory:

@@ -8,7 +8,7 @@ errors/*.png and, where FID is computed, features/.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -211,7 +211,9 @@ def _score(
         return _measured(trajectory, reference, number, own)
 
     threads = native.threads()
-    with native.one_thread() if _is_small(trajectory) else contextlib.nullcontext(), contextlib.ExitStack() as stack:
+    small = _is_small(trajectory)
+    # of large views no two are in memory at the same time
+    with native.one_thread() if small else one_torch_thread(), contextlib.ExitStack() as stack:
         truths = fills = None
         exact = reference.truth.exact
         writer = lambda folder, *kind: ObservationWriter(out / folder / trajectory.name, trajectory.name, *kind)
@@ -219,9 +221,10 @@ def _score(
             truths = stack.enter_context(writer("truth", "truth", "recorded"))
         if reference.baseline is not None:
             fills = stack.enter_context(writer(BASELINE, BASELINE))
-        views = _in_order(measure, trajectory, threads)
+        every = len(trajectory.views)
+        views = computed_ahead(measure, every, threads) if small else map(measure, range(every))
         # not over `views`: the last one would stay in memory while the next is made
-        for number in range(len(trajectory.views)):
+        for number in range(every):
             made = next(views)
             if fills is not None:
                 fills.add(made.seen[BASELINE])
@@ -233,7 +236,7 @@ def _score(
                 if number in counted:
                     scored += 1
                     truth_has |= _contents(made.truth, exact)
-                if reference.error_pictures and number == len(trajectory.views) // 2:
+                if reference.error_pictures and number == every // 2:
                     _write_error_picture(out / "errors" / f"{trajectory.name}.png", made.seen, made.truth.seen)
             for name, values in made.measured.items():
                 for metric, value in values.items():
@@ -243,21 +246,13 @@ def _score(
     anchors = {k: v for k, v in _values(sums.pop(TRUTH), truth_has).items() if not isinstance(v, str)}
     results = []
     for name, of in sums.items():
-        numbers = {"values": _values(of, truth_has), "iou": _iou(of), "details": view_metrics.details(of)}
+        classes = of["miou"]
+        counted = isinstance(classes, metrics.Segmentation) and int(classes.counts.sum())
+        iou = {n: round(value, 4) for n, value in metrics.iou_of(classes.counts).items()} if counted else {}
+        numbers = {"values": _values(of, truth_has), "iou": iou, "details": view_metrics.details(of)}
         where = {"method": name, "trajectory": trajectory.name, "views": scored}
         results.append({**where, **numbers, "truth": dict(anchors)})
     return results
-
-
-def _in_order(
-    measure: Callable[[int], MeasuredView], trajectory: ScoredTrajectory, threads: int
-) -> Iterator[MeasuredView]:
-    """The measured views of a trajectory in order; of large ones, no two are in memory at the same time."""
-    if _is_small(trajectory):
-        yield from computed_ahead(measure, len(trajectory.views), threads)
-        return
-    with one_torch_thread():
-        yield from map(measure, range(len(trajectory.views)))
 
 
 def _is_small(trajectory: ScoredTrajectory) -> bool:
@@ -346,13 +341,6 @@ def _values(sums: Mapping[str, metrics.Metric], truth_has: set[str]) -> dict[str
         if name in sums and row.needs[0] not in truth_has:
             values[name] = score_tables.NO_TRUTH
     return {n: round(v, 6) if isinstance(v, float) else v for n, v in values.items()}
-
-
-def _iou(sums: Mapping[str, metrics.Metric]) -> dict[str, float]:
-    segmentation = sums["miou"]
-    if not isinstance(segmentation, metrics.Segmentation) or not int(segmentation.counts.sum()):
-        return {}
-    return {name: round(value, 4) for name, value in metrics.iou_of(segmentation.counts).items()}
 
 
 def pair_of(

@@ -13,7 +13,7 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,7 +25,7 @@ from torch import Tensor
 from mudg.base import seeds, store
 from mudg.base.devices import choose_device
 from mudg.base.errors import InputError
-from mudg.base.types import Scene, View
+from mudg.base.types import Frame, Scene, View
 from mudg.base.weights import read_checkpoint
 from mudg.core import feature_distances
 from mudg.core.feature_distances import cmmd_distance, frechet_distance, polynomial_distance
@@ -97,11 +97,6 @@ class SetDistances:
     mind: float
     fid_at_infinity: float | None
 
-    def entry(self) -> Entry:
-        """As JSON values, rounded to 6 digits after the point."""
-        rounded = {name: None if value is None else round(value, 6) for name, value in vars(self).items()}
-        return {"values": {name: rounded.pop(name) for name in ("fid", "kid")}, **rounded}
-
 
 @dataclass
 class EmbeddingFiles:
@@ -167,42 +162,31 @@ class FeatureFiles(EmbeddingFiles):
         self.sha256, self.source_sha256 = sha256, source_sha256(weights)
 
 
-def recorded_images(scene: Scene, sets: TrajectorySets) -> ImageSet:
-    """The recorded frames of a trajectory's camera at the common size, in order of time; none if the scene lacks the
-    camera."""
-    frames = scene.frames_of(sets.camera) if sets.camera in scene.cameras else ()
-    return ImageSet(len(frames), lambda number: read_image(scene, frames[number])).resized(sets.width, sets.height)
+EVERY_SECOND: Final = (lambda rows: (rows[::2], rows[1::2]), "every second recorded frame against the others")
+Further = Callable[[Rows, Rows, Sequence[tuple[int, int]]], Mapping[str, float | str]]
+"""From features of all views of a video and of the recorded frames, and pairs of both at the same time, to numbers by
+metric, or why there is none."""
 
 
-@dataclass
-class SetNotes:
-    """Which files of features were compared, so that sets of several logs can be pooled, one record per method and
-    trajectory; and the floors: what the truth itself scores."""
+def set_entry(generated: Rows, reference: Rows, **distances: Callable[[Rows, Rows], float]) -> Entry:
+    """Distances of two sets of features ``[n, d]`` by metric, and their sizes."""
+    values = {name: round(distance(generated, reference), 6) for name, distance in distances.items()}
+    return {"values": values, "n": len(generated), "n_reference": len(reference)}
 
-    sets: list[dict[str, str]] = field(default_factory=list)
-    floors: list[dict[str, Any]] = field(default_factory=list)
 
-    def note(self, trajectory: str, method: str, made: str, reference: str) -> None:
-        """Note the names of two files in the folder of features."""
-        self.sets.append({"trajectory": trajectory, "method": method, "made": made, "reference": reference})
-
-    def note_floor(self, trajectory: str, how: str, entry: Entry) -> None:
-        """Note what the truth itself scores."""
-        sizes = {name: value for name, value in entry.items() if name != "values"}
-        self.floors.append({"trajectory": trajectory, "how": how, **entry["values"], **sizes})
-
-    def record(self) -> dict[str, Any]:
-        """For metrics.json."""
-        return {"floors": self.floors, "sets": self.sets}
+def floor_of(trajectory: str, how: str, entry: Entry) -> dict[str, Any]:
+    """What the truth itself scores on a trajectory, for metrics.json."""
+    sizes = {name: value for name, value in entry.items() if name != "values"}
+    return {"trajectory": trajectory, "how": how, **entry["values"], **sizes}
 
 
 class SetComparison:
     """A distance of sets of images for every trajectory of a scene, whose recorded frames are the reference.
 
     Args:
-        files: how images become features. compare: two sets of features to their numbers.
+        files: how images become features. compare: two sets of features to their numbers. facts: how these are made.
         halves: two parts of the reference, whose distance is the floor where no truth is known, and what they are.
-        made: how the numbers are made.
+        further: what else the features tell of a video, if anything.
     """
 
     def __init__(
@@ -210,53 +194,84 @@ class SetComparison:
         scene: Scene,
         files: EmbeddingFiles,
         compare: Callable[[Rows, Rows], Entry],
-        halves: tuple[Callable[[Rows], tuple[Rows, Rows]], str],
         facts: Mapping[str, Any],
+        halves: tuple[Callable[[Rows], tuple[Rows, Rows]], str] = EVERY_SECOND,
+        further: tuple[str, Further] | None = None,
     ) -> None:
-        self._scene, self._files, self._compare, self._halves, self._made = scene, files, compare, halves, facts
+        self._scene, self._files, self._compare, self._facts = scene, files, compare, facts
+        self._halves, self._further = halves, further
         self._recorded: dict[tuple[str, int, int], tuple[str, Rows]] = {}
-        self._notes = SetNotes()
+        self._floors, self._sets = list[dict[str, Any]](), list[dict[str, str]]()
 
-    def of(self, sets: TrajectorySets) -> dict[str, Entry | str]:
-        """Numbers by method, or why there are none; the floor of the trajectory is noted for ``record``. InputError:
-        methods have different numbers of images."""
+    def of(
+        self, sets: TrajectorySets, counted: Sequence[int] | None = None, views: Sequence[View] = ()
+    ) -> dict[str, Entry | str]:
+        """Numbers by method, or why there are none; the floor of the trajectory is noted for ``record``. ``counted``:
+        which of the images, of all ``views``, enter the distance (None: all). InputError: methods have different
+        numbers of images."""
         counts = {method: images.count for method, images in sets.methods.items()}
         if len(set(counts.values())) > 1:
             what, expected = "FID of sets of different size cannot be compared", "the same views for all methods"
             got = ", ".join(f"{method}: {count}" for method, count in counts.items())
             raise InputError(what, where=sets.name, expected=expected, got=got)
-        key, recorded = (sets.camera, sets.width, sets.height), recorded_images(self._scene, sets)
-        if not recorded.count:
-            return dict.fromkeys(counts, score_tables.NO_TRUTH)
-        if min(map(self._files.rows, (*counts.values(), recorded.count))) < FEWEST:
-            return dict.fromkeys(counts, score_tables.TOO_FEW)
+        frames = self._scene.frames_of(sets.camera) if sets.camera in self._scene.cameras else ()
+        recorded = ImageSet(len(frames), lambda number: read_image(self._scene, frames[number]))
+        recorded = recorded.resized(sets.width, sets.height)
+        sizes = [self._files.rows(count) if counted is None else len(counted) for count in counts.values()]
+        few = min((*sizes, self._files.rows(recorded.count))) < FEWEST
+        missing = score_tables.NO_TRUTH if not recorded.count else score_tables.TOO_FEW if few else ""
+        if missing and self._further is None:
+            return dict.fromkeys(counts, missing)
+        key = (sets.camera, sets.width, sets.height)
         if key not in self._recorded:
             self._recorded[key] = self._files.named(recorded)
         (name, reference), found = self._recorded[key], dict[str, Entry | str]()
+        chosen = lambda rows: rows if counted is None else rows[list(counted)]
         for method, images in sets.methods.items():
-            own, made = self._files.named(images.resized(sets.width, sets.height))
-            self._notes.note(sets.name, method, own, name)
-            found[method] = self._compare(made, reference)
+            own, rows = self._files.named(images.resized(sets.width, sets.height))
+            if self._further is None:
+                # which files were compared, so that sets of several logs can be pooled
+                self._sets.append({"trajectory": sets.name, "method": method, "made": own, "reference": name})
+                found[method] = self._compare(rows, reference)
+                continue
+            metric, further = self._further
+            entry = {"values": {metric: missing}} if missing else self._compare(chosen(rows), reference)
+            values = further(rows, reference, _same_times(counted or (), views, frames))
+            entry["values"] |= {k: v if isinstance(v, str) else round(v, 6) for k, v in values.items()}
+            found[method] = entry
         split, how = self._halves
         pair = split(reference)
         if sets.truth is not None:
-            pair = self._files.of(sets.truth.resized(sets.width, sets.height)), reference
+            pair = chosen(self._files.of(sets.truth.resized(sets.width, sets.height))), reference
             how = "true images of the same views"
         if min(map(len, pair)) >= FEWEST:
-            self._notes.note_floor(sets.name, how, self._compare(*pair))
+            self._floors.append(floor_of(sets.name, how, self._compare(*pair)))
         return found
 
     def record(self) -> dict[str, Any]:
         """How the numbers were made, and the floors, for metrics.json."""
-        return {**self._made, **self._notes.record()}
+        return {**self._facts, "floors": self._floors, **({} if self._further else {"sets": self._sets})}
 
 
-EVERY_SECOND: Final = (lambda rows: (rows[::2], rows[1::2]), "every second recorded frame against the others")
+def _same_times(counted: Sequence[int], views: Sequence[View], frames: Sequence[Frame]) -> list[tuple[int, int]]:
+    """Pairs of counted views and recorded frames at the same time."""
+    times, pairs = np.array([frame.view.time_s for frame in frames]), []
+    for place in counted if len(times) else ():
+        nearest = int(np.argmin(np.abs(times - views[place].time_s)))
+        if abs(times[nearest] - views[place].time_s) <= SAME_TIME_S:
+            pairs.append((place, nearest))
+    return pairs
+
+
+def distributions_of(config: ScoreConfig, scene: Scene, out: Path) -> SetComparison:
+    """What computes FID and KID."""
+    device, folder = choose_device(config.device, "networks of the scores"), out / FEATURES_FOLDER
+    return distributions(scene, FeatureFiles(Path(config.fid_weights), config.fid_resize, folder, device))
 
 
 def distributions(scene: Scene, files: FeatureFiles) -> SetComparison:
-    """FID and KID."""
-    made = {
+    """What computes FID and KID."""
+    facts = {
         "network": "Inception-v3 of 2015, global average, 2048 values",
         "weights_sha256": files.sha256,
         "published_weights": files.source_sha256 == inception.KNOWN_SHA256,
@@ -264,13 +279,13 @@ def distributions(scene: Scene, files: FeatureFiles) -> SetComparison:
         "reference": "recorded frames of the same camera",
         "covariance": "n - 1",
     }
-    return SetComparison(scene, files, lambda *pair: distances(*pair).entry(), EVERY_SECOND, made)
 
+    def entry(generated: Rows, reference: Rows) -> Entry:
+        of = vars(distances(generated, reference)).items()
+        rounded = {name: None if value is None else round(value, 6) for name, value in of}
+        return {"values": {name: rounded.pop(name) for name in ("fid", "kid")}, **rounded}
 
-def distributions_of(config: ScoreConfig, scene: Scene, out: Path) -> SetComparison:
-    """What computes FID and KID."""
-    device, folder = choose_device(config.device, "networks of the scores"), out / FEATURES_FOLDER
-    return distributions(scene, FeatureFiles(Path(config.fid_weights), config.fid_resize, folder, device))
+    return SetComparison(scene, files, entry, facts)
 
 
 def distances(generated: NDArray[np.float32], reference: NDArray[np.float32]) -> SetDistances:
@@ -331,8 +346,7 @@ def clip_count(frames: int) -> int:
 
 def video_entry(generated: Rows, reference: Rows) -> Entry:
     """FVD of two sets of features ``[n, d]``."""
-    value = round(frechet_distance(generated, reference), 6)
-    return {"values": {"fvd": value}, "n": len(generated), "n_reference": len(reference)}
+    return set_entry(generated, reference, fvd=frechet_distance)
 
 
 def videos_of(config: ScoreConfig, scene: Scene, out: Path) -> SetComparison:
@@ -351,7 +365,7 @@ def videos_of(config: ScoreConfig, scene: Scene, out: Path) -> SetComparison:
     }
     halves = lambda rows: (rows[: len(rows) // 2], rows[len(rows) // 2 :])
     how = "first half of the recorded video against the second"
-    return SetComparison(scene, files, video_entry, (halves, how), made)
+    return SetComparison(scene, files, video_entry, made, (halves, how))
 
 
 # -- video features --------------------------------------------------------------------------------
@@ -375,7 +389,7 @@ class VideoFeatures:
             expected = f"{tables}, each with a tensor features [clips, values]"
             remedy = "run the extractor yourself and save what it gives; programs (TorchScript) are not read"
             raise InputError("no such folder of features", where=str(folder), expected=expected, remedy=remedy)
-        self._folder, self._notes = folder, SetNotes()
+        self._folder, self._floors = folder, list[dict[str, Any]]()
         self._width: int | None = None
 
     def of(self, trajectory: str, camera: str, methods: Sequence[str]) -> dict[str, dict[str, Any] | str]:
@@ -390,7 +404,7 @@ class VideoFeatures:
             found[method] = score_tables.NO_FEATURES if made is None else _compared(made, reference)
         true = self._read(f"{TRUTH}/{trajectory}")
         if true is not None and not isinstance(floor := _compared(true, reference), str):
-            self._notes.note_floor(trajectory, "true clips", floor)
+            self._floors.append(floor_of(trajectory, "true clips", floor))
         return found
 
     def record(self) -> dict[str, Any]:
@@ -402,7 +416,7 @@ class VideoFeatures:
             "covariance": "n - 1",
             "kernel": "(x.y / d)^2, biased, times 100",
             "reference": "clips of the recorded video of the same camera",
-            "floors": self._notes.floors,
+            "floors": self._floors,
         }
 
     def _read(self, name: str) -> NDArray[np.float64] | None:
@@ -418,14 +432,10 @@ class VideoFeatures:
         return found.astype(np.float64)
 
 
-def _compared(generated: NDArray[np.float64], reference: NDArray[np.float64]) -> dict[str, Any] | str:
+def _compared(generated: NDArray[np.float64], reference: NDArray[np.float64]) -> Entry | str:
     if min(len(generated), len(reference)) < FEWEST:
         return score_tables.TOO_FEW
-    values = {
-        "video_frechet": frechet_distance(generated, reference),
-        "video_mmd": polynomial_distance(generated, reference),
-    }
-    return {"values": {k: round(v, 6) for k, v in values.items()}, "n": len(generated), "n_reference": len(reference)}
+    return set_entry(generated, reference, video_frechet=frechet_distance, video_mmd=polynomial_distance)
 
 
 # -- embeddings ------------------------------------------------------------------------------------
@@ -433,67 +443,6 @@ def _compared(generated: NDArray[np.float64], reference: NDArray[np.float64]) ->
 # Scores of images through one embedding each: FD-DINOv2 and consistency with DINOv2, CMMD, CLIP-F and CLIP-V with CLIP.
 # Distances of sets compare the counted views of a trajectory with the recorded frames of the same camera, as FID does.
 # CLIP-F and consistency follow the video, so all views count.
-
-
-class EmbeddingScores:
-    """A distance of counted views from the recorded frames, with its floors, and what else an embedding tells of a
-    video, for every trajectory of a scene. ``scene``: whose recorded frames are the reference. ``files``: makes
-    embeddings. ``name``: of the metric. ``distance``: of two sets. ``further``: other values by name, or why there is
-    none, from the embeddings of all views and of the recorded frames, and pairs of both at the same time. ``made``: how
-    the numbers are made."""
-
-    def __init__(
-        self,
-        scene: Scene,
-        files: EmbeddingFiles,
-        name: str,
-        distance: Callable[[Rows, Rows], float],
-        further: Callable[[Rows, Rows, Sequence[tuple[int, int]]], dict[str, float | str]],
-        facts: dict[str, Any],
-    ) -> None:
-        self._scene, self._files, self._name, self._distance = scene, files, name, distance
-        self._further, self._made, self._notes = further, facts, SetNotes()
-
-    def of(
-        self, sets: TrajectorySets, counted: Sequence[int], views: Sequence[View]
-    ) -> dict[str, dict[str, Any] | str]:
-        """By method ``values`` and sizes; ``sets`` holds all ``views``, of which those ``counted`` enter the
-        distance."""
-        reference, found = self._files.of(recorded_images(self._scene, sets)), {}
-        frames = self._scene.frames_of(sets.camera) if sets.camera in self._scene.cameras else ()
-        times, pairs = np.array([frame.view.time_s for frame in frames]), []
-        for place in counted if len(times) else ():
-            nearest = int(np.argmin(np.abs(times - views[place].time_s)))
-            if abs(times[nearest] - views[place].time_s) <= SAME_TIME_S:
-                pairs.append((place, nearest))
-        embedded = lambda images: self._files.of(images.resized(sets.width, sets.height))
-        for method, images in sets.methods.items():
-            rows = embedded(images)
-            found[method] = self._compared(rows[list(counted)], reference)
-            found[method]["values"] |= {
-                name: value if isinstance(value, str) else round(value, 6)
-                for name, value in self._further(rows, reference, pairs).items()
-            }
-        if sets.truth is not None:
-            floor = self._compared(embedded(sets.truth)[list(counted)], reference, fewest=0)
-            self._notes.note_floor(sets.name, "true images of the same views", floor)
-        elif len(reference) >= 2 * FEWEST:
-            split, how = EVERY_SECOND
-            self._notes.note_floor(sets.name, how, self._compared(*split(reference)))
-        return found
-
-    def _compared(self, generated: Rows, reference: Rows, fewest: int = FEWEST) -> dict[str, Any]:
-        """The distance and the sizes of both sets; or why there is none."""
-        if fewest and not len(reference):
-            return {"values": {self._name: score_tables.NO_TRUTH}}
-        if min(len(generated), len(reference)) < fewest:
-            return {"values": {self._name: score_tables.TOO_FEW}}
-        value = round(self._distance(generated, reference), 6)
-        return {"values": {self._name: value}, "n": len(generated), "n_reference": len(reference)}
-
-    def record(self) -> dict[str, Any]:
-        """How the numbers were made, and the floors."""
-        return {**self._made, "floors": self._notes.floors}
 
 
 def _units(rows: Rows) -> NDArray[np.float64]:
@@ -521,7 +470,7 @@ def _clip_values(rows: Rows, reference: Rows, pairs: Sequence[tuple[int, int]]) 
     }
 
 
-def dino_of(config: ScoreConfig, scene: Scene, out: Path) -> EmbeddingScores:
+def dino_of(config: ScoreConfig, scene: Scene, out: Path) -> SetComparison:
     """What computes FD-DINOv2 and the consistency of the video."""
     path, device = Path(config.dino_weights), choose_device(config.device, "networks of the scores")
     network = dinov2.DinoFeatures(read_checkpoint(path), str(path)).to(device)
@@ -540,10 +489,11 @@ def dino_of(config: ScoreConfig, scene: Scene, out: Path) -> EmbeddingScores:
         steady = subject_consistency(rows)
         return {"subject_consistency": score_tables.TOO_FEW if steady is None else steady}
 
-    return EmbeddingScores(scene, files, "fd_dinov2", frechet_distance, further, made)
+    compare = functools.partial(set_entry, fd_dinov2=frechet_distance)
+    return SetComparison(scene, files, compare, made, further=("fd_dinov2", further))
 
 
-def clip_of(config: ScoreConfig, scene: Scene, out: Path) -> EmbeddingScores:
+def clip_of(config: ScoreConfig, scene: Scene, out: Path) -> SetComparison:
     """What computes CMMD, CLIP-F and CLIP-V."""
     path, device = Path(config.clip_weights), choose_device(config.device, "networks of the scores")
     network = clip_image.ClipImageFeatures(read_checkpoint(path), str(path)).to(device)
@@ -557,4 +507,5 @@ def clip_of(config: ScoreConfig, scene: Scene, out: Path) -> EmbeddingScores:
         "kernel": "Gaussian, sigma 10, biased, times 1000",
         "reference": "recorded frames of the same camera",
     }
-    return EmbeddingScores(scene, files, "cmmd", cmmd_distance, _clip_values, made)
+    compare = functools.partial(set_entry, cmmd=cmmd_distance)
+    return SetComparison(scene, files, compare, made, further=("cmmd", _clip_values))

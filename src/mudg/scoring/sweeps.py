@@ -11,6 +11,7 @@ beside it, exact and without noise. Rows besides the methods, all without the he
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,35 +92,24 @@ def sweep_scores(scene: Scene, methods: Mapping[str, Path]) -> list[dict[str, An
     others, rows = OtherSweeps(scene), list[dict[str, Any]]()
     trajectories = {name: one for found in sets.values() for name, one in found.items()}
     for trajectory, example in sorted(trajectories.items(), key=lambda item: (item[1].shift_m, item[0])):
-        sums: dict[str, SweepScores] = {}
-        count = 0
+        sums, count = defaultdict[str, SweepScores](SweepScores), 0
         for number, method in enumerate(name for name, found in sets.items() if trajectory in found):
             one = sets[method][trajectory]
             for sweep, beams, true in _judged(scene, world, one):
-                arrays = one.arrays(sweep)
-                _add(sums, method, beams, _simulated(arrays), true)
+                arrays, returned = one.arrays(sweep), Measured(*np.full((2, len(beams)), np.nan))
+                beam = arrays["beam"]
+                returned.range_m[beam], returned.intensity[beam] = arrays["range_m"][beam], arrays["intensity"]
                 plain = Measured(arrays["range_m"].astype(np.float64), CONSTANT_INTENSITY * arrays["facing"])
-                _add(sums, f"{method}: constant", beams, plain, true)
+                rows_of = {method: returned, f"{method}: constant": plain}
                 if number == 0:
                     count += 1
-                    for name, made in others.answers(example.sensor, beams).items():
-                        _add(sums, name, beams, made, true)
+                    rows_of |= others.answers(example.sensor, beams)
+                for name, made in rows_of.items():
+                    sums[name].add(beams.directions, made, true)
         order = sorted(sums, key=lambda name: name in ("nearest", "fused"))
         head = {"trajectory": trajectory, "shift_m": example.shift_m, "sweeps": count}
         rows += [{"method": name, **head, "values": sums[name].values()} for name in order]
     return rows
-
-
-def _add(sums: dict[str, SweepScores], name: str, beams: Beams, simulated: Measured, true: Measured) -> None:
-    sums.setdefault(name, SweepScores()).add(beams.directions, simulated, true)
-
-
-def _simulated(arrays: Mapping[str, NDArray[Any]]) -> Measured:
-    """What a simulated sweep returns."""
-    beam, count = arrays["beam"], len(arrays["share"])
-    found = Measured(np.full(count, np.nan), np.full(count, np.nan))
-    found.range_m[beam], found.intensity[beam] = arrays["range_m"][beam], arrays["intensity"]
-    return found
 
 
 def _judged(

@@ -105,9 +105,7 @@ def document(
     trajectory. ``rows``: title, unit, better and needs of each metric. ``facts``: how the numbers were made:
     ``depth_limit_m``, beyond which depths do not count; ``anchors``; and by the entries of ``SET_METRICS``,
     ``detections`` and ``lpips`` what is known of their metrics; entries that are missing were not computed."""
-    depth_limit_m, distributions, videos = facts["depth_limit_m"], facts.get("distributions"), facts.get("videos")
-    held_out = len(scene.frames_in("test"))
-    limit = f"{depth_limit_m:g} m"
+    held_out, limit = len(scene.frames_in("test")), f"{facts['depth_limit_m']:g} m"
     off = "A recorded log has no ground truth off its path: shifted views are shown, not scored."
     no_split = "No frame was held out: on the recorded path the frames that were learned from are scored."
     rules = [
@@ -117,8 +115,6 @@ def document(
         "Views off the recorded path were never seen by any method." if exact else off,
         f"Depth counts where the truth is known and at most {limit}; where a method gives none, it counts as {limit}.",
         "Class scores are pooled over all views of a trajectory; mIoU is the mean over the classes in its truth.",
-        *([_rule_of_sets(distributions)] if distributions else []),
-        *([_rule_of_videos(videos)] if videos else []),
         *_further_rules(facts),
         *(LIDAR_RULES if facts.get("sweeps") else ()),
     ]
@@ -145,27 +141,23 @@ def document(
     }
 
 
-def _rule_of_sets(facts: Mapping[str, Any]) -> str:
-    other = f"weights that are not the published file ({facts['weights_sha256'][:12]})"
-    weights = "the published weights" if facts["published_weights"] else other
-    return (
-        f"FID and KID compare the views of a trajectory with the {facts['reference']}, with {weights} and the resize"
-        f" rule {facts['resize']}. They depend on the number of images: compare methods within a column only, and read"
-        " them beside the floor, which the truth itself scores."
-    )
-
-
-def _rule_of_videos(facts: Mapping[str, Any]) -> str:
-    return (
-        f"FVD compares clips of {facts['clip_frames']} views, one at every {facts['hop_frames']}th, with those of the"
-        f" {facts['reference']} (resize rule {facts['resize']}, epsilon {facts['norm_epsilon']:g}); all views count."
-        " With so few clips it is mostly bias: read it beside the floor."
-    )
-
-
 def _further_rules(facts: Mapping[str, Any]) -> list[str]:
-    """One sentence for each other metric whose definition has variants."""
+    """One rule for each other metric whose definition has variants."""
     rules = []
+    if of := facts.get("distributions"):
+        other = f"weights that are not the published file ({of['weights_sha256'][:12]})"
+        weights = "the published weights" if of["published_weights"] else other
+        rules.append(
+            f"FID and KID compare the views of a trajectory with the {of['reference']}, with {weights} and the resize"
+            f" rule {of['resize']}. They depend on the number of images: compare methods within a column only, and read"
+            " them beside the floor, which the truth itself scores."
+        )
+    if of := facts.get("videos"):
+        rules.append(
+            f"FVD compares clips of {of['clip_frames']} views, one at every {of['hop_frames']}th, with those of the"
+            f" {of['reference']} (resize rule {of['resize']}, epsilon {of['norm_epsilon']:g}); all views count. With so"
+            " few clips it is mostly bias: read it beside the floor."
+        )
     if facts.get("lpips"):
         how = "in -1..1" if facts["lpips"]["input"] == "correct" else "unscaled, in 0..1"
         rules.append(f"LPIPS gets its colours {how}.")
@@ -257,11 +249,12 @@ def plain(document: Mapping[str, Any]) -> str:
     floors = floors_by_distance(document)
     lines = []
     for distance in distances:
-        here = [values_of.get((m["name"], distance), {}) for m in document["methods"]]
-        columns = [m for m in document["metrics"] if m["name"] in names]
-        if not _has_numbers(here, columns):
-            columns = [m for m in document["metrics"] if m["name"] in WITHOUT_TRUTH]
-        if not _has_numbers(here, columns):
+        of_methods = {m["name"]: values_of.get((m["name"], distance), {}) for m in document["methods"]}
+        for wanted in (names, WITHOUT_TRUTH):
+            columns = [m for m in document["metrics"] if m["name"] in wanted]
+            if any(isinstance(of.get(m["name"]), float) for of in of_methods.values() for m in columns):
+                break
+        else:
             lines += [f"{distance_title(document, distance)}: nothing to score against (no truth)", ""]
             continue
         lines.append(distance_title(document, distance))
@@ -269,13 +262,11 @@ def plain(document: Mapping[str, Any]) -> str:
         widths = [max(14, len(head) + 2) for head in heads]
         lines.append("  " + " " * 28 + "".join(f"{head:>{width}}" for head, width in zip(heads, widths, strict=True)))
         for method in document["methods"]:
-            values = values_of.get((method["name"], distance), {})
             cells = []
             for metric, width in zip(columns, widths, strict=True):
-                of_methods = {m["name"]: values_of.get((m["name"], distance), {}) for m in document["methods"]}
                 across = {name: of.get(metric["name"]) for name, of in of_methods.items()}
                 star = "*" if method["name"] in best_of(metric["better"], across, metric["name"]) else " "
-                cells.append(f"{number_text(metric['name'], values.get(metric['name'])) + star:>{width}}")
+                cells.append(f"{number_text(metric['name'], across[method['name']]) + star:>{width}}")
             lines.append(f"  {method['title']:<28}" + "".join(cells))
         if distance in floors:
             found = [number_text(c["name"], floors[distance].get(c["name"])) + " " for c in columns]
@@ -289,10 +280,6 @@ def plain(document: Mapping[str, Any]) -> str:
             lines.append(f"  {first:<32}" + "".join(f"{c:>{w}}" for c, w in zip(cells, widths, strict=True)))
         lines.append("")
     return plain_lines(lines).rstrip()
-
-
-def _has_numbers(values: Sequence[Mapping[str, Any]], metrics: Sequence[Mapping[str, Any]]) -> bool:
-    return any(isinstance(of.get(metric["name"]), float) for of in values for metric in metrics)
 
 
 def markdown(document: Mapping[str, Any]) -> str:

@@ -83,14 +83,14 @@ def truth_of(scene: Scene) -> Truth:
                 remedy = "generate the city again; in scenes of other origin, leave the recipe out"
                 raise InputError(what, where=where, expected=expected, remedy=remedy)
         moving = np.array(city_logs.moving_instances(world), np.int32)
-        return Truth(True, lambda view, _frame, _name: _city_view(world, moving, view))
+
+        def exact(view: View, _frame: Frame | None, _name: str) -> ViewTruth:
+            truth = world.render(view)
+            dynamic = torch.from_numpy(np.isin(truth.instance, moving))[None]
+            return ViewTruth(world.observation(view, truth), dynamic, truth.instance, world.markings(view, truth))
+
+        return Truth(True, exact)
     return Truth(False, lambda view, frame, _name: None if frame is None else ViewTruth(_recorded(scene, frame, view)))
-
-
-def _city_view(world: CityWorld, moving: NDArray[np.int32], view: View) -> ViewTruth:
-    truth = world.render(view)
-    dynamic = torch.from_numpy(np.isin(truth.instance, moving))[None]
-    return ViewTruth(world.observation(view, truth), dynamic, truth.instance, world.markings(view, truth))
 
 
 def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path) -> None:

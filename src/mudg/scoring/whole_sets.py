@@ -18,32 +18,26 @@ from mudg.core.pictures import to_bytes
 from mudg.editing.settings import ScoreConfig
 from mudg.scene.observations import ObservationSet, read_observations
 from mudg.scoring import detections, sets
-from mudg.scoring.detections import Detections, ViewImages, detections_of
+from mudg.scoring.detections import BoxDetections, LaneDetections, ViewImages
 from mudg.scoring.facts import ANCHORED, Reference, ScoredTrajectory
 from mudg.scoring.sets import ImageSet, TrajectorySets
+from mudg.scoring.tables import SET_SIZES
 
 BASELINE: Final = "nearest_fill"
 Rows = Sequence[dict[str, Any]]
-OF_ENTRY: Final[Mapping[str, tuple[str, ...]]] = {
-    "distribution": ("fid", "kid"),
-    "video": ("fvd",),
-    "dinov2": ("fd_dinov2", "subject_consistency"),
-    "clip": ("cmmd", "clip_f", "clip_v"),
-    "video_features": ("video_frechet", "video_mmd"),
-}
-"""Entry of metrics.json -> its metrics."""
+ENTRIES: Final = {"distributions": "distribution", "videos": "video"}
+"""Entry of metrics.json that says how numbers were made -> that of a result with their sizes, where it differs."""
 
 
 @dataclass(frozen=True)
 class SetScores:
-    """What is computed of whole sets; None where its weights or files were not given."""
+    """What is computed of whole sets, as far as its weights or files were given. ``comparisons``: entry of metrics.json
+    -> what compares images or clips. ``detected``: metric -> entry of a result, and what holds detections against the
+    truth."""
 
-    distributions: sets.SetComparison | None
-    videos: sets.SetComparison | None
-    dinov2: sets.EmbeddingScores | None
-    clip: sets.EmbeddingScores | None
+    comparisons: Mapping[str, sets.SetComparison]
     video_features: sets.VideoFeatures | None
-    detections: Detections
+    detected: Mapping[str, tuple[str, BoxDetections | LaneDetections]]
 
     def add_to(self, results: Rows, trajectories: Sequence[ScoredTrajectory], reference: Reference, out: Path) -> None:
         """Add to the results what compares whole sets of views."""
@@ -57,39 +51,44 @@ class SetScores:
                 bar.advance(len(rows))
 
     def _add(self, trajectory: ScoredTrajectory, rows: Rows, reference: Reference, out: Path) -> None:
-        counted = trajectory.counted(reference.held_out)
-        if self.distributions is not None:
-            _add_named(rows, "distribution", self.distributions.of(_sets_of(trajectory, reference, out, counted)))
-        every = _sets_of(trajectory, reference, out, range(len(trajectory.views)))
-        if self.videos is not None:
-            _add_named(rows, "video", self.videos.of(every))
-        for name, embedded in (("dinov2", self.dinov2), ("clip", self.clip)):
-            if embedded is not None:
-                _add_named(rows, name, embedded.of(every, counted, trajectory.views))
+        counted, every = trajectory.counted(reference.held_out), range(len(trajectory.views))
+        for name, comparison in self.comparisons.items():
+            images = _sets_of(trajectory, reference, out, counted if name == "distributions" else every)
+            of_video = () if name in ENTRIES else (counted, trajectory.views)
+            _add_named(rows, ENTRIES.get(name, name), comparison.of(images, *of_video))
         if self.video_features is not None:
             methods = [row["method"] for row in rows]
             _add_named(rows, "video_features", self.video_features.of(trajectory.name, trajectory.camera, methods))
-        _add_detections(rows, self.detections, trajectory, counted, reference)
+        for metric, (entry, source) in self.detected.items():
+            _add_detected(rows, metric, entry, source, trajectory, counted, reference)
 
     def records(self) -> dict[str, Any]:
         """How the numbers were made, by entry of metrics.json."""
-        names = ("distributions", "videos", "dinov2", "clip", "video_features")
-        sources = {name: getattr(self, name) for name in names}
-        found = {name: source.record() for name, source in sources.items() if source is not None}
-        return {**found, **({"detections": made} if (made := self.detections.record()) else {})}
+        found = {name: comparison.record() for name, comparison in self.comparisons.items()}
+        if self.video_features is not None:
+            found["video_features"] = self.video_features.record()
+        if self.detected:
+            found["detections"] = {metric: source.record() for metric, (_, source) in self.detected.items()}
+        return found
 
 
 def set_scores_of(config: ScoreConfig, scene: Scene, out: Path) -> SetScores:
     """What the given weights and files allow to compute. InputError: a file is missing, damaged, or holds another
-    network."""
-    return SetScores(
-        sets.distributions_of(config, scene, out) if config.fid_weights else None,
-        sets.videos_of(config, scene, out) if config.fvd_weights else None,
-        sets.dino_of(config, scene, out) if config.dino_weights else None,
-        sets.clip_of(config, scene, out) if config.clip_weights else None,
-        sets.VideoFeatures(Path(config.video_features)) if config.video_features else None,
-        detections_of(config, scene),
-    )
+    network, or the log has no lane lines."""
+    makers = {
+        "distributions": (config.fid_weights, sets.distributions_of),
+        "videos": (config.fvd_weights, sets.videos_of),
+        "dinov2": (config.dino_weights, sets.dino_of),
+        "clip": (config.clip_weights, sets.clip_of),
+    }
+    comparisons = {name: make(config, scene, out) for name, (weights, make) in makers.items() if weights}
+    features = sets.VideoFeatures(Path(config.video_features)) if config.video_features else None
+    detected: dict[str, tuple[str, BoxDetections | LaneDetections]] = {}
+    if config.detections:
+        detected["nta_iou"] = ("nta", BoxDetections(scene, Path(config.detections), config.as_published))
+    if config.lanes:
+        detected["ntl_iou"] = ("ntl", LaneDetections(scene, Path(config.lanes)))
+    return SetScores(comparisons, features, detected)
 
 
 def anchors_of(results: Rows, trajectories: Sequence[ScoredTrajectory], reference: Reference) -> list[dict[str, Any]]:
@@ -147,15 +146,21 @@ def _add_named(rows: Rows, entry: str, found: Mapping[str, dict[str, Any] | str]
     """Values of several metrics by method, and what stands beside them, into the results of one trajectory."""
     for row in rows:
         of = found[row["method"]]
-        row["values"] |= dict(of["values"]) if not isinstance(of, str) else dict.fromkeys(OF_ENTRY[entry], of)
+        row["values"] |= dict(of["values"]) if not isinstance(of, str) else dict.fromkeys(SET_SIZES[entry], of)
         if not isinstance(of, str) and "n" in of:
             row[entry] = {name: value for name, value in of.items() if name != "values"}
 
 
-def _add_detections(
-    rows: Rows, found: Detections, trajectory: ScoredTrajectory, counted: Sequence[int], reference: Reference
+def _add_detected(
+    rows: Rows,
+    metric: str,
+    entry: str,
+    source: BoxDetections | LaneDetections,
+    trajectory: ScoredTrajectory,
+    counted: Sequence[int],
+    reference: Reference,
 ) -> None:
-    """NTA-IoU and NTL-IoU into the results of one trajectory, with their anchors."""
+    """NTA-IoU or NTL-IoU into the results of one trajectory, with its anchors."""
     views = tuple(trajectory.views[n] for n in counted)
     frames = reference.facts.frames_of(trajectory.camera)
     recorded = f"{detections.RECORDED}/{trajectory.camera}"
@@ -163,16 +168,15 @@ def _add_detections(
         "truth": ViewImages(f"{detections.TRUTH}/{trajectory.name}", tuple(counted), views),
         "recorded": ViewImages(recorded, tuple(range(len(frames))), tuple(frame.view for frame in frames)),
     }
-    for metric, (entry, of) in found.rows.items():
-        beside = {name: value["value"] for name, images in there.items() if not isinstance(value := of(images), str)}
-        for row in rows:
-            indices = trajectory.indices.get(row["method"], tuple(range(len(trajectory.views))))
-            images = ViewImages(f"{row['method']}/{trajectory.name}", tuple(indices[n] for n in counted), views)
-            value = of(images)
-            row["values"][metric] = value if isinstance(value, str) else value["value"]
-            row.setdefault("anchors", {})[metric] = beside
-            if isinstance(value, str):
-                continue
-            row[entry] = {k: v for k, v in value.items() if k != "value"}
-            if found.lanes is not None and entry == "ntl":
-                row[entry]["against_detector"] = found.lanes.against(images, there["truth"])
+    beside = {name: value["value"] for name, images in there.items() if not isinstance(value := source.of(images), str)}
+    for row in rows:
+        indices = trajectory.indices.get(row["method"], tuple(range(len(trajectory.views))))
+        images = ViewImages(f"{row['method']}/{trajectory.name}", tuple(indices[n] for n in counted), views)
+        value = source.of(images)
+        row["values"][metric] = value if isinstance(value, str) else value["value"]
+        row.setdefault("anchors", {})[metric] = beside
+        if isinstance(value, str):
+            continue
+        row[entry] = {k: v for k, v in value.items() if k != "value"}
+        if isinstance(source, LaneDetections):
+            row[entry]["against_detector"] = source.against(images, there["truth"])

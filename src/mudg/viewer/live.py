@@ -23,7 +23,17 @@ from mudg.base.types import Camera, FusedCloud, Scene, View
 from mudg.core.pictures import class_colors, depth_colors, to_bytes
 from mudg.core.table import Table
 from mudg.diffusion.inputs import InWeather
-from mudg.editing.apply import FACT, Drawer, EditedDrive, carry_out, in_weather, left_behind, street_left, weather_of
+from mudg.editing.apply import (
+    FACT,
+    Drawer,
+    EditedDrive,
+    carry_out,
+    drawer,
+    in_weather,
+    left_behind,
+    street_left,
+    weather_of,
+)
 from mudg.editing.harmonised import RenderMixer
 from mudg.editing.model import motion_of
 from mudg.editing.plan import EditPlan
@@ -32,7 +42,6 @@ from mudg.editing.script import EditScript, conditions_of, parse_edits, read_edi
 from mudg.formats.exporters.video import mp4_bytes
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import RigidNode, SkyNode
-from mudg.gaussians.rendering import raster_of, render_view
 from mudg.viewer.page import begin_of, key_rows
 from mudg.viewer.report import FAR_M, NEAR_M
 
@@ -273,11 +282,6 @@ def over_ground(model: SceneModel) -> SceneModel:
     return replace(model, sky=SkyNode(Table({"panorama": panorama})))
 
 
-def _drawer_of(model: SceneModel) -> Drawer:
-    raster = raster_of(model)
-    return lambda view: render_view(model, view, raster)
-
-
 class FrameSource:
     """Draws frames of one or two fitted scenes, one at a time. ``edited``: the scenes with a script carried out; "" =
     as they are. ``scene``: the log; its recorded views tell the light of the drive, where a script asks for other
@@ -349,14 +353,14 @@ class FrameSource:
             model = self._models[index]
             gone = [name for name in request.hidden if name in model.node_names()]
             seen = model if request.camera else over_ground(model)
-            draw = _drawer_of(seen.without_nodes(gone) if gone else seen)
+            draw = drawer(seen.without_nodes(gone) if gone else seen)
             if self._mixers and request.layer != "class" and not gone and not request.edits.strip():
                 return lambda view: self._mixers[index](view, draw(view))
             conditions = conditions_of(model.facts.get(FACT, {}).get("script", ()))
             if conditions is None or request.layer != "color":
                 return draw
             if index not in self._weather:
-                self._weather[index] = weather_of(_drawer_of(model), conditions, self._scene)
+                self._weather[index] = weather_of(drawer(model), conditions, self._scene)
             return in_weather(draw, self._weather[index])
 
     def _picture(self, request: Wanted, draw: Drawer, camera: Camera, moment: Moment) -> NDArray[np.uint8]:
