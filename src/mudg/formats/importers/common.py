@@ -589,29 +589,42 @@ def first_file(*candidates: Path) -> Path | None:
     return next((path for path in candidates if path.is_file()), None)
 
 
-def require_folder(source: Path, dataset: str) -> None:
-    """Refuse what is no folder."""
-    if not source.is_dir():
-        raise InputError(f"{dataset} folder does not exist", where=str(source), expected="a folder")
-
-
 def folder_contents(folder: Path) -> str:
     """The first names in a folder, for messages."""
+    if not folder.is_dir():
+        return "no such folder"
     return ", ".join(sorted(path.name for path in folder.iterdir())[:12]) or "an empty folder"
 
 
-def the_only(matching: Sequence[Item], names: Sequence[str], options: ImportOptions, where: Path, kind: str) -> Item:
-    """The one log that ``options.sequence`` means. Raises UsageError: none fits, or several do.
+def the_only(
+    found: Mapping[str, Item],
+    options: ImportOptions,
+    folder: Path,
+    kind: str,
+    expected: str,
+    fits: Callable[[str], bool] | None = None,
+) -> Item:
+    """The one log that ``options.sequence`` means.
 
-    ``matching``: logs that fit it; all of them where none was chosen. ``names``: of all logs in the folder ``where``,
-    for the message. ``kind``: what one is called: log, scene, drive, sequence.
+    Args:
+        found: name -> log, in the order in which messages list them.
+        kind: data set, and what one of its logs is called, as in "PandaSet sequence".
+        expected: what ``folder`` should hold, for the message if nothing is found.
+        fits: whether a name is meant; None = if it is the same.
+
+    Raises:
+        InputError: nothing is found. UsageError: several logs, or none fits.
     """
+    if not found:
+        raise InputError(f"no {kind} found", where=str(folder), expected=expected, got=folder_contents(folder))
+    wanted, names = options.sequence, list(found)
+    matching = [name for name in names if not wanted or (fits(name) if fits else name == wanted)]
     if len(matching) == 1:
-        return matching[0]
+        return found[matching[0]]
     listed = ", ".join(names[:12]) + (f", ... ({len(names)} in all)" if len(names) > 12 else "")
+    kind = kind.rpartition(" ")[2]
     what = f"the folder holds several {kind}s" if matching else f"there is no such {kind}"
-    expected = f"--sequence with one of {listed}"
-    raise UsageError(what, where=str(where), expected=expected, got=options.sequence or "none chosen")
+    raise UsageError(what, where=str(folder), expected=f"--sequence with one of {listed}", got=wanted or "none chosen")
 
 
 def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: str, usual: Sequence[str]) -> list[str]:
