@@ -87,24 +87,17 @@ def import_argoverse2(source: Path, out: Path, options: ImportOptions) -> Scene:
     return drive_log.write_log(read_log(folder, options), out, options)
 
 
-def _logs(source: Path) -> list[Path]:
-    """Log folders: ``source`` itself, or its sub-folders."""
-    if not source.is_dir():
-        return []
-    if (source / "city_SE3_egovehicle.feather").is_file():
-        return [source]
-    return sorted(path.parent for path in source.glob("*/city_SE3_egovehicle.feather"))
+def _logs(source: Path) -> dict[str, Path]:
+    """Log folders by name: ``source`` itself, or its sub-folders."""
+    here = (source / "city_SE3_egovehicle.feather").is_file()
+    folders = [source] if here else sorted(path.parent for path in source.glob("*/city_SE3_egovehicle.feather"))
+    return {folder.resolve().name: folder for folder in folders}
 
 
 def _choose_log(source: Path, options: ImportOptions) -> Path:
-    common.require_folder(source, "Argoverse 2")
-    logs, got = _logs(source), common.folder_contents(source)
-    if not logs:
-        expected = "city_SE3_egovehicle.feather, calibration and sensors, here or in sub-folders"
-        remedy = "give the folder of one log of the sensor data set"
-        raise InputError("no Argoverse 2 log found", where=str(source), got=got, expected=expected, remedy=remedy)
-    matching = [path for path in logs if path.resolve().name.startswith(options.sequence)]
-    return common.the_only(matching, [path.name for path in logs], options, source, "log")
+    expected = "city_SE3_egovehicle.feather, calibration and sensors, here or in sub-folders"
+    begins = lambda name: name.startswith(options.sequence)
+    return common.the_only(_logs(source), options, source, "Argoverse 2 log", expected, begins)
 
 
 def files_of_argoverse2(source: Path, options: ImportOptions) -> LogFiles:

@@ -1,7 +1,5 @@
-"""What importers share: work over items in parallel, units of time, poses that must be rigid, and the vehicle's path.
-
-The scene is the same for any number of workers: frames and sweeps are ordered by time when all are there.
-"""
+"""What importers share: work over items in parallel, units of time, poses that must be rigid, the vehicle's path, and
+finding the files of a log. The scene is the same for any number of workers."""
 
 from __future__ import annotations
 
@@ -41,7 +39,7 @@ def name_table(text: str) -> dict[str, str]:
     return {name.strip(): here.strip() for here, names in rows for name in names.split(",")}
 
 
-# columns ------------------------------------------------------------------------------------------
+# --- columns --------------------------------------------------------------------------------------
 Columns = Mapping[str, NDArray[Any]]
 _ROUNDING: Final = 1e-3
 
@@ -74,8 +72,8 @@ def finite_columns(columns: Columns, names: Sequence[str], where: object) -> NDA
 
 
 def unit_intensity(values: NDArray[Any], largest: float, where: object, remedy: str = "") -> NDArray[np.float32]:
-    """Intensities of a cloud, from 0 to the ``largest`` that its format has, as f32 from 0 to 1; rounding beyond that
-    is taken off. Raises InputError: other values, which would all become 0 or 1, or some that are not finite."""
+    """Intensities from 0 to the ``largest`` of their format as f32 from 0 to 1. Raises InputError: others, beyond
+    rounding."""
     scaled = values.astype(np.float64) / largest
     if not ((scaled > -_ROUNDING) & (scaled < 1 + _ROUNDING)).all():
         what, got = "intensity is out of range", f"{values.min():g} to {values.max():g}"
@@ -101,11 +99,8 @@ def record_fields(what: str, where: object, expected: str) -> Iterator[None]:
 
 @contextmanager
 def arrow_files(path: Path) -> Iterator[None]:
-    """Code that reads a Feather or Parquet file with pyarrow.
-
-    Raises:
-        ResourceError: pyarrow is not installed. InputError: the file is damaged or cut off.
-    """
+    """Code that reads a Feather or Parquet file with pyarrow. ResourceError: it is not installed. InputError: the file
+    is damaged or cut off."""
     try:
         import pyarrow
     except ImportError as error:
@@ -118,7 +113,7 @@ def arrow_files(path: Path) -> Iterator[None]:
         raise InputError(what, where=str(path), remedy=remedy, got=str(error)[:200] or "it ends early") from error
 
 
-# options ------------------------------------------------------------------------------------------
+# --- options --------------------------------------------------------------------------------------
 Resolution = int | tuple[int, int]
 """Longest side in pixels, or width and height."""
 
@@ -187,7 +182,7 @@ def holdout_split(frame_ids_by_time: list[list[str]], test_every: int) -> dict[s
     }
 
 
-# common -------------------------------------------------------------------------------------------
+# --- limits ---------------------------------------------------------------------------------------
 Item = TypeVar("Item")
 Matrix = NDArray[np.float64]
 TimeUnit = Literal["ns", "us", "ms", "s"]
@@ -225,14 +220,14 @@ def for_each(
     """Do ``work`` on every item with a progress bar; at most two items per worker are in memory.
 
     Args:
-        items: read lazily, by the calling thread: a generator over the records of a large file is fine.
-        work: called once per item, from several threads if ``workers`` > 1.
+        items: read lazily, by the calling thread.
+        work: called from several threads if ``workers`` > 1.
         total: number of items; None = ``len(items)``, or unknown for a generator.
-        workers: threads; 1 = no threads, 0 = as many as there are processors to use.
+        workers: threads; 0 = as many as there are processors to use.
         name: what an item is called, put before the place of an error.
 
-    Returns the number of items. Raises the error of the earliest failed item, its ``where`` completed by the item's
-    name. No item is started after one failed; those under way are waited for.
+    Returns the number of items. Raises the error of the earliest failed item. No item is started after one failed;
+    those under way are waited for.
     """
     if total is None:
         total = len(items) if isinstance(items, Sequence) else 0
@@ -287,9 +282,8 @@ def _named(work: Callable[[Item], None], item: Item, name: Callable[[Item], str]
 
 
 def seconds(times: Sequence[int] | Sequence[float] | NDArray, unit: TimeUnit, where: str, start: float = 0) -> Matrix:
-    """Times of one sensor's records as seconds f64[N] since ``start`` (same unit). Integers are subtracted before they
-    become floats, so nanoseconds of the epoch keep their digits. Raises InputError: not increasing, not finite, or so
-    close or far apart that the unit is wrong."""
+    """Times of one sensor's records as seconds f64[N] since ``start`` (same unit); nanoseconds of the epoch keep their
+    digits. Raises InputError: not increasing, not finite, or so close or far apart that the unit is wrong."""
     numbers = np.asarray(times)
     if numbers.dtype.kind not in "iuf" or numbers.ndim != 1 or not np.isfinite(numbers.astype(np.float64)).all():
         raise InputError("timestamps are not a list of finite numbers", where=where, got=str(numbers)[:80])
@@ -336,7 +330,7 @@ def nearest_index(sorted_times_s: NDArray[Any], times_s: NDArray[Any]) -> NDArra
 
 def rigid_pose(matrix: ArrayLike, where: str) -> Matrix:
     """A pose from a file, [3, 4] or [4, 4], as f64[4, 4]; rounding up to 1e-3 in the rotation is cleaned. Raises
-    InputError: scaled (the factor is told), left-handed, not a rotation, or not finite."""
+    InputError: scaled, left-handed, not a rotation, or not finite."""
     numbers = np.asarray(matrix, np.float64)
     if numbers.shape not in ((3, 4), (4, 4)):
         raise InputError("pose has the wrong shape", where=where, expected="3x4 or 4x4 numbers", got=str(numbers.shape))
@@ -368,8 +362,8 @@ def rigid_rotation(matrix: NDArray[np.float64], where: str) -> Matrix:
 
 
 def pose_from_quaternion(wxyz: ArrayLike, xyz_m: ArrayLike, where: str) -> Matrix:
-    """Pose f64[4, 4] from a unit quaternion (w, x, y, z) and a translation in metres. Raises InputError: not finite,
-    wrong count, or a quaternion whose length is not 1 within 1 %."""
+    """Pose f64[4, 4] from a unit quaternion (w, x, y, z) and metres. Raises InputError: not finite, wrong count, or a
+    quaternion whose length is not 1 within 1 %."""
     q, t = np.asarray(wxyz, np.float64).reshape(-1), np.asarray(xyz_m, np.float64).reshape(-1)
     if q.shape != (4,) or t.shape != (3,) or not np.isfinite(q).all() or not np.isfinite(t).all():
         what = "pose is not a quaternion and a translation"
@@ -385,8 +379,7 @@ def pose_near(
     ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATION_S, where: str = "ego path"
 ) -> Matrix:
     """Ego pose at a time; a little outside the path it goes on as it did between its two nearest keys. Raises
-    InputError: more than ``max_beyond_s`` outside, or in a gap of the path where the pose would be a guess
-    (``motion.gap_at``)."""
+    InputError: more than ``max_beyond_s`` outside, or in a gap of the path (``motion.gap_at``)."""
     inside = pose_at(ego.times_s, ego.world_from_ego, time_s)
     if inside is not None:
         gap = motion.gap_at(ego, time_s)
@@ -496,11 +489,9 @@ def check_motion(ego: EgoPath, where: str) -> None:
 def deskew(
     xyz: NDArray[np.float32], dt_s: NDArray[np.float32], world_from_lidar: Callable[[float], Matrix], time_s: float
 ) -> NDArray[np.float32]:
-    """Bring points that were measured while the sensor moved to one moment, ``time_s``.
-
-    ``xyz``: f32[N, 3] metres, each in the sensor's frame at its own time, which is ``dt_s`` f32[N] later.
-    ``world_from_lidar``: the sensor's pose f64[4, 4] at a time; asked at 33 moments, between which points are blended.
-    """
+    """Bring points that were measured while the sensor moved to one moment, ``time_s``: ``xyz`` f32[N, 3] metres, each
+    in the sensor's frame at its own time, ``dt_s`` f32[N] later. ``world_from_lidar``: the sensor's pose f64[4, 4] at a
+    time; asked at 33 moments, between which points are blended."""
     if len(xyz) == 0 or not dt_s.any():
         return xyz
     low, high = float(dt_s.min()), float(dt_s.max())
@@ -514,9 +505,8 @@ def deskew(
 def blend_motion(
     points: NDArray[np.floating], corrections: Sequence[Matrix], place: NDArray[np.floating]
 ) -> NDArray[Any]:
-    """Move each of the points [N, 3] by what lies between two of many corrections, blended linearly. ``points``:
-    metres; computed in their type. ``corrections``: f64[4, 4] each, at least two. ``place``: [N] number of the
-    correction, with its fraction: 2.5 is halfway between the third and the fourth."""
+    """Move each of the points [N, 3] by what lies between two of many ``corrections`` f64[4, 4], blended linearly, in
+    the points' type. ``place``: [N] number of the correction; 2.5 is halfway between the third and the fourth."""
     step = np.clip(place.astype(int), 0, len(corrections) - 2)
     out = np.empty_like(points)
     for index in range(len(corrections) - 1):
@@ -552,9 +542,8 @@ def numbered_files(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
 
 
 def complete_frames(streams: Mapping[str, Iterable[int]], options: ImportOptions, where: str, title: str) -> list[int]:
-    """Frame numbers to import: those that every stream (name of a camera or LiDAR -> its frame numbers) has, within
-    ``options.frames``. Raises InputError: a stream lacks frames that others have (unless ``skip_missing``), or nothing
-    is left."""
+    """Frame numbers within ``options.frames`` that every stream (camera or LiDAR -> its numbers) has. Raises
+    InputError: a stream lacks frames that others have (unless ``skip_missing``), or nothing is left."""
     numbers = {name: set(found) for name, found in streams.items()}
     everything = set().union(*numbers.values())
     if options.frames is not None:
@@ -589,35 +578,48 @@ def first_file(*candidates: Path) -> Path | None:
     return next((path for path in candidates if path.is_file()), None)
 
 
-def require_folder(source: Path, dataset: str) -> None:
-    """Refuse what is no folder."""
-    if not source.is_dir():
-        raise InputError(f"{dataset} folder does not exist", where=str(source), expected="a folder")
-
-
 def folder_contents(folder: Path) -> str:
     """The first names in a folder, for messages."""
+    if not folder.is_dir():
+        return "no such folder"
     return ", ".join(sorted(path.name for path in folder.iterdir())[:12]) or "an empty folder"
 
 
-def the_only(matching: Sequence[Item], names: Sequence[str], options: ImportOptions, where: Path, kind: str) -> Item:
-    """The one log that ``options.sequence`` means. Raises UsageError: none fits, or several do.
+def the_only(
+    found: Mapping[str, Item],
+    options: ImportOptions,
+    folder: Path,
+    kind: str,
+    expected: str,
+    fits: Callable[[str], bool] | None = None,
+) -> Item:
+    """The one log that ``options.sequence`` means.
 
-    ``matching``: logs that fit it; all of them where none was chosen. ``names``: of all logs in the folder ``where``,
-    for the message. ``kind``: what one is called: log, scene, drive, sequence.
+    Args:
+        found: name -> log, in the order in which messages list them.
+        kind: data set, and what one of its logs is called, as in "PandaSet sequence".
+        expected: what ``folder`` should hold, for the message if nothing is found.
+        fits: whether a name is meant; None = if it is the same.
+
+    Raises:
+        InputError: nothing is found. UsageError: several logs, or none fits.
     """
+    if not found:
+        raise InputError(f"no {kind} found", where=str(folder), expected=expected, got=folder_contents(folder))
+    wanted, names = options.sequence, list(found)
+    matching = [name for name in names if not wanted or (fits(name) if fits else name == wanted)]
     if len(matching) == 1:
-        return matching[0]
+        return found[matching[0]]
     listed = ", ".join(names[:12]) + (f", ... ({len(names)} in all)" if len(names) > 12 else "")
+    kind = kind.rpartition(" ")[2]
     what = f"the folder holds several {kind}s" if matching else f"there is no such {kind}"
-    expected = f"--sequence with one of {listed}"
-    raise UsageError(what, where=str(where), expected=expected, got=options.sequence or "none chosen")
+    raise UsageError(what, where=str(folder), expected=f"--sequence with one of {listed}", got=wanted or "none chosen")
 
 
 def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: str, usual: Sequence[str]) -> list[str]:
     """The data set's names of the cameras to import, in the order of ``available``: the data set's name -> the name in
-    the scene, either of which may be asked for. ``usual``: the data set's names taken when none is asked for; those
-    that are not there are left out. Raises UsageError: no such camera. InputError: none of the usual ones is there."""
+    the scene, either of which may be asked for. ``usual``: those taken when none is asked for. Raises UsageError: no
+    such camera. InputError: none of the usual ones is there."""
     by_scene_name = {ours: theirs for theirs, ours in available.items()}
     listed = ", ".join(o if o == t else f"{o} ({t})" for t, o in available.items()) or "no cameras"
     if not options.cameras:

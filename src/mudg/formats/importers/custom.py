@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import io
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, NamedTuple
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,11 +30,6 @@ from mudg.scene import schema
 from mudg.scene.check import Finding
 from mudg.scene.read import decode_image
 
-# schema -------------------------------------------------------------------------------------------
-#
-# ``log.json``, the index of a log in the neutral layout, as checked records. The layout is docs/custom_format.md. As in
-# ``scene/schema.py``, the parser takes ``complain``: the importer raises at the first problem, ``mudg doctor`` collects
-# all.
 Matrix = NDArray[np.float64]
 INDEX: Final = "log.json"
 FORMAT: Final = "mudg-log"
@@ -43,7 +38,7 @@ LENSES: Final = {"brown_conrady": (brown_conrady, (4, 5, 8)), "equidistant": (eq
 """Distortion models and how many coefficients they take."""
 
 
-# --- what log.json may hold -----------------------------------------------------------------------
+# --- what log.json may hold (docs/custom_format.md) -----------------------------------------------
 
 
 class QuaternionEntry(StrictRecord):
@@ -199,18 +194,10 @@ class LogItem:
     world_from_sensor: Matrix | None = None
 
 
-class LogClock(NamedTuple):
-    """Where seconds count from: the first vehicle pose, in the log's own unit, ``units_per_s`` units per second."""
-
-    unit: common.TimeUnit
-    start: float
-    units_per_s: int
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class CustomLog:
-    """A parsed ``log.json``. Seconds count from the first vehicle pose; the world's origin is that pose's place:
-    ``origin_m`` f64[3] was taken from every position. Images and sweeps are in time order per sensor."""
+    """A parsed ``log.json``. Seconds count from the first vehicle pose, which is at ``start`` in the log's own unit;
+    that pose's place is the world's origin. Images and sweeps are in time order per sensor."""
 
     root: Path
     name: str
@@ -221,8 +208,8 @@ class CustomLog:
     images: tuple[LogItem, ...]
     sweeps: tuple[LogItem, ...]
     tracks: tuple[Track, ...]
-    clock: LogClock
-    origin_m: NDArray[np.float64]
+    start: float
+    units_per_s: int
 
 
 # --- parsing --------------------------------------------------------------------------------------
@@ -231,12 +218,20 @@ class CustomLog:
 def read_log(root: Path, complain: schema.Complain = schema.raise_first) -> CustomLog:
     """Parse ``root/log.json``.
 
+    Args:
+        complain: called with each problem, as in ``scene/schema.py``; a record with a problem is left out.
+
     Raises:
-        InputError: the frame of the file or the vehicle's path is wrong, or ``complain`` raised. ``complain``: called
-            with each problem; a record with a problem is left out.
+        InputError: the frame of the file or the vehicle's path is wrong, or ``complain`` raised.
     """
     where = str(root / INDEX)
-    top = _parse_index(schema.parse_object(store.read_bytes(root / INDEX), where), where)
+    value = schema.parse_object(store.read_bytes(root / INDEX), where)
+    stated = value.get("format"), value.get("version")
+    if stated != (FORMAT, VERSION):
+        what = "this is not the index of a log in the neutral layout"
+        expected = f'"format": "{FORMAT}", "version": {VERSION}'
+        raise InputError(what, where=where, expected=expected, got=f"{stated[0]!r}, {stated[1]!r}"[:80])
+    top = parse_record(LogIndex, value, f"{where}: ")
     cameras = schema.parse_table(top.cameras, f"{where}: cameras", _parse_camera, complain)
     lidars = schema.parse_table(top.lidars, f"{where}: lidars", _parse_lidar, complain)
     if not cameras:
@@ -244,34 +239,77 @@ def read_log(root: Path, complain: schema.Complain = schema.raise_first) -> Cust
         complain(InputError("the log has no cameras", where=f"{where}: cameras", expected=expected))
     if not top.ego:
         raise InputError("the log has no vehicle poses", where=f"{where}: ego", expected="at least one")
-    entry = partial(parse_record, EgoPoseEntry)
-    path = schema.parse_each(top.ego, f"{where}: ego", entry, schema.raise_first)
-    clock = LogClock(top.time_unit, path[0].time, common.UNITS_PER_SECOND[top.time_unit])
-    poses = np.stack([entry.world_from_ego for entry in path])
-    origin_m = poses[0, :3, 3].copy()
-    poses[:, :3, 3] -= origin_m
-    ego = EgoPath(common.seconds([entry.time for entry in path], clock.unit, f"{where}: ego", clock.start), poses)
-    reader = _LogReader(where, clock, origin_m, complain)
-    images = reader.items("images", top.images, LogImageEntry, top.cameras, cameras)
-    sweeps = reader.items("sweeps", top.sweeps, LogCloudEntry, top.lidars, lidars)
-    tracks = reader.tracks(top.tracks)
+    path = schema.parse_each(top.ego, f"{where}: ego", partial(parse_record, EgoPoseEntry), schema.raise_first)
+    origin_m = np.array(path[0].world_from_ego)[:3, 3]
+
+    def seconds(records: Iterable[Any], where: str) -> NDArray[np.float64]:
+        """Times of one sensor's records since the first vehicle pose."""
+        return common.seconds([record.time for record in records], top.time_unit, where, path[0].time)
+
+    def in_scene(pose: Any) -> Matrix:
+        """A pose in the log's world, moved to the scene's."""
+        moved = np.array(pose)
+        moved[:3, 3] -= origin_m
+        return moved
+
+    def items(name: str, key: str, entry_type: type[LogImageEntry | LogCloudEntry], usable: Mapping[str, Any]) -> Any:
+        """``images`` or ``sweeps`` in time order per sensor; a sensor whose times are wrong is complained about and
+        left out."""
+        declared = getattr(top, f"{key}s")
+
+        def parse(value: object, where: str) -> Any:
+            entry = parse_record(entry_type, value, where)
+            sensor = getattr(entry, key)
+            if sensor not in declared:
+                what, expected = f"record names a {key} that the log does not have", ", ".join(declared)
+                expected = expected or f"an entry in {key}s"
+                raise InputError(what, where=place(where, key), expected=expected, got=sensor[:80])
+            return entry
+
+        entries = schema.parse_each(getattr(top, name), f"{where}: {name}", parse, complain)
+        records: list[LogItem] = []
+        for sensor, parsed in usable.items():
+            own, here = [entry for entry in entries if getattr(entry, key) == sensor], f"{where}: {name} of {sensor}"
+            if not own:
+                remedy = f"add them, or remove {sensor}"
+                complain(InputError(f"{sensor} has no {name}", where=here, remedy=remedy))
+                continue
+            try:
+                times = seconds(own, here).tolist()
+            except InputError as problem:
+                complain(problem)
+                continue
+            mounted = np.asarray(parsed.ego_from_sensor)
+            for entry, time_s in zip(own, times, strict=True):
+                pose = getattr(entry, "world_from_camera", None)
+                placed = None if pose is None else in_scene(pose)
+                records.append(
+                    LogItem("image" if key == "camera" else "cloud", sensor, mounted, time_s, Ref(entry.file), placed)
+                )
+        return tuple(records)
+
+    def parse_track(value: object, where: str) -> Track:
+        entry = parse_record(LogTrackEntry, value, where)
+        times_s = seconds(entry.boxes, place(where, "boxes"))
+        poses = [in_scene(box.world_from_object) for box in entry.boxes]
+        with named_by(where):
+            return Track(entry.id, entry.label, np.array(entry.size_m), times_s, np.reshape(poses, (-1, 4, 4)))
+
+    poses = np.stack([in_scene(entry.world_from_ego) for entry in path])
+    ego = EgoPath(seconds(path, f"{where}: ego"), poses)
+    images = items("images", "camera", LogImageEntry, cameras)
+    sweeps = items("sweeps", "lidar", LogCloudEntry, lidars)
+    tracks = schema.parse_each(top.tracks, f"{where}: tracks", parse_track, complain)
+    for twice in schema.repeated(track.id for track in tracks):
+        complain(InputError("two tracks have one id", where=f"{where}: tracks", got=twice))
     notes = ["read from the neutral layout"]
     if np.abs(origin_m).max() > 0:
         coordinates = ", ".join(f"{value:.3f}" for value in origin_m)
         notes.append(f"world origin moved to the first vehicle position, ({coordinates}) in the log")
     source = Source(top.dataset, top.licence, None, tuple(notes))
-    return CustomLog(
-        root, top.name, source, cameras, lidars, ego, tuple(images), tuple(sweeps), tuple(tracks), clock, origin_m
-    )
-
-
-def _parse_index(value: dict[str, Any], where: str) -> LogIndex:
-    found = value.get("format"), value.get("version")
-    if found != (FORMAT, VERSION):
-        what = "this is not the index of a log in the neutral layout"
-        expected = f'"format": "{FORMAT}", "version": {VERSION}'
-        raise InputError(what, where=where, expected=expected, got=f"{found[0]!r}, {found[1]!r}"[:80])
-    return parse_record(LogIndex, value, f"{where}: ")
+    units_per_s = common.UNITS_PER_SECOND[top.time_unit]
+    parts = cameras, lidars, ego, images, sweeps, tuple(tracks), path[0].time, units_per_s
+    return CustomLog(root, top.name, source, *parts)
 
 
 def _parse_camera(name: str, value: object, where: str) -> LogCamera:
@@ -284,18 +322,15 @@ def _parse_camera(name: str, value: object, where: str) -> LogCamera:
     plain = {key: getattr(entry, key) for key in ("width", "height", "fx", "fy", "readout_s", "shutter")}
     middle = {key: getattr(entry, key) + 0.5 - entry.pixel_centre for key in ("cx", "cy")}
     camera = schema.parse_camera(name, {**plain, **middle, "distortion": coefficients}, where)
-    return LogCamera(camera, _lens(entry.distortion, place(where, "distortion")), np.asarray(entry.ego_from_camera))
-
-
-def _lens(entry: DistortionEntry | None, where: str) -> Lens | None:
-    if entry is None:
-        return None
-    make, counts = LENSES[entry.model]
-    if len(entry.coefficients) not in counts:
-        expected, got = " or ".join(str(count) for count in counts), str(len(entry.coefficients))
-        what = "distortion model takes another number of coefficients"
-        raise InputError(what, where=place(where, "coefficients"), expected=expected, got=got)
-    return make(*entry.coefficients) if any(entry.coefficients) else None
+    lens = None
+    if entry.distortion is not None:
+        make, counts = LENSES[entry.distortion.model]
+        if len(coefficients) not in counts:
+            expected, got = " or ".join(str(count) for count in counts), str(len(coefficients))
+            what, where = "distortion model takes another number of coefficients", place(where, "distortion")
+            raise InputError(what, where=place(where, "coefficients"), expected=expected, got=got)
+        lens = make(*coefficients) if any(coefficients) else None
+    return LogCamera(camera, lens, np.asarray(entry.ego_from_camera))
 
 
 def _parse_lidar(name: str, value: object, where: str) -> LogLidar:
@@ -307,81 +342,7 @@ def _parse_lidar(name: str, value: object, where: str) -> LogLidar:
     return lidar
 
 
-class _LogReader:
-    """Parses records that depend on the log's clock and origin."""
-
-    def __init__(self, where: str, clock: LogClock, origin_m: NDArray[np.float64], complain: schema.Complain) -> None:
-        self.where, self.clock, self.origin_m, self.complain = where, clock, origin_m, complain
-
-    def seconds(self, times: list[Any], where: str) -> NDArray[np.float64]:
-        """Seconds since the start, checked."""
-        return common.seconds(times, self.clock.unit, where, self.clock.start)
-
-    def in_scene(self, pose: Any) -> Matrix:
-        """A pose in the log's world, moved to the scene's."""
-        moved = np.array(pose)
-        moved[:3, 3] -= self.origin_m
-        return moved
-
-    def items(
-        self,
-        kind: str,
-        values: list[Any],
-        entry_type: type[LogImageEntry] | type[LogCloudEntry],
-        declared: Iterable[str],
-        usable: Mapping[str, LogCamera] | Mapping[str, LogLidar],
-    ) -> list[LogItem]:
-        """``images`` or ``sweeps`` in time order per sensor; a sensor whose times are wrong is complained about and
-        left out. ``declared``: names of all sensors of the log; ``usable``: those that were parsed."""
-        names = tuple(declared)
-        key, item_kind = ("camera", "image") if entry_type is LogImageEntry else ("lidar", "cloud")
-
-        def parse(value: object, where: str) -> tuple[str, Any]:
-            entry = parse_record(entry_type, value, where)
-            sensor = getattr(entry, key)
-            if sensor not in names:
-                what, expected = f"record names a {key} that the log does not have", ", ".join(names)
-                expected = expected or f"an entry in {key}s"
-                raise InputError(what, where=place(where, key), expected=expected, got=sensor[:80])
-            return sensor, entry
-
-        entries = schema.parse_each(values, f"{self.where}: {kind}", parse, self.complain)
-        found: list[LogItem] = []
-        for name, parsed in usable.items():
-            own = [entry for sensor, entry in entries if sensor == name]
-            where = f"{self.where}: {kind} of {name}"
-            if not own:
-                self.complain(InputError(f"{name} has no {kind}", where=where, remedy=f"add them, or remove {name}"))
-                continue
-            try:
-                times = self.seconds([entry.time for entry in own], where).tolist()
-            except InputError as problem:
-                self.complain(problem)
-                continue
-            mounted = np.asarray(parsed.ego_from_sensor)
-            for entry, time_s in zip(own, times, strict=True):
-                pose = getattr(entry, "world_from_camera", None)
-                placed = None if pose is None else self.in_scene(pose)
-                found.append(LogItem(item_kind, name, mounted, time_s, Ref(entry.file), placed))
-        return found
-
-    def tracks(self, values: list[Any]) -> list[Track]:
-        """Tracked boxes."""
-
-        def parse(value: object, where: str) -> Track:
-            entry = parse_record(LogTrackEntry, value, where)
-            times_s = self.seconds([box.time for box in entry.boxes], place(where, "boxes"))
-            poses = [self.in_scene(box.world_from_object) for box in entry.boxes]
-            with named_by(where):
-                return Track(entry.id, entry.label, np.array(entry.size_m), times_s, np.reshape(poses, (-1, 4, 4)))
-
-        tracks = schema.parse_each(values, f"{self.where}: tracks", parse, self.complain)
-        for twice in schema.repeated(track.id for track in tracks):
-            self.complain(InputError("two tracks have one id", where=f"{self.where}: tracks", got=twice))
-        return tracks
-
-
-# importer -----------------------------------------------------------------------------------------
+# --- importer -------------------------------------------------------------------------------------
 MAX_ALIKE: Final = 5
 """Findings with the same text that are listed one by one."""
 MAX_DELAY_S: Final = 1.0
@@ -406,13 +367,11 @@ def import_custom(source: Path, out: Path, options: ImportOptions) -> Scene:
             something is missing, malformed or contradictory; nothing is left at ``out``.
     """
     common.refuse_options(options, "neutral-layout", "sequence", "poses", "boxes")
-    read, notes = read_log(source), []
-    read = replace(read, ego=common.mended_path(read.ego, options, notes))
-    content = _chosen(read, options)
+    log_read, notes = read_log(source), []
+    content = _chosen(replace(log_read, ego=common.mended_path(log_read.ego, options, notes)), options)
     fits = {name: fit_images(c.camera, options, c.lens) for name, c in content.cameras.items()}
-    images, sweeps = _numbered(content.images), _numbered(content.sweeps)
     moments = _moments(content.images)
-    as_scene(content, _raise)  # records without a pose are refused before anything is read
+    as_scene(content, schema.raise_first)  # records without a pose are refused before anything is read
 
     def convert(item: Numbered) -> Iterator[SceneImage | SceneSweep]:
         number, record = item
@@ -426,12 +385,9 @@ def import_custom(source: Path, out: Path, options: ImportOptions) -> Scene:
             yield SceneSweep(record.sensor, number, record.time_s, pose_of(content.ego, record), points)
 
     origin = replace(content.source, notes=(*content.source.notes, *notes, *image_notes(fits)))
-    name, items, tracks = content.name, [*images, *sweeps], lambda: (content.tracks, ())
-    return write_scene(SceneContent(name, origin, fits, items, convert, _id_of, content.ego, tracks), out, options)
-
-
-def _raise(problem: MudgError) -> None:
-    raise problem
+    items, tracks = [*_numbered(content.images), *_numbered(content.sweeps)], lambda: (content.tracks, ())
+    whole = SceneContent(content.name, origin, fits, items, convert, _id_of, content.ego, tracks)
+    return write_scene(whole, out, options)
 
 
 def _id_of(item: Numbered) -> str:
@@ -521,19 +477,21 @@ def refuse_grey(path: Path) -> None:
 
 
 def read_sweep(content: CustomLog, sweep: LogItem, options: ImportOptions) -> SweepPoints:
-    """The points of a sweep, motion-compensated to its time.
-
-    Raises:
-        InputError: no points, a field that was declared is not there, intensities above the declared largest one,
-            points that need their times and have none.
-    """
+    """The points of a sweep, motion-compensated to its time. Raises InputError: no points, or they contradict what the
+    log declares of their fields."""
     lidar, path = content.lidars[sweep.sensor], _file(content, sweep)
     cloud = read_cloud(path, known=(lidar.intensity_field, lidar.time_field))
     if len(cloud.xyz) == 0:
         remedy = "export it again, or take the sweep out of log.json"
         raise InputError("cloud has no points", where=str(path), expected="at least one return", remedy=remedy)
     dt_s = _delays(cloud, sweep, content, path)
-    intensity = _intensity(cloud, lidar, sweep.sensor, path)
+    intensity, name = np.zeros(len(cloud.xyz), np.float32), lidar.intensity_field
+    if name:
+        there = f"log.json: lidars.{sweep.sensor}"
+        remedy = f"name the field in {there}.intensity_field; an empty text if there is none"
+        values = np.nan_to_num(_field(cloud, name, "intensity", path, remedy).astype(np.float64))
+        remedy = f"give the largest possible value in {there}.intensity_max (often 255)"
+        intensity = common.unit_intensity(values, lidar.intensity_max, path, remedy)
     points = SweepPoints(cloud.xyz.astype(np.float32), intensity, dt_s, no_returns=cloud.missing)
     if options.untwist == "no" or (options.untwist == "auto" and lidar.motion_compensated):
         return points
@@ -557,35 +515,24 @@ def _field(cloud: Cloud, name: str, what: str, path: Path, remedy: str = "") -> 
     return values
 
 
-def _intensity(cloud: Cloud, lidar: LogLidar, name: str, path: Path) -> NDArray[np.float32]:
-    if not lidar.intensity_field:
-        return np.zeros(len(cloud.xyz), np.float32)
-    remedy = f"name the field in log.json: lidars.{name}.intensity_field; an empty text if there is none"
-    values = _field(cloud, lidar.intensity_field, "intensity", path, remedy)
-    remedy = f"give the largest possible value in log.json: lidars.{name}.intensity_max (often 255)"
-    return common.unit_intensity(np.nan_to_num(values.astype(np.float64)), lidar.intensity_max, path, remedy)
-
-
 def _delays(cloud: Cloud, sweep: LogItem, content: CustomLog, path: Path) -> NDArray[np.float32]:
     """Seconds of each point relative to the sweep's time; 0 where clouds have no times."""
-    lidar, clock = content.lidars[sweep.sensor], content.clock
+    lidar = content.lidars[sweep.sensor]
     if not lidar.time_field or lidar.time_unit is None:
         return np.zeros(len(cloud.xyz), np.float32)
     values, per_second = _field(cloud, lidar.time_field, "times", path), common.UNITS_PER_SECOND[lidar.time_unit]
     if lidar.time_from == "log":
         # whole numbers are subtracted before they are scaled: nanoseconds of the epoch keep their digits
         values = values.astype(np.int64) if values.dtype.kind == "u" else values
-        start = clock.start * per_second
-        start = start // clock.units_per_s if isinstance(start, int) else start / clock.units_per_s
+        start, units_per_s = content.start * per_second, content.units_per_s
+        start = start // units_per_s if isinstance(start, int) else start / units_per_s
         dt_s = (values - np.asarray(start, values.dtype)).astype(np.float64) / per_second - sweep.time_s
     else:
         dt_s = values.astype(np.float64) / per_second
     if not np.isfinite(dt_s).all() or np.abs(dt_s).max() > MAX_DELAY_S:
         expected, got = f"within {MAX_DELAY_S:g} s", f"up to {np.abs(dt_s).max():.3g} s"
-        what, remedy = (
-            "times of points are far from their sweep's",
-            "check time_unit and time_from of the LiDAR in log.json",
-        )
+        what = "times of points are far from their sweep's"
+        remedy = "check time_unit and time_from of the LiDAR in log.json"
         raise InputError(what, where=str(path), expected=expected, got=got, remedy=remedy)
     return dt_s.astype(np.float32)
 
@@ -623,16 +570,22 @@ def check_log(source: Path) -> list[Finding]:
         yield from scene_check.check_points(scene, sweep, points)
 
     with log.task("checking images and sweeps", len(images) + len(sweeps)) as bar:
-        for check in (
-            *map(check_image, scene.frames, images),
-            *map(check_sweep, scene.sweeps, sweeps),
-        ):  # nothing read yet
+        for check in (*map(check_image, scene.frames, images), *map(check_sweep, scene.sweeps, sweeps)):
             findings.extend(scene_check.collected(check, str(source)))
             bar.advance()
-    return scene_check.worst_first(_collapsed(findings))
+    counts: Counter[tuple[scene_check.Level, str]] = Counter()
+    kept = []
+    for finding in findings:
+        kind = finding.level, finding.message.split(";")[0]
+        counts[kind] += 1
+        kept += [finding] if counts[kind] <= MAX_ALIKE else []
+    for (level, message), count in counts.items():
+        if count > MAX_ALIKE:
+            kept.append(Finding(level, "and others", f"{message}: {count - MAX_ALIKE} more"))
+    return scene_check.worst_first(kept)
 
 
-def as_scene(content: CustomLog, complain: Callable[[MudgError], None]) -> tuple[Scene, list[LogItem], list[LogItem]]:
+def as_scene(content: CustomLog, complain: schema.Complain) -> tuple[Scene, list[LogItem], list[LogItem]]:
     """The log as a scene whose references are files of the log: nothing is copied; and the records of its frames and
     sweeps. Records without a pose are complained about and left out. Cameras are as recorded."""
     frames: dict[LogItem, Frame] = {}
@@ -656,20 +609,3 @@ def as_scene(content: CustomLog, complain: Callable[[MudgError], None]) -> tuple
     name, root, tracks, ego = content.name, str(content.root), content.tracks, content.ego
     parts = tuple(frames.values()), tuple(sweeps.values()), tracks, ego, split, content.source
     return Scene(name, root, cameras, *parts), list(frames), list(sweeps)
-
-
-def _collapsed(findings: Iterable[Finding]) -> list[Finding]:
-    """At most ``MAX_ALIKE`` findings of one kind (the same text before the first ``;``), and how many more."""
-    counts: Counter[tuple[scene_check.Level, str]] = Counter()
-    kept = []
-    for finding in findings:
-        kind = (finding.level, finding.message.split(";")[0])
-        counts[kind] += 1
-        if counts[kind] <= MAX_ALIKE:
-            kept.append(finding)
-    more = [
-        Finding(level, "and others", f"{message}: {count - MAX_ALIKE} more")
-        for (level, message), count in counts.items()
-        if count > MAX_ALIKE
-    ]
-    return kept + more

@@ -1,13 +1,12 @@
 """The one writer of imported scenes, and logs whose sensors run on their own clocks.
 
-Every importer ends in ``write_scene``: it says in a ``SceneContent`` what is small (cameras, vehicle path, notes), and
-turns one item after another (a frame, an image, a sweep) into ``SceneImage`` and ``SceneSweep`` when they are written.
+Every importer ends in ``write_scene``: a ``SceneContent`` holds what is small (cameras, vehicle path, notes), and turns
+one item after another (a frame, an image, a sweep) into ``SceneImage`` and ``SceneSweep``.
 
 Formats whose sensors run on their own clocks fill a ``DriveLog`` instead: every image and sweep with its own time and
-pose in the map's frame, nothing decoded yet. ``write_log`` chooses frames, moves the world to the first vehicle pose,
-and writes the scene. Frames are counted by one camera, the reference: frame n is its n-th image in time order.
-Everything else that was recorded nearer to that image than to its neighbours belongs to frame n. ``--frames`` and the
-held-out split go by this number.
+pose in the map's frame, nothing decoded yet. ``write_log`` chooses frames and moves the world to the first vehicle
+pose. Frame n is the n-th image of one camera, the reference, and what was recorded nearer to it than to its neighbours;
+``--frames`` and the held-out split go by this number.
 """
 
 from __future__ import annotations
@@ -83,13 +82,12 @@ class SceneSweep:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneContent(Generic[Item]):
-    """A scene that is ready to be written: all that is small, and how to get the rest.
+    """A scene that is ready to be written. Tracks and ``ego`` are in its world and clock.
 
-    ``name``: the scene's id. ``source``: data set, licence and notes, which are logged. ``fits``: by the cameras' scene
-    names, in the order of the scene. ``items``: what is converted one by one: frames, images, sweeps; may be a
-    generator (``total`` says how many then). ``convert``: an item to its images and sweeps; called from several threads
-    if ``workers`` > 1. ``item_name``: put before the place of an error. ``tracks``: called after the last item: tracks,
-    and notes about them. They and ``ego`` are in the world and clock of the scene.
+    ``name``: the scene's id. ``source``: its notes are logged. ``fits``: by the cameras' scene names, in the order of
+    the scene. ``items``: what is converted one by one; may be a generator (``total`` says how many then). ``convert``:
+    an item to its images and sweeps; called from several threads if ``workers`` > 1. ``item_name``: put before the
+    place of an error. ``tracks``: called after the last item: tracks, and notes about them.
     """
 
     name: str
@@ -104,13 +102,9 @@ class SceneContent(Generic[Item]):
 
 
 def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) -> Scene:
-    """Write a scene at ``out``.
-
-    Points at a sensor's own place (``scene.returns``) are left out, and headings of boxes that flip by 180 degrees are
-    turned back; both are counted in the scene's notes.
-
-    Images whose size is kept are copied byte for byte, after a check that they are complete and of their camera's size.
-    At most two items per worker are in memory, beside the few that wait for the disk.
+    """Write a scene at ``out``. Points at a sensor's own place are left out, and headings of boxes that flip by 180
+    degrees turned back; the scene's notes count both. At most two items per worker are in memory, beside the few that
+    wait for the disk.
 
     Raises:
         InputError: an item is missing or damaged, or what is written contradicts itself. Nothing is left at ``out``.
@@ -124,8 +118,12 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
     def convert(item: Item) -> None:
         for part in content.convert(item):
             if isinstance(part, SceneSweep):
-                sweep_id = f"{part.sensor}/{part.number:06d}"
-                points = _without_zeros(part, content.ego)
+                sweep_id, points = f"{part.sensor}/{part.number:06d}", part.points
+                zeros = at_sensor(points, part.time_s, part.world_from_lidar, content.ego)
+                if zeros.any():
+                    classes = None if points.classes is None else points.classes[~zeros]
+                    xyz, intensity, dt_s = (values[~zeros] for values in (points.xyz, points.intensity, points.dt_s))
+                    points = SweepPoints(xyz, intensity, dt_s, classes, points.no_returns + int(zeros.sum()))
                 counts = points.no_returns, points.no_returns + len(points.xyz), float32_spacing_m(points.xyz)
                 rows.setdefault(part.sensor, []).append(counts)
                 if len(points.xyz) == 0:
@@ -145,7 +143,15 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
         common.for_each(content.items, convert, title=title, total=total, workers=workers, name=content.item_name)
         tracks, notes = content.tracks()
         tracks, turned = turned_back(tracks)
-        notes = [*notes, *turned, *_row_notes(rows)]
+        notes = [*notes, *turned]
+        for sensor, counts in sorted(rows.items()):
+            without, total = sum(one[0] for one in counts), sum(one[1] for one in counts)
+            if without:
+                share = f"{without} of {total} points ({without / total:.1%})"
+                notes.append(f"{sensor}: {share} mark beams without a return and were left out")
+            if (spacing_m := max(one[2] for one in counts)) > FLOAT32_SPACING_M:
+                far = f"points reach so far from the sensor that float32 rounds them to {spacing_m * 1e3:.3g} mm"
+                log.warn(f"{sensor}: {far}; are they in the sensor's frame?")
         _log_notes(dataset, notes)
         writer.add_notes(notes)
         for track in tracks:
@@ -156,31 +162,6 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
             groups.setdefault(moment, []).append(frame_id)
         writer.set_split(common.holdout_split(list(groups.values()), options.test_every))
         return writer.finish()
-
-
-def _without_zeros(sweep: SceneSweep, ego: EgoPath) -> SweepPoints:
-    """The points of a sweep without those at the sensor's own place, which are counted."""
-    points = sweep.points
-    zeros = at_sensor(points, sweep.time_s, sweep.world_from_lidar, ego)
-    if not zeros.any():
-        return points
-    classes = None if points.classes is None else points.classes[~zeros]
-    no_returns = points.no_returns + int(zeros.sum())
-    return SweepPoints(points.xyz[~zeros], points.intensity[~zeros], points.dt_s[~zeros], classes, no_returns)
-
-
-def _row_notes(rows: Mapping[str, Sequence[tuple[int, int, float]]]) -> list[str]:
-    """Notes about beams without a return, and about points so far away that float32 rounds them."""
-    notes = []
-    for sensor, counts in sorted(rows.items()):
-        without, total = sum(one[0] for one in counts), sum(one[1] for one in counts)
-        if without:
-            share = f"{without} of {total} points ({without / total:.1%})"
-            notes.append(f"{sensor}: {share} mark beams without a return and were left out")
-        if (spacing_m := max(one[2] for one in counts)) > FLOAT32_SPACING_M:
-            far = f"points reach so far from the sensor that float32 rounds them to {spacing_m * 1e3:.3g} mm"
-            log.warn(f"{sensor}: {far}; are they in the sensor's frame?")
-    return notes
 
 
 def _log_notes(dataset: str, notes: Iterable[str]) -> None:
@@ -233,10 +214,10 @@ class CameraOptics:
 class DriveLog:
     """What a reader found, in the frame of the data set's map.
 
-    ``name``: the scene's id. ``cameras``: by scene name, in the order of the scene; the first one counts frames.
-    ``images``, ``sweeps``: in any order; times in seconds on one clock. ``where``: folder, for messages. ``optics``: by
-    scene name; cameras that are not named are rectified. ``box_times``: ``sweeps``: keys of tracks are the times of the
-    sweeps in which people saw the boxes; ``own``: the boxes' own.
+    ``name``: the scene's id. ``cameras``: by scene name; the first one counts frames. ``images``, ``sweeps``: in any
+    order; times in seconds on one clock. ``where``: for messages. ``optics``: by scene name; other cameras are
+    rectified. ``box_times``: ``sweeps``: keys of tracks are the times of the sweeps in which people saw the boxes;
+    ``own``: the boxes' own.
     """
 
     name: str
@@ -252,11 +233,8 @@ class DriveLog:
 
 
 def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
-    """Write the chosen frames of ``drive`` as a scene at ``out``.
-
-    Tracks reach 0.05 s beyond their boxes, so that images at their ends are covered. Boxes of moving objects are
-    brought to the sweeps' times (``box_times``), unless ``untwist`` is ``no``: then every sweep counts as one moment,
-    without point times, and boxes stay as drawn.
+    """Write the chosen frames of ``drive`` as a scene at ``out``. Boxes of moving objects are brought to the sweeps'
+    times, unless ``untwist`` is ``no``: then every sweep counts as one moment, and boxes stay as drawn.
 
     Raises:
         UsageError: no frame lies in the chosen range. InputError: a file is missing or damaged; poses, times and
@@ -380,14 +358,10 @@ def _outside_gaps(chosen: dict[Record, int], drive: DriveLog, options: ImportOpt
 
 # --- when a box was seen --------------------------------------------------------------------------
 #
-# A turning sensor meets an object some time before or after the sweep's time stamp. Sweeps that are compensated for the
-# vehicle's motion still show a moving object where it was when the beams met it, and people draw its box around these
-# points: the box belongs to the mean time of the points inside it, not to the stamp it is filed under. At 10 m/s and
-# 0.08 s that is 0.8 m. Each such box is moved by the track's velocity to the stamp, where points, too, are brought by
-# their ``dt_s``.
-#
-# Images are taken a little before or after the sweep they belong to; ``reach_images`` lets a track cover those at its
-# ends.
+# A turning sensor meets an object some time before or after the sweep's time stamp, and people draw the box around the
+# points as the beams met them: it belongs to the mean time of the points inside it, not to the stamp it is filed under
+# (0.8 m at 10 m/s and 0.08 s). Each such box is moved by the track's velocity to the stamp, where points, too, are
+# brought by their ``dt_s``.
 MOVES_M: Final = 1.0
 """A track whose box's centre visits a region of a longer diagonal moves; other boxes stay as they were drawn."""
 REACH_S: Final = 0.05
@@ -459,8 +433,8 @@ def _track_velocity(times_s: NDArray[np.float64], late_s: NDArray[np.float64], p
 
 
 def reach_images(track: Track) -> Track:
-    """The track with a key ``REACH_S`` before its first and one after its last box, made with the velocity of the
-    nearest two. Without these, objects would be missing in images taken just before the first sweep that shows them."""
+    """The track with a key ``REACH_S`` before its first and one after its last box, by the velocity of the nearest two:
+    images are taken a little before or after the sweep they belong to."""
     times, poses = track.times_s, track.world_from_object
     before, after = poses[0].copy(), poses[-1].copy()
     if len(times) > 1:
@@ -509,10 +483,9 @@ def box_size(length: Any, width: Any, height: Any, where: str) -> tuple[float, f
 
 
 class BoxTracks:
-    """Collects boxes in any order, 136 bytes each; ``tracks`` puts them together. ``where``: the file or folder the
-    boxes come from, for messages. ``labels``: the data set's class -> the label here (``car``, ``pedestrian``, ...).
-    Other classes keep the last part (after a dot) of their name in lower case, and are named once in the notes.
-    ``max_gap_s``: an object that is not seen for longer than this is split."""
+    """Collects boxes in any order; ``tracks`` puts them together. ``where``: file or folder of the boxes, for messages.
+    ``labels``: the data set's class -> the label here. Other classes keep the last part (after a dot) of their name in
+    lower case, and are named once in the notes. ``max_gap_s``: an object that is not seen for longer is split."""
 
     def __init__(self, where: str, labels: Mapping[str, str], max_gap_s: float = MAX_GAP_S) -> None:
         self._where, self._labels, self._max_gap_s = where, labels, max_gap_s
@@ -525,8 +498,7 @@ class BoxTracks:
         return len(self._rows)
 
     def label_of(self, category: str) -> str:
-        """The label of a class of the data set; classes that are not known are counted. InputError for a name above 200
-        bytes."""
+        """The label of a class; unknown ones are counted. InputError for a name above 200 bytes."""
         if category in self._labels:
             return self._labels[category]
         foreign_name(category, f"{self._where}: class of a box")
@@ -547,13 +519,13 @@ class BoxTracks:
         """Add one box. Raises InputError: the size is not positive or absurd, or the id is longer than 200 bytes.
 
         Args:
-            track: the object's id, the same in all frames.
-            label: its label (``label_of``). The track takes its commonest one.
+            track: the object's id.
+            label: of ``label_of``. The track takes its commonest one.
             size_m: length, width, height.
             world_from_box: f64[4, 4], x forward, y left, z up, origin in the centre.
             standing: the data set says with every box of the object that it does not move in the whole log.
-            late_s: how long after ``time_s`` the box was measured (a turning LiDAR reaches it at its own time). The
-                track's key stands at ``time_s``, moved there with the object's velocity.
+            late_s: how long after ``time_s`` the box was measured. The track's key stands at ``time_s``, moved there
+                with the object's velocity.
             where: file and record, for messages.
         """
         foreign_name(track, f"{where or self._where}: id of an object")
@@ -567,14 +539,17 @@ class BoxTracks:
     def tracks(
         self, speeds: Speeds | None = None, images_s: Mapping[float, tuple[float, float]] | None = None
     ) -> tuple[list[Track], list[str]]:
-        """All tracks in the order of their first boxes, and notes for people.
+        """All tracks in the order of their first boxes, and notes.
 
         The size is the median over the track. What stands gets one pose (median place, mean heading) from its first to
         its last moment. What may move is split where it is not seen for more than ``max_gap_s``: ``7``, ``7.1``, ...
-        ``speeds``: how velocities are found; None = from the neighbouring boxes of a piece. ``images_s``: time of a box
-        -> times of the first and last image that show the object; a track reaches from the first image of its first
-        box to the last one of its last. None = from box to box. Raises InputError: an object has two boxes at one
-        moment; length and width are swapped.
+
+        Args:
+            speeds: how velocities are found; None = from the neighbouring boxes of a piece.
+            images_s: time of a box -> times of the first and last image that show the object, which a track reaches to.
+
+        Raises:
+            InputError: an object has two boxes at one moment; length and width are swapped.
         """
         tracks: list[Track] = []
         split = 0
@@ -595,8 +570,13 @@ class BoxTracks:
                 mean = quaternion_from_matrix(poses[0])  # running slerp from the first on
                 for count, pose in enumerate(poses[1:], start=2):
                     mean = slerp(mean, quaternion_from_matrix(pose), 1 / count)
-                place, ends = np.median(poses[:, :3, 3], axis=0), _ends(times, images_s)
-                pose = from_rotation_translation(matrix_from_quaternion(mean), place)
+                first, last = float(times[0]), float(times[-1])
+                if images_s is not None:
+                    start, end = images_s[first][0], images_s[last][1]
+                    first = start if start < first - _SAME_TIME_S else first
+                    last = end if end > last + _SAME_TIME_S else last
+                ends = np.array([first, last] if last - first > _SAME_TIME_S else [first])
+                pose = from_rotation_translation(matrix_from_quaternion(mean), np.median(poses[:, :3, 3], axis=0))
                 tracks.append(Track(name, label, size, ends, np.stack([pose] * len(ends))))
                 continue
             pieces = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(times) > self._max_gap_s) + 1)
@@ -609,7 +589,14 @@ class BoxTracks:
                     ends_s = images_s[float(times[piece[0]])][0], images_s[float(times[piece[-1]])][1]
                     keys = _reaching(*keys, velocity[piece], ends_s)
                 tracks.append(Track(f"{name}.{part}" if part else name, label, size, *keys))
-        check_sides(tracks, self._where)
+        vehicles = [track for track in tracks if track.label in LONGER_THAN_WIDE]
+        wide = [track for track in vehicles if track.size_m[1] > track.size_m[0]]
+        if vehicles and 2 * len(wide) > len(vehicles):
+            what, expected = "length and width of boxes are swapped", "vehicles longer than wide"
+            example = f"{wide[0].label} {wide[0].id}: {wide[0].size_m[0]:.2f} m long, {wide[0].size_m[1]:.2f} m wide"
+            got = f"{len(wide)} of {len(vehicles)} are wider than long, e.g. {example}"
+            remedy = "check the order in which the sizes were written"
+            raise InputError(what, where=self._where, expected=expected, got=got, remedy=remedy)
         tracks.sort(key=lambda track: float(track.times_s[0]))
         notes = []
         if split:
@@ -631,19 +618,6 @@ def turned_back(tracks: Sequence[Track]) -> tuple[list[Track], list[str]]:
             names.append(f"{track.id} at {track.times_s[turned[0]]:.2f} s ({len(turned)} of {len(poses)} keys)")
     some = ", ".join(names[:_NAMED]) + (f", ... ({len(names)} in all)" if len(names) > _NAMED else "")
     return mended, [f"headings that flip by 180 degrees were turned back: {some}"] if names else []
-
-
-def check_sides(tracks: Sequence[Track], where: str) -> None:
-    """Refuse a log in which most vehicles are wider than long: length and width were read in the wrong order."""
-    vehicles = [track for track in tracks if track.label in LONGER_THAN_WIDE]
-    wide = [track for track in vehicles if track.size_m[1] > track.size_m[0]]
-    if vehicles and 2 * len(wide) > len(vehicles):
-        length, width, _ = wide[0].size_m
-        what, expected = "length and width of boxes are swapped", "vehicles longer than wide"
-        got = f"{len(wide)} of {len(vehicles)} are wider than long, e.g. {wide[0].label} {wide[0].id}: "
-        got += f"{length:.2f} m long, {width:.2f} m wide"
-        remedy = "check the order in which the sizes were written"
-        raise InputError(what, where=where, expected=expected, got=got, remedy=remedy)
 
 
 def neighbour_speeds(measured_s: NDArray[np.float64], places: Matrix, pieces: Sequence[NDArray[np.intp]]) -> Matrix:
@@ -673,12 +647,3 @@ def _reaching(
         times_s, poses = np.concatenate([times_s, ends_s[1:]]), np.concatenate([poses, poses[-1:]])
         poses[-1, :3, 3] += velocity[-1] * end_s
     return times_s, poses
-
-
-def _ends(times_s: NDArray[np.float64], images_s: Mapping[float, tuple[float, float]] | None) -> NDArray[np.float64]:
-    """First and last moment of what stands; one if they are the same. ``images_s`` as in ``BoxTracks.tracks``."""
-    first, last = float(times_s[0]), float(times_s[-1])
-    if images_s is not None:
-        start, end = images_s[first][0], images_s[last][1]
-        first, last = (start if start < first - _SAME_TIME_S else first), (end if end > last + _SAME_TIME_S else last)
-    return np.array([first, last] if last - first > _SAME_TIME_S else [first])

@@ -74,7 +74,6 @@ def _odometry_poses(source: Path) -> tuple[Path, ...]:
 
 def import_kitti(source: Path, out: Path, options: ImportOptions) -> Scene:
     """Import one recording; see the module text for what is understood."""
-    common.require_folder(source, "KITTI")
     drive = _Recording(source, options)
     frames, notes = drive.frames, drive.notes
     world_from_velo = {n: drive.velo_at(drive.scan_s[n]) for n in frames}

@@ -382,17 +382,13 @@ def files_of_kitti360(source: Path, options: ImportOptions) -> LogFiles:
 
 def _find(source: Path, options: ImportOptions) -> tuple[Path, str]:
     """The data set's folder and the drive."""
-    common.require_folder(source, "KITTI-360")
     if source.absolute().parent.name == "data_2d_raw":
         return source.absolute().parent.parent, source.absolute().name
-    raw = source / "data_2d_raw"
-    if not raw.is_dir():
-        what, got = "no KITTI-360 recording found", common.folder_contents(source)
-        raise InputError(what, where=str(source), got=got, expected="data_2d_raw, data_poses and calibration in it")
-    drives = sorted(path.name for path in raw.iterdir() if path.is_dir())
-    wanted = options.sequence
-    matching = [d for d in drives if not wanted or d == wanted or d.removesuffix("_sync").endswith(f"_{wanted}")]
-    return source, common.the_only(matching, drives, options, raw, "drive")
+    raw, wanted = source / "data_2d_raw", options.sequence
+    drives = {path.name: path.name for path in (sorted(raw.iterdir()) if raw.is_dir() else ()) if path.is_dir()}
+    fits = lambda drive: drive == wanted or drive.removesuffix("_sync").endswith(f"_{wanted}")
+    expected = "data_2d_raw, data_poses and calibration in the data set's folder"
+    return source, common.the_only(drives, options, raw, "KITTI-360 drive", expected, fits)
 
 
 def _box_files(root: Path, drive: str) -> list[Path]:

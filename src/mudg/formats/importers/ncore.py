@@ -386,13 +386,10 @@ def _listed(path: Path) -> list[Path]:
 
 
 def _choose(source: Path, options: ImportOptions) -> tuple[Path, ...]:
-    found = _recordings(source)
-    if not found or not all(found.values()):
-        expected = f"files NAME{MARK}.zarr.itar, or folders NAME{MARK}.zarr"
-        got = common.folder_contents(source) if source.is_dir() else "no such file"
-        raise InputError("no NCore recording found", where=str(source), expected=expected, got=got)
-    matching = [stores for name, stores in found.items() if name.startswith(options.sequence)]
-    chosen = tuple(common.the_only(matching, list(found), options, source, "recording"))
+    expected = f"files NAME{MARK}.zarr.itar, or folders NAME{MARK}.zarr"
+    found = {name: stores for name, stores in _recordings(source).items() if stores}
+    begins = lambda name: name.startswith(options.sequence)
+    chosen = tuple(common.the_only(found, options, source, "NCore recording", expected, begins))
     for path in chosen:
         if not path.exists():
             what = "a store of the recording is missing"

@@ -22,7 +22,7 @@ import itertools
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
@@ -396,22 +396,11 @@ def _find(source: Path, options: ImportOptions) -> tuple[Path, str]:
         if log_name and log_name != source.stem:
             raise UsageError("the file is another log", where=str(source), expected=source.stem, got=log_name)
         return source, "" if scene == source.stem else scene
-    if not source.is_dir():
-        raise InputError("nuPlan log does not exist", where=str(source), expected="a .db file or a folder of them")
-    databases = {path.stem: path for path in _databases(source)}
-    if not databases:
-        what = "no nuPlan log found"
-        raise InputError(
-            what, where=str(source), expected="*.db here or in splits/*", got=common.folder_contents(source)
-        )
-    log_name, _, scene = options.sequence.partition("/")
-    if log_name in databases:
-        return databases[log_name], scene
-    if len(databases) == 1 and not scene:
+    databases, (log_name, _, scene) = {path.stem: path for path in _databases(source)}, options.sequence.partition("/")
+    if len(databases) == 1 and log_name not in databases and not scene:
         return next(iter(databases.values())), log_name
-    return databases[
-        common.the_only([] if log_name else list(databases), list(databases), options, source, "log")
-    ], scene
+    expected = "*.db here or in splits/*"
+    return common.the_only(databases, replace(options, sequence=log_name), source, "nuPlan log", expected), scene
 
 
 def files_of_nuplan(source: Path, options: ImportOptions) -> LogFiles:

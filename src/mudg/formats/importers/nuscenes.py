@@ -365,16 +365,8 @@ def import_nuscenes(source: Path, out: Path, options: ImportOptions) -> Scene:
     """Import one scene of a release: its root, or its table folder. ``options.sequence``: the scene (``scene-0061``, or
     ``v1.0-mini/scene-0061`` where several releases lie side by side); ``cameras`` by either name, all six by
     default."""
-    if not source.is_dir():
-        raise InputError("nuScenes folder does not exist", where=str(source), expected="a folder")
     common.refuse_untwist(options, "nuScenes", str(source))
-    releases = _releases(source)
-    if not releases:
-        what = "no nuScenes tables found"
-        expected = "v1.0-mini, v1.0-trainval or v1.0-test with scene.json and sample_data.json"
-        remedy = "give the folder that holds v1.0-*, samples and sweeps"
-        raise InputError(what, where=str(source), got=common.folder_contents(source), expected=expected, remedy=remedy)
-    return drive_log.write_log(read_log(releases, options), out, options)
+    return drive_log.write_log(read_log(source, options), out, options)
 
 
 def _releases(source: Path) -> list[Path]:
@@ -410,9 +402,9 @@ def _those(folder: Path, name: str, field: str, values: set[str]) -> TokenTable:
     return TokenTable(path, find_records(path, field, values))
 
 
-def read_log(releases: Sequence[Path], options: ImportOptions) -> DriveLog:
+def read_log(source: Path, options: ImportOptions) -> DriveLog:
     """What the tables tell about the chosen scene; no image or sweep is opened."""
-    folder, scene = _choose_scene(releases, options)
+    folder, scene = _choose_scene(source, options)
     where = f"{folder}: {scene['name']}"
     log.info(f"nuscenes: {where}")
     samples = _samples_in_order(folder, scene)
@@ -451,20 +443,18 @@ def read_log(releases: Sequence[Path], options: ImportOptions) -> DriveLog:
     return DriveLog(str(scene["name"]), cameras, images, sweeps, tracks, ego, source, where)
 
 
-def _choose_scene(releases: Sequence[Path], options: ImportOptions) -> tuple[Path, Row]:
+def _choose_scene(source: Path, options: ImportOptions) -> tuple[Path, Row]:
+    """Table folder and record of the scene; of one that lies in two releases that of the smaller, which is quicker."""
     wanted_release, _, wanted = options.sequence.rpartition("/")
-    found: list[tuple[Path, Row]] = []
-    names: list[str] = []
+    releases, scenes = _releases(source), dict[str, tuple[Path, Row]]()
     for folder in releases:
-        if wanted_release and folder.name != wanted_release:
-            continue
         for row in iter_records(folder / "scene.json"):
             name = text(row, "name", str(folder / "scene.json"))
-            names.append(f"{folder.name}/{name}" if len(releases) > 1 else name)
-            if wanted in ("", name, row.get("token")):
-                found.append((folder, row))
-    # the same scene may lie in two releases: the smaller one is quicker
-    return common.the_only(found[:1] if wanted else found, names, options, releases[0].parent, "scene")
+            if wanted in (name, row.get("token")) and wanted_release in ("", folder.name):
+                return folder, row
+            scenes[f"{folder.name}/{name}" if len(releases) > 1 else name] = folder, row
+    expected = "v1.0-mini, v1.0-trainval or v1.0-test with scene.json and sample_data.json"
+    return common.the_only(scenes, options, source, "nuScenes scene", expected)
 
 
 def _samples_in_order(folder: Path, scene: Row) -> dict[str, int]:

@@ -306,15 +306,16 @@ class _Cuboid:
 
 def looks_like_pandaset(source: Path) -> bool:
     """Whether ``source`` is a sequence of PandaSet, or a folder of such sequences."""
-    return source.is_dir() and (_is_sequence(source) or bool(_sequences(source)))
+    return _is_sequence(source) or bool(_sequences(source))
 
 
 def _is_sequence(folder: Path) -> bool:
     return (folder / "lidar" / "poses.json").is_file() and any((folder / "camera" / name).is_dir() for name in CAMERAS)
 
 
-def _sequences(source: Path) -> list[str]:
-    return sorted(f.name for f in source.iterdir() if f.name.isdigit() and f.is_dir() and _is_sequence(f))
+def _sequences(source: Path) -> dict[str, Path]:
+    folders = sorted(source.iterdir()) if source.is_dir() else ()
+    return {folder.name: folder for folder in folders if folder.name.isdigit() and _is_sequence(folder)}
 
 
 def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
@@ -371,15 +372,10 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
 
 
 def _chosen_sequence(source: Path, options: ImportOptions) -> Path:
-    common.require_folder(source, "PandaSet")
     if not options.sequence and _is_sequence(source):
         return source
-    sequences = _sequences(source)
-    if not sequences and not options.sequence:
-        what, expected = "no PandaSet sequence found", "lidar/poses.json and camera/front_camera and so on"
-        raise InputError(what, where=str(source), got=common.folder_contents(source), expected=expected)
-    matching = [name for name in sequences if options.sequence in ("", name)]
-    return source / common.the_only(matching, sequences, options, source, "sequence")
+    expected = "lidar/poses.json and camera/front_camera and so on, here or in numbered folders"
+    return common.the_only(_sequences(source), options, source, "PandaSet sequence", expected)
 
 
 def files_of_pandaset(source: Path, options: ImportOptions) -> LogFiles:

@@ -122,16 +122,14 @@ def _find(source: Path, options: ImportOptions) -> tuple[Path | None, str]:
     """The record file of the chosen log, or None and the name of its tables."""
     if source.is_file():
         return source, ""
-    if not source.is_dir():
-        raise InputError("Waymo log does not exist", where=str(source), expected="a TFRecord file or a folder")
     records = {path.stem: path for path in sorted(source.glob(f"*{_SUFFIX}"))}
-    segments = records or sorted({path.stem for name in REQUIRED for path in (source / name).glob("*.parquet")})
-    if not segments:
-        expected = f"*{_SUFFIX} files, or component folders: {', '.join(REQUIRED)}"
-        raise InputError("no Waymo log found", where=str(source), got=common.folder_contents(source), expected=expected)
-    matching = [name for name in segments if name == options.sequence] or [n for n in segments if options.sequence in n]
-    name = common.the_only(matching, matching or list(segments), options, source, "log")
-    return records.get(name), name
+    tables = sorted({path.stem for name in REQUIRED for path in (source / name).glob("*.parquet")})
+    wanted, found = options.sequence, {name: (path, name) for name, path in records.items()}
+    found = found or {name: (None, name) for name in tables}
+    if wanted in found:
+        return found[wanted]
+    expected = f"*{_SUFFIX} files, or component folders: {', '.join(REQUIRED)}"
+    return common.the_only(found, options, source, "Waymo log", expected, lambda name: wanted in name)
 
 
 def _chosen_cameras(waymo: WaymoLog, options: ImportOptions, source: Path) -> list[str]:
