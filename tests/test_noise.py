@@ -210,7 +210,7 @@ def test_every_sampler_takes_its_settings_and_no_other():
         assert own == set(noise.SAMPLER_SETTINGS[sampler])
         noise.check_sampler(sampler, own)
         for name in every - own:
-            with pytest.raises(UsageError, match=f"{sampler} does not take the setting {name}") as refused:
+            with pytest.raises(UsageError, match=f"{sampler} does not take the setting {name}") as caught:
                 noise.check_sampler(sampler, [name])
-            assert f"{name} with ddim" in str(refused.value)
+            assert f"{name} with ddim" in str(caught.value)
     refused("unknown sampler", noise.check_sampler, "magic", raises=UsageError)

@@ -319,6 +319,10 @@ def test_doubled_rows_and_long_names_are_refused(source: Path, tmp_path: Path) -
     connection.close()
     caught = refused("two images of one camera have the same time", ingest, log(source), tmp_path / "out")
     assert "image at" in caught.where
+    connection = sqlite3.connect(log(source))
+    connection.execute("DELETE FROM image WHERE rowid = (SELECT MAX(rowid) FROM image)")
+    connection.commit()
+    connection.close()
     for table, column in (("category", "name"), ("camera", "channel"), ("log", "logfile")):
         connection = sqlite3.connect(log(source))
         kept = connection.execute(f"SELECT {column} FROM {table} LIMIT 1").fetchone()

@@ -205,7 +205,7 @@ def test_broken_files_are_refused_in_words(release: Path, tmp_path: Path, capsys
     table = copy / "v1.0-mini" / "sample_data.json"
     table.write_bytes(table.read_bytes()[:-200])
     refused("cut off", ingest, copy, tmp_path / "out2")
-    refused("no nuScenes tables", ingest, copy / "samples", tmp_path / "out2")
+    refused("no nuScenes scene found", ingest, copy / "samples", tmp_path / "out2")
 
 
 def test_default_cameras_must_all_be_there_and_unknown_categories_are_named(

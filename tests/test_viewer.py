@@ -34,14 +34,15 @@ from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera
 from mudg.core.trajectory import at_shift
+from mudg.editing import apply
 from mudg.editing.script import read_edits
 from mudg.formats.paths import read_path
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import raster_of, render_view
 from mudg.gaussians.storage import save_model
 from mudg.scene.read import read_scene
-from mudg.viewer import live, view
 from mudg.viewer import page as viewer_page
+from mudg.viewer import view
 from mudg.viewer.live import GROUND, FrameSource, VideoRequest
 from mudg.viewer.page import BLOCK, blob_of, chunk_rows, coverage, level_of, opacity_of, pack_scene, smallest_three
 from mudg.viewer.server import token_for
@@ -782,14 +783,14 @@ def test_one_video_is_made_at_a_time(toy: Toy) -> None:
 
 
 def test_a_video_that_nobody_waits_for_is_given_up(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn, real = list[float](), live.render_view
+    drawn, real = list[float](), apply.render_view
 
-    def noted(*given: Any) -> Any:
+    def noted(*given: Any, **settings: Any) -> Any:
         drawn.append(time.monotonic())
         time.sleep(0.02)
-        return real(*given)
+        return real(*given, **settings)
 
-    monkeypatch.setattr(live, "render_view", noted)
+    monkeypatch.setattr(apply, "render_view", noted)
     with serving(toy[1], toy[0] / "scene") as (port, token):
         long = question(tuple(0.001 * k for k in range(700)))
         connection, answer = begin(port, "POST", "/video", long, **allowed(port, token))
@@ -809,14 +810,14 @@ def test_a_video_that_nobody_waits_for_is_given_up(toy: Toy, monkeypatch: pytest
 
 
 def test_a_problem_on_the_way_is_told_in_the_answer(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = live.render_view
+    real = apply.render_view
 
     def breaking(model: SceneModel, view: Any, raster: Any) -> Any:
         if view.time_s > 0.3:
             raise InputError("this moment cannot be drawn")
-        return real(model, view, raster)
+        return real(model, view, raster=raster)
 
-    monkeypatch.setattr(live, "render_view", breaking)
+    monkeypatch.setattr(apply, "render_view", breaking)
     with serving(toy[1], toy[0] / "scene") as (port, token):
         status, answer = ask(port, "POST", "/video", question(), **allowed(port, token))
     lines = [json.loads(line) for line in answer.splitlines()]
@@ -847,14 +848,14 @@ def test_the_page_saves_a_video_and_cancels_one(toy: Toy, tmp_path: Path, monkey
             for k in (0, 2, 8):
                 true = render_view(toy[2], views[round(0.1 * k, 3)], raster_of(toy[2])).rgb.permute(1, 2, 0).numpy()
                 assert psnr(film[k], true) > 32
-            begun, go_on, real = list[int](), threading.Event(), live.render_view
+            begun, go_on, real = list[int](), threading.Event(), apply.render_view
 
-            def held(*given: Any) -> Any:
+            def held(*given: Any, **settings: Any) -> Any:
                 begun.append(1)
                 assert len(begun) < 3 or go_on.wait(60)
-                return real(*given)
+                return real(*given, **settings)
 
-            monkeypatch.setattr(live, "render_view", held)
+            monkeypatch.setattr(apply, "render_view", held)
             one.run(f"{CLICK}; 1")
             # exact frames count, too
             one.wait("/^Cancel \\([0-2] of 9 frames\\)$/.test(document.getElementById('mp4').textContent)")
