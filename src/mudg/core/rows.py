@@ -45,8 +45,16 @@ class Rows:
     elevations_deg: Floats
 
     @classmethod
-    def of(cls, xyz: Floats) -> Rows:
-        """The rows of returns f64[N, 3] in the sensor's frame; none where elevations have no peaks."""
+    def of(cls, xyz: Floats, like: Rows | None = None) -> Rows:
+        """The rows of returns f64[N, 3] in the sensor's frame; none where elevations have no peaks.
+
+        Args:
+            like: of another sweep of the sensor; axis and heights are taken from it.
+        """
+        if like is not None:
+            return (
+                cls._with_peaks(xyz, like.turn, like.heights_m, like.split_deg)[0] if len(like.elevations_deg) else like
+            )
         some = xyz[:: max(1, len(xyz) // MOST_RETURNS)]
         blur = lambda lean: -_sharpness(_angles(some @ _turn(lean).T)[1])
         first = min(((a, b) for a in LEANS for b in LEANS), key=blur)
@@ -63,7 +71,9 @@ class Rows:
         return found if share > ON_ROWS else cls(turn, found.heights_m, 0.0, np.zeros(0))
 
     @classmethod
-    def _with_peaks(cls, xyz: Floats, turn: Floats, heights_m: tuple[float, float], split_deg: float) -> tuple[Rows, float]:
+    def _with_peaks(
+        cls, xyz: Floats, turn: Floats, heights_m: tuple[float, float], split_deg: float
+    ) -> tuple[Rows, float]:
         """Rows with these heights, and the share of the returns that lie on them."""
         rows = cls(turn, heights_m, split_deg, np.zeros(0))
         elevation = rows.angles(xyz)[1]

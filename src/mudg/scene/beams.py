@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from mudg.base import geometry
 from mudg.base.types import EgoPath, Scene, Sweep, SweepPoints, Track
@@ -98,11 +99,11 @@ def beams_of(scene: Scene, sweep: Sweep, points: SweepPoints | None = None) -> B
     return Beams(directions, share, away, found.intensity, start, end, *times)
 
 
-def with_silent(beams: Beams) -> Beams:
+def with_silent(beams: Beams, like: Rows | None = None) -> Beams:
     """The same and, behind them, the beams that returned nothing: gaps in the sensor's rows. Where there are no rows,
-    nothing is added."""
+    nothing is added. ``like``: rows of another sweep of the sensor."""
     xyz = beams.directions * beams.range_m[:, None]
-    rows = Rows.of(xyz)
+    rows = Rows.of(xyz, like)
     if len(rows.elevations_deg) < 2 or len(beams) < 100:
         return beams
     azimuth, elevation, away = rows.angles(xyz)
@@ -174,46 +175,70 @@ def moving_tracks(scene: Scene) -> tuple[Track, ...]:
     return tuple(track for track in scene.tracks if judge_track(track, FusionRules()).moving)
 
 
-def returns_of(scene: Scene, sweeps: Sequence[Sweep]) -> dict[str, Returns]:
-    """Returns of sweeps by what they belong to: ``WORLD`` in the world, moving tracks each in the frame of its box."""
-    tracks, parts = moving_tracks(scene), dict[str, list[tuple[Floats, Floats, Floats]]]()
-    for sweep in sweeps:
-        points = read_points(scene, sweep)
-        intensity = points.intensity.astype(np.float64)
-        owner, owned = separate(SweepShots(sweep.time_s, sweep.world_from_lidar, points, ()), tracks, FusionRules())
-        still = owner == STATIC
-        world = geometry.transform_points(sweep.world_from_lidar, points.xyz[still].astype(np.float64))
-        place = sweep.world_from_lidar[:3, 3]
-        parts.setdefault(WORLD, []).append((world, np.broadcast_to(place, world.shape), intensity[still]))
-        for number, xyz in owned.items():
-            pose = tracks[number].pose_at(sweep.time_s)
-            if pose is not None:
-                seen_from = np.broadcast_to(geometry.transform_points(geometry.invert(pose), place[None]), xyz.shape)
-                own = (xyz.astype(np.float64), seen_from, intensity[owner == number])
-                parts.setdefault(tracks[number].id, []).append(own)
-    return {name: Returns.of(own) for name, own in parts.items()}
+def returns_of(scene: Scene, sweep: Sweep, silent: Beams | None = None) -> dict[str, Returns]:
+    """Returns of a sweep by what they belong to: ``WORLD`` in the world, moving tracks each in the frame of its box.
+
+    Args:
+        silent: the sweep's beams (``with_silent``). Those without a return stand, without intensity, as far away as
+            the return nearest in angle.
+    """
+    points, tracks, place = read_points(scene, sweep), moving_tracks(scene), sweep.world_from_lidar[:3, 3]
+    xyz, dt_s, intensity = points.xyz, points.dt_s, points.intensity
+    if silent is not None and not silent.returned.all():
+        ends, times = _silent_ends(sweep, silent)
+        xyz, dt_s = np.concatenate([xyz, ends]), np.concatenate([dt_s, times])
+        intensity = np.concatenate([intensity, np.full(len(ends), np.nan, np.float32)])
+    shots = SweepShots(sweep.time_s, sweep.world_from_lidar, SweepPoints(xyz, intensity, dt_s), ())
+    owner, owned = separate(shots, tracks, FusionRules())
+    still = owner == STATIC
+    parts = {
+        WORLD: Returns(
+            geometry.transform_points(sweep.world_from_lidar, xyz[still].astype(np.float64)), place, intensity[still]
+        )
+    }
+    for number, own in owned.items():
+        pose = tracks[number].pose_at(sweep.time_s)
+        if pose is not None:
+            seen_from = geometry.transform_points(geometry.invert(pose), place[None])[0]
+            parts[tracks[number].id] = Returns(own.astype(np.float64), seen_from, intensity[owner == number])
+    return parts
+
+
+def _silent_ends(sweep: Sweep, beams: Beams) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Where beams without a return may have ended, f32[n, 3] in the sweep's frame, and when, f32[n]."""
+    heard = beams.returned
+    rows = KDTree(beams.directions[heard]).query(beams.directions[~heard])[1]
+    away = beams.range_m.copy()
+    away[~heard] = beams.range_m[heard][rows]
+    ends = beams.directions * away[:, None]
+    for share, own in beams.parts(MOMENTS):
+        ends[own] = geometry.transform_points(geometry.invert(sweep.world_from_lidar) @ beams.pose(share), ends[own])
+    times = beams.start_s + beams.share * (beams.end_s - beams.start_s) - sweep.time_s
+    return ends[~heard].astype(np.float32), times[~heard].astype(np.float32)
 
 
 def placed(
-    parts: Mapping[str, Returns], poses: Mapping[str, Floats], origin: Floats
+    parts: Sequence[tuple[str, Returns]], poses: Mapping[str, Floats], origin: Floats
 ) -> tuple[Floats, NDArray[np.int64]]:
     """Returns where their objects are, without those that were seen from behind.
 
     Args:
-        parts: by name. poses: world-from-box of the objects; those that are not named are left out. origin: f64[3].
+        parts: with the name of what they belong to. poses: world-from-box of the objects; parts of others are left
+            out. origin: f64[3].
 
     Returns:
         Places f64[N, 3] relative to the origin in the world's axes, and numbers i64[N] among all returns of ``parts``.
     """
-    xyz, numbers, first = [], [], 0
-    for name, part in parts.items():
+    xyz, numbers, first = [np.zeros((0, 3))], [np.zeros(0, np.int64)], 0
+    for name, part in parts:
         if name == WORLD or name in poses:
             points, seen_from = part.xyz, part.seen_from
             if name != WORLD:
-                points, seen_from = (geometry.transform_points(poses[name], block) for block in (points, seen_from))
+                points = geometry.transform_points(poses[name], points)
+                seen_from = geometry.transform_points(poses[name], seen_from[None])[0]
             away = points - origin
             shown = ((away * (points - seen_from)).sum(1) > 0) & ((away**2).sum(1) > 0.25)
             xyz.append(away[shown])
             numbers.append(first + np.flatnonzero(shown))
         first += len(part)
-    return (np.concatenate(xyz), np.concatenate(numbers)) if xyz else (np.zeros((0, 3)), np.zeros(0, np.int64))
+    return np.concatenate(xyz), np.concatenate(numbers)
