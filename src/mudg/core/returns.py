@@ -8,7 +8,7 @@ discs made of the same returns; discs of a noisy surface hide each other, and th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -29,75 +29,41 @@ HELD: Final = 0.001
 """How much slopes are held towards 0, as a share of the weights."""
 OUTLIER: Final = 0.01
 """Relative error at which a return counts half."""
-VOXEL_M: Final = 0.03
-VOXEL_SHARE: Final = 0.002
-"""Returns are averaged in cubes of this side, or of this share of the range."""
+BEHIND: Final = 1.2
+"""A beam that was lost this far behind a surface says nothing about it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Returns:
-    """Returns of many sweeps in one frame.
+    """Returns of one sweep in one frame, and beams that were lost.
 
     Args:
-        xyz: f64[N, 3] metres. seen_from: f64[N, 3], where the sensor was. intensity: f64[N] in [0, 1].
-        count: f64[N], how many were averaged. missed: f64[N], how many beams were lost here.
+        xyz: f64[N, 3] metres. seen_from: f64[3], where the sensor was. intensity: f32[N] in [0, 1], NaN where a beam
+            was lost.
     """
 
     xyz: Floats
     seen_from: Floats
-    intensity: Floats
-    count: Floats
-    missed: Floats
-
-    @classmethod
-    def of(cls, parts: list[tuple[Floats, Floats, Floats]]) -> Returns:
-        """Of points, places of the sensor and intensities; nothing is averaged."""
-        xyz, seen_from, intensity = (np.concatenate(column) for column in zip(*parts, strict=True))
-        return cls(xyz, seen_from, intensity, np.ones(len(xyz)), np.zeros(len(xyz)))
+    intensity: NDArray[np.float32]
 
     def __len__(self) -> int:
         return len(self.xyz)
 
     def taken(self, rows: NDArray[np.integer] | NDArray[np.bool_]) -> Returns:
         """Some of them."""
-        xyz, seen_from, intensity = self.xyz[rows], self.seen_from[rows], self.intensity[rows]
-        return Returns(xyz, seen_from, intensity, self.count[rows], self.missed[rows])
-
-    def averaged(self) -> Returns:
-        """Neighbours averaged; cubes grow with the range in powers of two."""
-        if not len(self):
-            return self
-        away = np.linalg.norm(self.xyz - self.seen_from, axis=1)
-        level = np.ceil(np.log2(np.maximum(away * VOXEL_SHARE / VOXEL_M, 1.0))).astype(np.int64)
-        cell = np.floor(self.xyz / (VOXEL_M * 2.0**level)[:, None]).astype(np.int64)
-        key = np.ravel_multi_index(
-            tuple((cell - cell.min(0)).T) + (level,), (*(np.ptp(cell, 0) + 1), int(level.max()) + 1)
-        )
-        of = np.unique(key, return_inverse=True)[1]
-        count, missed = (np.asarray(np.bincount(of, own), np.float64) for own in (self.count, self.missed))
-        mean = lambda values: np.bincount(of, values * self.count) / count
-        xyz, seen_from = (np.stack([mean(axis) for axis in block.T], 1) for block in (self.xyz, self.seen_from))
-        return Returns(xyz, seen_from, mean(self.intensity), count, missed)
-
-    def with_missed(self, missed: Floats) -> Returns:
-        """The same with other counts of lost beams."""
-        return replace(self, missed=missed)
-
-    @property
-    def loss(self) -> Floats:
-        """Share of the beams that were lost at each, f64[N]."""
-        return (self.missed + 0.1) / (self.missed + self.count + 1.0)
+        return Returns(self.xyz[rows], self.seen_from, self.intensity[rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Met:
-    """What B beams met, with k neighbours each.
+    """What B beams met.
 
     Args:
         range_m: f64[B], NaN where no return is within reach. facing: f64[B], cosine between beam and surface.
         nearest_rad: f64[B], angle to the nearest return, infinite where there is none. spacing_rad: f64[B], the middle
             angle to the neighbours. one_sided: f64[B] in [0, 1], how much they lie to one side of the beam.
-        rows: i64[B, k], numbers of the neighbours. weights: f64[B, k], sum 1, or 0 where there are none.
+        heard, lost: f64[B], how many returns and lost beams are around, each counted by its angle. intensity: f64[B].
+        nearest: i64[B], number of the return that counts most, -1: none.
     """
 
     range_m: Floats
@@ -105,32 +71,58 @@ class Met:
     nearest_rad: Floats
     spacing_rad: Floats
     one_sided: Floats
-    rows: NDArray[np.int64]
-    weights: Floats
+    heard: Floats
+    lost: Floats
+    intensity: Floats
+    nearest: NDArray[np.int64]
 
     @classmethod
     def nothing(cls, count: int) -> Met:
         """Beams that met nothing."""
-        nan, none = np.full(count, np.nan), np.full(count, np.inf)
-        shape = (count, NEIGHBOURS)
-        return cls(nan.copy(), nan.copy(), none.copy(), none.copy(), nan, np.zeros(shape, np.int64), np.zeros(shape))
+        nan, none = (np.full((4, count), value) for value in (np.nan, np.inf))
+        return cls(nan[0], nan[1], none[0], none[1], nan[2], *np.zeros((3, count)), np.full(count, -1))
 
     def put(self, own: NDArray[np.int64], part: Met) -> None:
         """Write what some of the beams met."""
-        for name in ("range_m", "facing", "nearest_rad", "spacing_rad", "one_sided", "rows", "weights"):
+        for name in self.__dataclass_fields__:
             getattr(self, name)[own] = getattr(part, name)
 
-    def mean(self, values: Floats) -> Floats:
-        """Weighted mean f64[B] of values f64[N] of the returns; 0 where nothing was met."""
-        return (self.weights * values[self.rows]).sum(1)
 
-
-def first_surface(beams: Floats, xyz: Floats) -> Met:
+def first_surface(beams: Floats, xyz: Floats, intensity: Floats, trust: Floats) -> Met:
     """What beams meet first.
 
     Args:
         beams: unit directions f64[B, 3] from the origin. xyz: returns f64[N, 3] in the same frame, none at the origin.
+        intensity: f64[N], NaN where a beam was lost. trust: f64[N], how much each counts.
     """
+    heard = np.flatnonzero(np.isfinite(intensity))
+    met = _surface(beams, xyz[heard], intensity[heard], trust[heard])
+    met.nearest[:] = np.where(met.nearest >= 0, np.append(heard, -1)[met.nearest], -1)
+    silent = np.isnan(intensity)
+    if silent.any():
+        met.lost[:] = _lost(beams, xyz[silent], trust[silent], met)
+    return met
+
+
+def _lost(beams: Floats, xyz: Floats, trust: Floats, met: Met) -> Floats:
+    """Lost beams around beams f64[B], each counted by its angle for the spacing of the returns."""
+    away = np.linalg.norm(xyz, axis=1)
+    count = min(NEIGHBOURS, len(xyz))
+    query = KDTree(xyz / away[:, None], balanced_tree=False, compact_nodes=False).query
+    gaps, rows = (
+        np.asarray(a).reshape(len(beams), count)
+        for a in query(beams, count, distance_upper_bound=REACH_RAD, workers=-1)
+    )
+    known = np.isfinite(gaps)
+    rows = np.where(known, rows, 0)
+    spacing = np.where(np.isfinite(met.spacing_rad), met.spacing_rad, REACH_RAD / 2)[:, None]
+    with np.errstate(invalid="ignore"):
+        behind = away[rows] > BEHIND * met.range_m[:, None] + 1
+    near = np.exp(-0.5 * (np.where(known, gaps, 0) / spacing) ** 2) * trust[rows]
+    return np.where(known & ~behind, near, 0.0).sum(1)
+
+
+def _surface(beams: Floats, xyz: Floats, intensity: Floats, trust: Floats) -> Met:
     found = Met.nothing(len(beams))
     if len(xyz) < NEIGHBOURS or not len(beams):
         return found
@@ -149,7 +141,7 @@ def first_surface(beams: Floats, xyz: Floats) -> Met:
     off = np.where(known, np.hypot(x, y), np.inf)
     spacing = np.maximum(np.nanmedian(np.where(known, off, np.nan), axis=1), 1e-6)
     u, v = x / spacing[:, None], y / spacing[:, None]
-    near = np.where(known, np.exp(-0.5 * (u * u + v * v)), 0.0)
+    near = np.where(known, np.exp(-0.5 * (u * u + v * v)), 0.0) * trust[rows]
     one_sided = np.hypot((near * u).sum(1), (near * v).sum(1)) / np.maximum((near * np.hypot(u, v)).sum(1), 1e-12)
     plane, error = _plane(u, v, inverse, near)
     rough = (near * error).sum(1) / near.sum(1) > ONE_PLANE
@@ -164,15 +156,17 @@ def first_surface(beams: Floats, xyz: Floats) -> Met:
     high = np.where(counts, inverse, 0.0).max(1)
     at = np.where(np.isfinite(low), plane[:, 0].clip(0.9 * low, 1.1 * high), plane[:, 0])
     slope = np.hypot(plane[:, 1], plane[:, 2]) / spacing
-    total = weights_now.sum(1, keepdims=True)
+    total = np.maximum(weights_now.sum(1), 1e-300)
     part = Met(
         1 / at,
         at / np.hypot(at, slope),
         np.asarray(gaps[own, 0], np.float64),
         spacing,
         one_sided,
-        rows,
-        np.where(total > 0, weights_now / np.maximum(total, 1e-300), 0.0),
+        near.sum(1),
+        np.zeros(len(own)),
+        (weights_now * intensity[rows]).sum(1) / total,
+        rows[np.arange(len(rows)), weights_now.argmax(1)],
     )
     found.put(own, part)
     return found

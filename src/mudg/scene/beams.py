@@ -9,12 +9,13 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, signal
+from scipy.spatial import KDTree
 
 from mudg.base import geometry
 from mudg.base.types import EgoPath, Scene, Sweep, Track
 from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, separate
 from mudg.core.returns import Returns
+from mudg.core.rows import Rows
 from mudg.scene.read import read_points, sweeps_beside
 
 Floats = NDArray[np.float64]
@@ -24,12 +25,6 @@ MOMENTS: Final = 64
 """Parts of a sweep whose beams share a pose."""
 SAME_MOMENT_S: Final = 0.06
 """A sweep belongs to the frames that were taken this near in time."""
-ROW_BIN_DEG: Final = 0.01
-ROWS_APART_DEG: Final = 0.12
-ROW_SIGMA_DEG: Final = 0.05
-DOUBLED_SHARE: Final = 0.6
-FEWEST_IN_ROW: Final = 0.1
-"""Least height of a row's peak, as a share of the middle one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,76 +99,51 @@ def beams_of(scene: Scene, sweep: Sweep) -> Beams:
     return Beams(directions, share, away, found.intensity, start, end, *times)
 
 
-def with_silent(beams: Beams) -> Beams:
-    """The same and, behind them, the beams that returned nothing: places of the sensor's grid of rows and columns
-    without a return. Rows are peaks of elevation; where there are none, nothing is added."""
-    x, y, z = beams.directions.T
-    azimuth, elevation = np.arctan2(y, x), np.degrees(np.arcsin(z.clip(-1, 1)))
-    rows = row_elevations(elevation)
-    if len(rows) < 2 or len(beams) < 100:
+def with_silent(beams: Beams, like: Rows | None = None) -> Beams:
+    """The same and, behind them, the beams that returned nothing: gaps in the sensor's rows. Where there are no rows,
+    nothing is added. ``like``: rows of another sweep of the sensor."""
+    xyz = beams.directions * beams.range_m[:, None]
+    rows = Rows.of(xyz, like)
+    if len(rows.elevations_deg) < 2 or len(beams) < 100:
         return beams
-    row = np.searchsorted((rows[:-1] + rows[1:]) / 2, elevation)
+    azimuth, elevation, away = rows.angles(xyz)
+    row = rows.number(elevation)
     order = np.lexsort((azimuth, row))
-    steps = np.diff(azimuth[order])[np.diff(row[order]) == 0]
-    steps = steps[steps > np.radians(0.01)]
-    if not len(steps):
+    gap, same = np.diff(azimuth[order]), np.diff(row[order]) == 0
+    usual = same & (gap > np.radians(0.01))
+    if not usual.any():
         return beams
-    step = float(np.median(steps))
-    first, last = float(azimuth.min()), float(azimuth.max())
-    whole = last - first > np.radians(355)
-    columns = round(2 * np.pi / step) if whole else max(1, round((last - first) / step))
-    begin, step = (-np.pi, 2 * np.pi / columns) if whole else (first, (last - first) / columns)
-    at = (azimuth - begin) / step
-    taken = np.zeros((len(rows), columns), bool)
-    for shift in (-0.25, 0.0, 0.25):
-        column = np.floor(at + shift).astype(np.int64)
-        column = column % columns if whole else column.clip(0, columns - 1)
-        taken[row, column] = True
-    silent_row, column = np.nonzero(~taken)
-    angle, tilt = begin + (column + 0.5) * step, np.radians(rows[silent_row])
-    level = np.cos(tilt)
-    directions = np.stack([np.cos(angle) * level, np.sin(angle) * level, np.sin(tilt)], 1)
-    bin_of = np.floor(at).astype(np.int64).clip(0, columns - 1)
-    counts = np.bincount(bin_of, minlength=columns)
-    known = np.flatnonzero(counts)
-    share = np.interp(column, known, np.bincount(bin_of, beams.share, columns)[known] / counts[known])
-    nan = np.full(len(column), np.nan)
+    step = float(np.median(gap[usual]))
+    rate = float(np.median(np.diff(beams.share[order])[usual] / gap[usual]))
+    # a post at either end of every row: the row's other end, a turn away, or a step outside the field
+    ends = np.flatnonzero(~np.r_[False, same]), np.flatnonzero(~np.r_[same, False])
+    first, last = (order[own] for own in ends)
+    whole = np.ptp(azimuth) > np.radians(355)
+    if whole:
+        post = azimuth[first] + 2 * np.pi
+        left, right, begin, end = last, first, azimuth[last], post
+    else:
+        low, high = np.full(len(first), azimuth.min() - step), np.full(len(last), azimuth.max() + step)
+        left, right = np.r_[first, last], np.r_[first, last]
+        begin, end = np.r_[low, azimuth[last]], np.r_[azimuth[first], high]
+    left, right = np.r_[order[:-1][same], left], np.r_[order[1:][same], right]
+    begin, gap = np.r_[azimuth[order[:-1][same]], begin], np.r_[gap[same], end - begin]
+    count = (np.rint(gap / step) - 1).clip(0).astype(np.int64)
+    at = np.repeat(np.arange(len(gap)), count)
+    part = (np.arange(len(at)) - np.repeat(np.cumsum(count) - count, count) + 1) / (count[at] + 1)
+    nearness = (1 - part) / away[left[at]] + part / away[right[at]]
+    turned = begin[at] + part * gap[at]
+    share = beams.share[left[at]] + rate * (turned - azimuth[left[at]])
+    points = rows.points(turned, rows.elevations_deg[row[left[at]]], 1 / nearness)
+    nan = np.full(len(at), np.nan)
     join = lambda a, b: np.concatenate([a, b])
     return Beams(
-        join(beams.directions, directions),
-        join(beams.share, share.clip(0, 1)),
+        join(beams.directions, points / np.linalg.norm(points, axis=1, keepdims=True)),
+        join(beams.share, share % 1.0 if whole and rate else share.clip(0, 1)),
         join(beams.range_m, nan),
         join(beams.intensity, nan),
         *(beams.start, beams.end, beams.start_s, beams.end_s),
     )
-
-
-def row_elevations(elevation_deg: Floats) -> Floats:
-    """Elevations of a turning sensor's rows, degrees, rising: peaks of how often an elevation occurs."""
-    if not len(elevation_deg):
-        return np.zeros(0)
-    low, high = float(elevation_deg.min()) - 1, float(elevation_deg.max()) + 1
-    counts, edges = np.histogram(elevation_deg, round((high - low) / ROW_BIN_DEG), (low, high))
-    smooth = ndimage.gaussian_filter1d(counts.astype(np.float64), ROW_SIGMA_DEG / ROW_BIN_DEG, mode="constant")
-    peaks, found = signal.find_peaks(smooth, height=0.0, prominence=0.0, distance=ROWS_APART_DEG / ROW_BIN_DEG)
-    if not len(peaks):
-        return np.zeros(0)
-    height = found["prominences"]
-    kept = np.flatnonzero(height >= FEWEST_IN_ROW * float(np.median(height[height > 0.2 * smooth.max()])))
-    rows, height = (edges[peaks] + edges[peaks + 1])[kept] / 2, height[kept]
-    return rows[~_doubled(rows, height)]
-
-
-def _doubled(rows: Floats, height: Floats) -> NDArray[np.bool_]:
-    """Which peaks bool[R] are another row's second one: the lower of two that stand much nearer than rows around do."""
-    gaps = np.diff(rows)
-    usual = ndimage.median_filter(gaps, 9, mode="nearest")
-    near = gaps < DOUBLED_SHARE * usual
-    lower = height[:-1] < height[1:]
-    found = np.zeros(len(rows), bool)
-    found[:-1] |= near & lower
-    found[1:] |= near & ~lower
-    return found
 
 
 # which sweeps -------------------------------------------------------------------------------------
@@ -199,46 +169,70 @@ def moving_tracks(scene: Scene) -> tuple[Track, ...]:
     return tuple(track for track in scene.tracks if judge_track(track, FusionRules()).moving)
 
 
-def returns_of(scene: Scene, sweeps: Sequence[Sweep]) -> dict[str, Returns]:
-    """Returns of sweeps by what they belong to: ``WORLD`` in the world, moving tracks each in the frame of its box."""
-    tracks, parts = moving_tracks(scene), dict[str, list[tuple[Floats, Floats, Floats]]]()
-    for sweep in sweeps:
-        points = read_points(scene, sweep)
-        intensity = points.intensity.astype(np.float64)
-        owner, owned = separate(SweepShots(sweep.time_s, sweep.world_from_lidar, points, ()), tracks, FusionRules())
-        still = owner == STATIC
-        world = geometry.transform_points(sweep.world_from_lidar, points.xyz[still].astype(np.float64))
-        place = sweep.world_from_lidar[:3, 3]
-        parts.setdefault(WORLD, []).append((world, np.broadcast_to(place, world.shape), intensity[still]))
-        for number, xyz in owned.items():
-            pose = tracks[number].pose_at(sweep.time_s)
-            if pose is not None:
-                seen_from = np.broadcast_to(geometry.transform_points(geometry.invert(pose), place[None]), xyz.shape)
-                own = (xyz.astype(np.float64), seen_from, intensity[owner == number])
-                parts.setdefault(tracks[number].id, []).append(own)
-    return {name: Returns.of(own) for name, own in parts.items()}
+def returns_of(scene: Scene, sweep: Sweep, silent: Beams | None = None) -> dict[str, Returns]:
+    """Returns of a sweep by what they belong to: ``WORLD`` in the world, moving tracks each in the frame of its box.
+
+    Args:
+        silent: the sweep's beams (``with_silent``). Those without a return stand, without intensity, as far away as
+            the return nearest in angle.
+    """
+    points, tracks, place = read_points(scene, sweep), moving_tracks(scene), sweep.world_from_lidar[:3, 3]
+    xyz, dt_s, intensity = points.xyz, points.dt_s, points.intensity
+    if silent is not None and not silent.returned.all():
+        ends, times = _silent_ends(sweep, silent)
+        xyz, dt_s = np.concatenate([xyz, ends]), np.concatenate([dt_s, times])
+        intensity = np.concatenate([intensity, np.full(len(ends), np.nan, np.float32)])
+    shots = SweepShots(sweep.time_s, sweep.world_from_lidar, SweepPoints(xyz, intensity, dt_s), ())
+    owner, owned = separate(shots, tracks, FusionRules())
+    still = owner == STATIC
+    parts = {
+        WORLD: Returns(
+            geometry.transform_points(sweep.world_from_lidar, xyz[still].astype(np.float64)), place, intensity[still]
+        )
+    }
+    for number, own in owned.items():
+        pose = tracks[number].pose_at(sweep.time_s)
+        if pose is not None:
+            seen_from = geometry.transform_points(geometry.invert(pose), place[None])[0]
+            parts[tracks[number].id] = Returns(own.astype(np.float64), seen_from, intensity[owner == number])
+    return parts
+
+
+def _silent_ends(sweep: Sweep, beams: Beams) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Where beams without a return may have ended, f32[n, 3] in the sweep's frame, and when, f32[n]."""
+    heard = beams.returned
+    rows = KDTree(beams.directions[heard]).query(beams.directions[~heard])[1]
+    away = beams.range_m.copy()
+    away[~heard] = beams.range_m[heard][rows]
+    ends = beams.directions * away[:, None]
+    for share, own in beams.parts(MOMENTS):
+        ends[own] = geometry.transform_points(geometry.invert(sweep.world_from_lidar) @ beams.pose(share), ends[own])
+    times = beams.start_s + beams.share * (beams.end_s - beams.start_s) - sweep.time_s
+    return ends[~heard].astype(np.float32), times[~heard].astype(np.float32)
 
 
 def placed(
-    parts: Mapping[str, Returns], poses: Mapping[str, Floats], origin: Floats
+    parts: Sequence[tuple[str, Returns]], poses: Mapping[str, Floats], origin: Floats
 ) -> tuple[Floats, NDArray[np.int64]]:
     """Returns where their objects are, without those that were seen from behind.
 
     Args:
-        parts: by name. poses: world-from-box of the objects; those that are not named are left out. origin: f64[3].
+        parts: with the name of what they belong to. poses: world-from-box of the objects; parts of others are left
+            out. origin: f64[3].
 
     Returns:
         Places f64[N, 3] relative to the origin in the world's axes, and numbers i64[N] among all returns of ``parts``.
     """
-    xyz, numbers, first = [], [], 0
-    for name, part in parts.items():
+    xyz, numbers, first = [np.zeros((0, 3))], [np.zeros(0, np.int64)], 0
+    for name, part in parts:
         if name == WORLD or name in poses:
             points, seen_from = part.xyz, part.seen_from
             if name != WORLD:
-                points, seen_from = (geometry.transform_points(poses[name], block) for block in (points, seen_from))
+                points = geometry.transform_points(poses[name], points)
+                seen_from = geometry.transform_points(poses[name], seen_from[None])[0]
             away = points - origin
             shown = ((away * (points - seen_from)).sum(1) > 0) & ((away**2).sum(1) > 0.25)
             xyz.append(away[shown])
             numbers.append(first + np.flatnonzero(shown))
         first += len(part)
-    return (np.concatenate(xyz), np.concatenate(numbers)) if xyz else (np.zeros((0, 3)), np.zeros(0, np.int64))
+    return np.concatenate(xyz), np.concatenate(numbers)

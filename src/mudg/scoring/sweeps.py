@@ -166,8 +166,8 @@ class OtherSweeps:
         return {"nearest": self._answer(near[:1], beams, 1), "fused": self._answer(near[:FUSED], beams, CANDIDATES)}
 
     def _answer(self, sweeps: Sequence[Sweep], beams: Beams, candidates: int) -> Measured:
-        parts = returns_of(self._scene, sweeps)
-        intensity = np.concatenate([*(part.intensity for part in parts.values()), np.zeros(0)])
+        parts = [own for sweep in sweeps for own in returns_of(self._scene, sweep).items()]
+        intensity = np.concatenate([*(part.intensity for _, part in parts), np.zeros(0)])
         found = Measured(np.full(len(beams), np.nan), np.full(len(beams), np.nan))
         for share, own in beams.parts(SLICES):
             pose, poses = beams.pose(share), {}

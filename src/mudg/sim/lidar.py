@@ -230,22 +230,22 @@ def _meet(
     measured."""
     poses = session.poses(moment)
     poses = known.poses(moment.time_s, poses) if moment.objects is None else poses
-    met = known.meet(beams, moment.world_from_sensor, poses)
-    names, parts = sorted(session.sizes_m()), list(known.parts)
-    bare = np.array([False, *(name not in known.parts for name in names)])
+    met = known.meet(beams, moment.world_from_sensor, moment.time_s, poses)
+    names = sorted(session.sizes_m())
+    bare = np.array([False, *(name not in known.names for name in names)])
     with np.errstate(invalid="ignore"):
         before = bare[hits.instances[own]] & ~(hits.distance[own] >= met.range_m)
     seen = np.isfinite(met.range_m) & ~before
-    chosen, row = own[seen], met.rows[np.arange(len(own)), met.weights.argmax(1)][seen]
+    chosen = own[seen]
     hits.distance[chosen], hits.facing[chosen] = met.range_m[seen], met.facing[seen]
-    hits.intensity[chosen] = met.mean(known.column("intensity"))[seen].clip(0, 1)
-    hits.lost[chosen] = ~known.returns(met)[seen]
-    number = np.array([1 + names.index(name) if name in names else 0 for name in parts], np.uint16)
-    hits.instances[chosen] = number[known.owners()[row]]
+    hits.intensity[chosen] = met.intensity[seen].clip(0, 1)
+    hits.lost[chosen] = ~known.returns(beams, met)[seen]
+    number = np.array([1 + names.index(name) if name in names else 0 for name in known.names], np.uint16)
+    hits.instances[chosen] = number[met.nearest[seen]]
     other = own[np.isfinite(hits.distance[own]) & ~seen & (hits.instances[own] == 0)]
     ends = beams[np.searchsorted(own, other)] * hits.distance[other][:, None]
     places = geometry.transform_points(moment.world_from_sensor, ends)
-    hits.distance[other[known.contradicts(places, moment.world_from_sensor, poses)]] = np.nan
+    hits.distance[other[known.contradicts(places, moment.world_from_sensor, moment.time_s, poses)]] = np.nan
 
 
 def _carried(points: NDArray[np.float32], share: Floats, start: Instant, end: Instant) -> NDArray[np.float32]:

@@ -10,7 +10,7 @@ whose returns are not in the cloud. Where the log measured nothing, the Gaussian
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -19,13 +19,21 @@ from scipy.spatial import KDTree
 
 from mudg.base import geometry, log
 from mudg.base.errors import UsageError
-from mudg.base.types import Scene, Sweep, Track
+from mudg.base.types import Scene, Sweep
 from mudg.core.returns import Met, Returns, first_surface
-from mudg.scene.beams import WORLD, beams_of, moving_tracks, placed, returns_of, training_sweeps, with_silent
+from mudg.core.rows import Rows
+from mudg.scene.beams import WORLD, Beams, beams_of, moving_tracks, placed, returns_of, training_sweeps, with_silent
 
 Floats = NDArray[np.float64]
-MOST_SILENT: Final = 4
-"""Sweeps of which the lost beams are followed, evenly chosen."""
+Gone = Callable[[Floats], NDArray[np.bool_]]
+Trusted = tuple[int, Sweep, float]
+MOST_LOOKS: Final = 8
+"""Sweeps that tell where the sensor looks and where it is blind."""
+NEAREST: Final = 8
+"""Sweeps that beams meet at once."""
+HALF: Final = 0.7
+AGE_M_S: Final = 1.0
+FEW: Final = 0.2
 MOST_TESTED: Final = 2
 """Sweeps that the regression learns from."""
 SECTORS: Final = 8
@@ -68,97 +76,209 @@ class FieldOfView:
         return level & self.azimuths[self._degree(directions)]
 
 
+class Blind:
+    """Where a sensor loses beams whatever is there, as behind the vehicle's own body: log-odds by direction, f64[72, 90]
+    of 5 degrees of azimuth and 2 of elevation."""
+
+    def __init__(self, odds: Floats) -> None:
+        self._odds = odds
+
+    @classmethod
+    def of(cls, sweeps: Sequence[Beams]) -> Blind:
+        """Of beams of many sweeps."""
+        counts = np.zeros((2, 72 * 90))
+        for beams in sweeps:
+            for kind, own in enumerate((beams.returned, ~beams.returned)):
+                counts[kind] += np.bincount(cls._cell(beams.directions[own]), minlength=72 * 90)
+        return cls(np.log((counts[1] + 1) / (counts[0] + 1)))
+
+    @staticmethod
+    def _cell(directions: Floats) -> NDArray[np.int64]:
+        azimuth = np.degrees(np.arctan2(directions[:, 1], directions[:, 0])) / 5
+        elevation = np.degrees(np.arcsin(directions[:, 2].clip(-1, 1))) / 2
+        return np.floor(azimuth + 36).astype(np.int64).clip(0, 71) * 90 + np.floor(elevation + 45).astype(
+            np.int64
+        ).clip(0, 89)
+
+    def of_directions(self, directions: Floats) -> Floats:
+        """Log-odds f64[N] of directions f64[N, 3]."""
+        return self._odds[self._cell(directions)]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
+class SweepReturns:
+    """What a sweep measured: its beams, and returns and lost beams by what they belong to."""
+
+    beams: Beams
+    parts: Mapping[str, Returns]
+
+
 class LogReturns:
-    """Returns of a log.
+    """What the sweeps of a log's sensor tell. They are read when they are asked for.
 
     Args:
-        parts: by object, and ``WORLD``. tracks: of the objects. weights: of the regression (``features``); None: too
-            little to learn from, and a beam returns where it meets something.
-        stations: world-from-sensor f64[S, 4, 4] of the sweeps. field: of the sensor.
+        scene: the log. sweeps: those that may be learnt from. gone: which places f64[N, 3] of the world an edit took
+            away.
     """
 
-    parts: Mapping[str, Returns]
-    tracks: Mapping[str, Track]
-    weights: Floats | None
-    stations: Floats
-    field: FieldOfView
+    def __init__(self, scene: Scene, sweeps: Sequence[Sweep], gone: Gone | None = None) -> None:
+        self._scene, self.sweeps, self._gone = scene, tuple(sweeps), gone
+        self._tracks = {track.id: track for track in moving_tracks(scene)}
+        self._read: dict[str, SweepReturns] = {}
+        self._rows: Rows | None = None
+        self.names = (WORLD, *self._tracks)
+        self.weights: Floats | None = None
+        self.tested = _evenly(self.sweeps[1:-1], MOST_TESTED) if len(self.sweeps) >= 4 else ()
+        others = [sweep for sweep in self.sweeps if sweep not in self.tested]
+        own = [self.of(sweep).beams for sweep in _evenly(others, MOST_LOOKS)]
+        looks = np.concatenate([beams.directions[beams.returned] for beams in own])
+        self.field = FieldOfView.of(looks)
+        self.blind = Blind.of(own)
+
+    def of(self, sweep: Sweep) -> SweepReturns:
+        """What one sweep measured."""
+        if sweep.id not in self._read:
+            heard = beams_of(self._scene, sweep)
+            self._rows = self._rows or Rows.of(heard.directions * heard.range_m[:, None])
+            beams = with_silent(heard, self._rows)
+            parts = returns_of(self._scene, sweep, beams)
+            if self._gone is not None:
+                parts[WORLD] = parts[WORLD].taken(~self._gone(parts[WORLD].xyz))
+            self._read[sweep.id] = SweepReturns(beams, parts)
+        return self._read[sweep.id]
 
     def poses(self, time_s: float, known: Mapping[str, Floats]) -> dict[str, Floats]:
         """Poses of all objects at a time: those that are known, else those of the tracks."""
-        found = {name: track.pose_at(time_s) for name, track in self.tracks.items()}
+        found = {name: track.pose_at(time_s) for name, track in self._tracks.items()}
         return {name: pose for name, pose in found.items() if pose is not None} | dict(known)
 
-    def meet(self, directions: Floats, world_from_sensor: Floats, poses: Mapping[str, Floats]) -> Met:
-        """What beams f64[B, 3] of the sensor meet; ``rows`` number all returns of ``parts``."""
-        xyz, numbers = placed(self.parts, poses, world_from_sensor[:3, 3])
+    def meet(
+        self,
+        directions: Floats,
+        world_from_sensor: Floats,
+        time_s: float,
+        poses: Mapping[str, Floats],
+        without: str = "",
+    ) -> Met:
+        """What beams f64[B, 3] of the sensor meet in the nearest sweeps; where those measured nothing, in others.
+        ``nearest`` of the answer numbers ``names``; -1: nothing.
+
+        Args:
+            without: id of a sweep that is left out.
+        """
+        near, far = self._chosen(world_from_sensor, time_s, poses, without)
+        met = self._meet(near, directions, world_from_sensor, poses)
+        own = np.flatnonzero(np.isnan(met.range_m))
+        if len(own) and far:
+            other = self._meet(far, directions[own], world_from_sensor, poses)
+            other.lost[:] += met.lost[own]
+            met.put(own, other)
+        return met
+
+    def _chosen(
+        self, world_from_sensor: Floats, time_s: float, poses: Mapping[str, Floats], without: str
+    ) -> tuple[list[Trusted], list[Trusted]]:
+        """Per part of the world the sweeps that were taken nearest to the sensor's place and time, and others, evenly
+        chosen, each with its trust."""
+        near, far = list[Trusted](), list[Trusted]()
+        sweeps = [sweep for sweep in self.sweeps if sweep.id != without]
+        for number, name in enumerate(self.names):
+            if name != WORLD and name not in poses:
+                continue
+            here = poses.get(name, np.eye(4))
+            place = geometry.invert(here) @ world_from_sensor[:, 3] if name else world_from_sensor[:, 3]
+            apart = []
+            for sweep in sweeps:
+                there = np.eye(4) if name == WORLD else self._tracks[name].pose_at(sweep.time_s)
+                if there is not None:
+                    away = geometry.invert(there) @ sweep.world_from_lidar[:, 3] - place
+                    apart.append(
+                        (float(np.linalg.norm(away[:3])) + AGE_M_S * abs(sweep.time_s - time_s), len(apart), sweep)
+                    )
+            order = [sweep for _, _, sweep in sorted(apart)]
+            rest = order[NEAREST:]
+            near += [(number, sweep, HALF ** (k / 2)) for k, sweep in enumerate(order[:NEAREST])]
+            far += [(number, sweep, 1.0) for sweep in _evenly(rest, NEAREST)]
+        return near, far
+
+    def _meet(
+        self, chosen: Sequence[Trusted], directions: Floats, world_from_sensor: Floats, poses: Mapping[str, Floats]
+    ) -> Met:
+        """What beams meet in parts of sweeps."""
+        found, empty = Met.nothing(len(directions)), Returns(np.zeros((0, 3)), np.zeros(3), np.zeros(0, np.float32))
+        parts = [
+            (self.names[number], self.of(sweep).parts.get(self.names[number], empty)) for number, sweep, _ in chosen
+        ]
+        if not parts:
+            return found
+        sizes = [len(part) for _, part in parts]
+        owner, trust = (
+            np.repeat(column, sizes) for column in ([number for number, _, _ in chosen], [t for _, _, t in chosen])
+        )
+        intensity = np.concatenate([part.intensity for _, part in parts])
+        xyz, numbers = placed(parts, poses, world_from_sensor[:3, 3])
         turn = world_from_sensor[:3, :3]
         local = np.stack([xyz[:, 0] * a + xyz[:, 1] * b + xyz[:, 2] * c for a, b, c in turn.T], 1)  # faster than @
-        found, aside = (
-            Met.nothing(len(directions)),
-            np.hypot(local[:, 0], local[:, 1]) * np.cos(np.pi / SECTORS + MARGIN_RAD),
-        )
+        aside = np.hypot(local[:, 0], local[:, 1]) * np.cos(np.pi / SECTORS + MARGIN_RAD)
         around = np.arctan2(directions[:, 1], directions[:, 0]) / (2 * np.pi) + 0.5
         sector = np.floor(around * SECTORS).astype(np.int64).clip(0, SECTORS - 1)
         for k in np.unique(sector):
             own, middle = np.flatnonzero(sector == k), (k + 0.5) / SECTORS * 2 * np.pi - np.pi
             near = np.flatnonzero(np.cos(middle) * local[:, 0] + np.sin(middle) * local[:, 1] >= aside)
-            part = first_surface(directions[own], local[near])
-            if len(near):
-                part.rows[:] = numbers[near[part.rows]]
+            rows = numbers[near]
+            part = first_surface(directions[own], local[near], intensity[rows], trust[rows])
+            part.nearest[:] = np.where(part.nearest >= 0, np.append(owner[rows], -1)[part.nearest], -1)
             found.put(own, part)
         return found
 
-    def column(self, name: str) -> Floats:
-        """A column of all returns: ``intensity``, ``loss``, ``count``."""
-        return np.concatenate([getattr(part, name) for part in self.parts.values()])
-
-    def owners(self) -> NDArray[np.int64]:
-        """Number of its part in ``parts``, of all returns."""
-        return np.repeat(np.arange(len(self.parts)), [len(part) for part in self.parts.values()])
-
-    def features(self, met: Met) -> Floats:
-        """What decides whether a beam returns, f64[B, 7]: 1, log-odds of the loss, range / 100 m, incidence, how far
-        the nearest return is for the spacing, the spacing (log, units of 0.2 degrees), one-sidedness."""
-        loss = met.mean(self.column("loss")).clip(0.01, 0.99)
+    def features(self, directions: Floats, met: Met) -> Floats:
+        """What decides whether a beam returns, f64[B, 8]: 1, log-odds of the loss around, and of that in this direction
+        of the sensor, range / 100 m, incidence, how far the nearest return is for the spacing, the spacing (log, units
+        of 0.2 degrees), one-sidedness."""
+        loss = np.log((met.lost + FEW) / (met.heard + FEW))
         with np.errstate(invalid="ignore", divide="ignore"):
             near = np.where(np.isfinite(met.spacing_rad), met.nearest_rad / met.spacing_rad, 1.0)
             spacing = np.log(np.where(np.isfinite(met.spacing_rad), met.spacing_rad, 0.01) / np.radians(0.2))
-        columns = (np.log(loss / (1 - loss)), met.range_m / 100, met.facing, near, spacing, met.one_sided)
+        columns = (
+            loss,
+            self.blind.of_directions(directions),
+            met.range_m / 100,
+            met.facing,
+            near,
+            spacing,
+            met.one_sided,
+        )
         return np.nan_to_num(np.stack([np.ones(len(loss)), *columns], 1))
 
-    def returns(self, met: Met) -> NDArray[np.bool_]:
+    def returns(self, directions: Floats, met: Met) -> NDArray[np.bool_]:
         """Which beams return."""
         seen = np.isfinite(met.range_m)
-        return seen if self.weights is None else seen & (self.features(met) @ self.weights > 0)
+        return seen if self.weights is None else seen & (self.features(directions, met) @ self.weights > 0)
 
-    def contradicts(self, places: Floats, world_from_sensor: Floats, poses: Mapping[str, Floats]) -> NDArray[np.bool_]:
+    def contradicts(
+        self, places: Floats, world_from_sensor: Floats, time_s: float, poses: Mapping[str, Floats]
+    ) -> NDArray[np.bool_]:
         """Which surfaces at places f64[N, 3] in the world cannot be there: the recorded sensor nearest to the simulated
         one had them in its field and met nothing before them."""
         if not len(places):
             return np.zeros(0, bool)
-        apart = np.linalg.norm(self.stations[:, :3, 3] - world_from_sensor[:3, 3], axis=1)
-        station = self.stations[apart.argmin()]
+        stations = np.stack([sweep.world_from_lidar for sweep in self.sweeps])
+        apart = np.linalg.norm(stations[:, :3, 3] - world_from_sensor[:3, 3], axis=1)
+        station = stations[apart.argmin()]
         local = geometry.transform_points(geometry.invert(station), places)
         away = np.maximum(np.linalg.norm(local, axis=1), 1e-6)
-        met = self.meet(local / away[:, None], station, poses)
+        met = self.meet(local / away[:, None], station, time_s, poses)
         hidden = np.isfinite(met.range_m) & (met.range_m < HIDDEN_SHARE * away)
         return ~hidden & self.field.holds(local / away[:, None])
 
-    def without(self, gone: Callable[[Floats], NDArray[np.bool_]]) -> LogReturns:
-        """Without those returns of the world at places f64[N, 3] that are gone."""
-        if WORLD not in self.parts:
-            return self
-        kept = self.parts[WORLD].taken(~gone(self.parts[WORLD].xyz))
-        return replace(self, parts={**self.parts, WORLD: kept})
 
-
-def learn_returns(scene: Scene, sensor: str = "") -> LogReturns | None:
+def learn_returns(scene: Scene, sensor: str = "", gone: Gone | None = None) -> LogReturns | None:
     """What the sweeps of a log's sensor tell, those of held-out frames left out; None without sweeps. The same log
     gives the same numbers.
 
     Args:
         sensor: empty: the log's first. Others lie centimetres beside it, and their intensity means something else.
+        gone: which places f64[N, 3] of the world an edit took away.
 
     Raises:
         UsageError: the log has no such sensor.
@@ -170,20 +290,10 @@ def learn_returns(scene: Scene, sensor: str = "") -> LogReturns | None:
     if not sweeps:
         return None
     log.info(f"LiDAR: surfaces, intensity and lost beams from {len(sweeps)} sweeps of {sweeps[0].sensor}")
-    tracks = {track.id: track for track in moving_tracks(scene)}
-    looks = np.concatenate([beams_of(scene, sweep).directions for sweep in _evenly(sweeps, MOST_SILENT)])
-    own = (tracks, None, np.stack([sweep.world_from_lidar for sweep in sweeps]), FieldOfView.of(looks))
-    tested = _evenly(sweeps[1:-1], MOST_TESTED) if len(sweeps) >= 4 else ()
-    weights = None
-    if tested:
-        rest = tuple(sweep for sweep in sweeps if sweep not in tested)
-        trial = _with_losses(scene, rest, LogReturns(_averaged(scene, rest), *own))
-        weights = _regression(*_samples(scene, tested, trial))
-    return replace(_with_losses(scene, sweeps, LogReturns(_averaged(scene, sweeps), *own)), weights=weights)
-
-
-def _averaged(scene: Scene, sweeps: Sequence[Sweep]) -> dict[str, Returns]:
-    return {name: part.averaged() for name, part in returns_of(scene, sweeps).items()}
+    returns = LogReturns(scene, sweeps, gone)
+    if returns.tested:
+        returns.weights = _regression(*_samples(returns.tested, returns))
+    return returns
 
 
 def _evenly(sweeps: Sequence[Sweep], most: int) -> tuple[Sweep, ...]:
@@ -191,39 +301,16 @@ def _evenly(sweeps: Sequence[Sweep], most: int) -> tuple[Sweep, ...]:
     return tuple(sweeps[k] for k in at)
 
 
-def _with_losses(scene: Scene, sweeps: Sequence[Sweep], returns: LogReturns) -> LogReturns:
-    """The same with ``Returns.missed``: every beam of some of these sweeps that was lost counts, by weight, at the
-    returns that it met. Returns that more beams went through than met are traces of what moved; they are left out."""
-    chosen = _evenly(sweeps, MOST_SILENT)
-    sizes = [len(part) for part in returns.parts.values()]
-    missed, met_here, gone_through = (np.zeros(sum(sizes)) for _ in range(3))
-    for sweep in chosen:
-        beams = with_silent(beams_of(scene, sweep))
-        for share, own in beams.parts(SECTORS):
-            met = returns.meet(beams.directions[own], beams.pose(share), returns.poses(beams.time_s(share), {}))
-            away, surface = beams.range_m[own], met.range_m
-            with np.errstate(invalid="ignore"):
-                kinds = (np.isnan(away), away <= 1.05 * surface + THROUGH_M, away > 1.05 * surface + THROUGH_M)
-            for sums, kind in zip((missed, met_here, gone_through), kinds, strict=True):
-                sums += np.bincount(met.rows[kind].reshape(-1), met.weights[kind].reshape(-1), len(sums))
-    missed *= len(sweeps) / max(1, len(chosen))
-    parts, first = {}, 0
-    for name, part in returns.parts.items():
-        own = slice(first, first + len(part))
-        parts[name] = part.with_missed(missed[own]).taken(gone_through[own] <= met_here[own] + UNDECIDED)
-        first += len(part)
-    return replace(returns, parts=parts)
-
-
-def _samples(scene: Scene, sweeps: Sequence[Sweep], returns: LogReturns) -> tuple[Floats, NDArray[np.bool_]]:
-    """Features of the beams of sweeps that are not in the cloud, and which returned."""
-    rows, answers = [np.zeros((0, 7))], [np.zeros(0, bool)]
+def _samples(sweeps: Sequence[Sweep], returns: LogReturns) -> tuple[Floats, NDArray[np.bool_]]:
+    """Features of the beams of sweeps, met in the others, and which returned."""
+    rows, answers = list[Floats](), list[NDArray[np.bool_]]()
     for sweep in sweeps:
-        beams = with_silent(beams_of(scene, sweep))
+        beams = returns.of(sweep).beams
         for share, own in beams.parts(SECTORS):
-            met = returns.meet(beams.directions[own], beams.pose(share), returns.poses(beams.time_s(share), {}))
+            time_s = beams.time_s(share)
+            met = returns.meet(beams.directions[own], beams.pose(share), time_s, returns.poses(time_s, {}), sweep.id)
             seen = np.isfinite(met.range_m)
-            rows.append(returns.features(met)[seen])
+            rows.append(returns.features(beams.directions[own], met)[seen])
             answers.append(beams.returned[own][seen])
     return np.concatenate(rows), np.concatenate(answers)
 
@@ -242,7 +329,7 @@ def _regression(features: Floats, answers: NDArray[np.bool_]) -> Floats | None:
     return weights
 
 
-def places_gone(before: Floats, after: Floats) -> Callable[[Floats], NDArray[np.bool_]] | None:
+def places_gone(before: Floats, after: Floats) -> Gone | None:
     """Which places f64[N, 3] belong to what an edit took out of the background; None: it took nothing.
 
     Args:

@@ -270,8 +270,7 @@ class Session:
             UsageError: the log has no such LiDAR.
         """
         if sensor not in self._returns and self.scene is not None and self.scene.sweeps:
-            found = learn_returns(self.scene, sensor)
-            self._returns[sensor] = found if found is None or self._gone is None else found.without(self._gone)
+            self._returns[sensor] = learn_returns(self.scene, sensor, self._gone)
         return self._returns.get(sensor)
 
     def render(self, requests: Iterable[SensorRequest[Reply]]) -> list[Reply]:
