@@ -19,12 +19,13 @@ from mudg.city.config import CityConfig
 from mudg.city.logs import write_city
 from mudg.city.sensors import lidar_elevations
 from mudg.city.world import CityWorld
-from mudg.core.returns import Returns, first_surface
+from mudg.core.returns import Met, first_surface
+from mudg.core.rows import peaks
 from mudg.core.table import Table
 from mudg.editing.settings import RenderConfig
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import StaticNode
-from mudg.scene.beams import beams_of, held_out, moving_tracks, row_elevations, training_sweeps, with_silent
+from mudg.scene.beams import beams_of, held_out, moving_tracks, training_sweeps, with_silent
 from mudg.scene.sweep_sets import read_sweep_sets
 from mudg.scoring import sweeps as scores
 from mudg.sim.lidar import BeamTable, LidarRequest
@@ -77,13 +78,21 @@ def down(angles_deg: np.ndarray) -> np.ndarray:
 # -- surfaces --------------------------------------------------------------------------------------
 
 
+def meet(beams: np.ndarray, xyz: np.ndarray, lost: np.ndarray | None = None) -> Met:
+    """What beams meet among returns that count alike. ``lost``: where beams were lost."""
+    light = np.full(len(xyz), 0.5)
+    if lost is not None:
+        xyz, light = np.concatenate([xyz, lost]), np.concatenate([light, np.full(len(lost), np.nan)])
+    return first_surface(beams, xyz, light, np.ones(len(xyz)))
+
+
 def test_beams_that_graze_the_ground_meet_its_plane() -> None:
     beams = down(np.linspace(3.2, 11, 60))
-    met = first_surface(beams, ground())
+    met = meet(beams, ground())
     exact = 1.9 / -beams[:, 2]
     np.testing.assert_allclose(met.range_m, exact, rtol=1e-3)
     np.testing.assert_allclose(met.facing, -beams[:, 2], atol=0.01)
-    noisy = first_surface(beams, ground(noise_m=0.02))
+    noisy = meet(beams, ground(noise_m=0.02))
     error = (noisy.range_m - exact) * -beams[:, 2]  # along the normal
     assert np.abs(np.median(error)) < 0.006 and np.abs(error).mean() < 0.016  # no surface in front of the surface
 
@@ -96,7 +105,7 @@ def test_what_stands_before_another_surface_is_met_and_its_gap_is_not() -> None:
     side = np.linspace(-2.5, 2.5, 41)
     beams = np.stack([np.full(41, 8.0), side, 0.2 + 0 * side], 1)
     beams /= np.linalg.norm(beams, axis=1, keepdims=True)
-    met = first_surface(beams, np.concatenate([near, far]))
+    met = meet(beams, np.concatenate([near, far]))
     depth = met.range_m * beams[:, 0]
     clear = np.abs(np.abs(side) - 1) > 0.06
     np.testing.assert_allclose(depth[clear], np.where(np.abs(side) > 1, 8, 20)[clear], rtol=5e-3)
@@ -106,19 +115,23 @@ def test_what_stands_before_another_surface_is_met_and_its_gap_is_not() -> None:
 def test_beams_beside_a_surface_have_it_on_one_side() -> None:
     wall = np.stack(np.meshgrid([10.0], np.arange(-2, 2, 0.05), np.arange(-2, 2, 0.05)), -1).reshape(-1, 3)
     beams = np.array([[10, 0.0, 0.0], [10, 2.05, 0.0], [10, 5.0, 0.0], [-10, 0.0, 0.0]])
-    met = first_surface(beams / np.linalg.norm(beams, axis=1, keepdims=True), wall)
+    met = meet(beams / np.linalg.norm(beams, axis=1, keepdims=True), wall)
     assert met.one_sided[0] < 0.35 and met.one_sided[1] > 0.8 and met.nearest_rad[1] > 0.5 * met.spacing_rad[1]
-    assert np.isnan(met.range_m[2:]).all() and (met.weights[2:] == 0).all()
+    assert np.isnan(met.range_m[2:]).all() and (met.heard[2:] == 0).all()
 
 
-def test_averaging_keeps_counts_and_means() -> None:
-    g = np.random.default_rng(2)
-    xyz, light = g.uniform(-3, 3, (4000, 3)), g.uniform(size=4000)
-    whole = Returns.of([(xyz, np.zeros_like(xyz), light)]).with_missed(np.full(4000, 2.0))
-    thin = whole.averaged()
-    assert len(thin) < len(whole) and thin.count.sum() == 4000 and thin.missed.sum() == pytest.approx(8000)
-    np.testing.assert_allclose((thin.xyz * thin.count[:, None]).sum(0), xyz.sum(0))
-    assert (thin.intensity * thin.count).sum() == pytest.approx(light.sum())
+def test_lost_beams_count_where_they_were_lost_and_not_behind_a_surface() -> None:
+    y, z = (axis.reshape(-1) for axis in np.meshgrid(np.arange(-3, 3, 0.05), np.arange(-1, 1, 0.05)))
+    wall = np.stack([np.full(len(y), 10.0), y, z], 1)
+    beams = np.array([[10.0, -1.5, 0.0], [10.0, 1.5, 0.0]])
+    beams /= np.linalg.norm(beams, axis=1, keepdims=True)
+    left = wall[y > 0]
+    beside = meet(beams, wall[y < 0], left)
+    assert beside.heard[0] > 1 and beside.lost[0] == 0.0
+    assert beside.lost[1] > 1 and np.isnan(beside.range_m[1])
+    half = meet(beams, wall, left)  # as many lost as heard on the left
+    assert half.lost[1] == pytest.approx(half.heard[1], rel=0.3) and half.lost[0] == 0.0
+    assert meet(beams, wall, 2 * left).lost[1] == 0.0  # lost behind the wall: the wall knows nothing of it
 
 
 # -- recorded beams --------------------------------------------------------------------------------
@@ -130,7 +143,7 @@ def test_beams_are_those_that_the_city_fired(city: Scene, world: CityWorld) -> N
     elevation = np.arcsin(beams.directions[:, 2])
     rows = lidar_elevations(CITY)
     assert np.quantile(np.abs(elevation[:, None] - rows).min(1), 0.99) < np.radians(0.05)
-    np.testing.assert_allclose(np.radians(row_elevations(np.degrees(elevation))), rows, atol=np.radians(0.03))
+    np.testing.assert_allclose(np.radians(peaks(np.degrees(elevation))), rows, atol=np.radians(0.03))
     full = with_silent(beams)
     assert 0.95 < len(full) / (32 * 720) <= 1.0 and not full.returned[len(beams) :].any()
     np.testing.assert_array_equal(full.range_m[: len(beams)], beams.range_m)
@@ -161,10 +174,12 @@ def test_learning_does_not_read_held_out_sweeps(city: Scene, tmp_path: Path) -> 
     gone = held_out(city)
     without = replace(city, sweeps=tuple(sweep for sweep in city.sweeps if sweep.id not in gone), split={})
     one, other = learn_returns(city), learn_returns(without)
+    assert not gone & {sweep.id for sweep in one.sweeps}
     assert one.weights.tobytes() == other.weights.tobytes()
-    for name, part in one.parts.items():
-        assert part.xyz.tobytes() == other.parts[name].xyz.tobytes()
-        assert part.missed.tobytes() == other.parts[name].missed.tobytes()
+    beams = beams_of(city, city.sweeps[4])
+    asked = beams.directions[::50], beams.start, beams.start_s, one.poses(beams.start_s)
+    for name in ("range_m", "lost", "intensity"):
+        assert getattr(one.meet(*asked), name).tobytes() == getattr(other.meet(*asked), name).tobytes()
 
 
 # -- sweeps ----------------------------------------------------------------------------------------
@@ -215,15 +230,15 @@ def test_equal_requests_on_a_log_get_equal_bytes_and_objects_move_with_the_calle
 
 def test_a_surface_that_the_log_looked_through_is_no_answer(city: Scene) -> None:
     found = learn_returns(city)
-    station = found.stations[2]
+    station, time_s = city.sweeps[2].world_from_lidar, city.sweeps[2].time_s
     beams = beams_of(city, city.sweeps[2])
     far = np.flatnonzero(beams.range_m > 15)[::40]
     at = lambda share: geometry.transform_points(station, beams.directions[far] * (share * beams.range_m[far])[:, None])
-    poses = found.poses(city.sweeps[2].time_s, {})
-    assert found.contradicts(at(0.5), station, poses).mean() > 0.95  # seen through
-    assert found.contradicts(at(1.5), station, poses).mean() < 0.1  # hidden: nobody knows
+    poses = found.poses(time_s)
+    assert found.contradicts(at(0.5), station, time_s, poses).mean() > 0.95  # seen through
+    assert found.contradicts(at(1.5), station, time_s, poses).mean() < 0.1  # hidden: nobody knows
     above = geometry.transform_points(station, np.array([[1.0, 0.0, 30.0]]))
-    assert not found.contradicts(above, station, poses).any()  # out of its field
+    assert not found.contradicts(above, station, time_s, poses).any()  # out of its field
 
 
 def test_returns_of_what_an_edit_took_away_go_with_it() -> None:

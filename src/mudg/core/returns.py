@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 Floats = NDArray[np.float64]
-NEIGHBOURS: Final = 8
+NEIGHBOURS: Final = 12
 REACH_RAD: Final = float(np.radians(0.8))
 """Returns farther from a beam than this do not tell what it meets."""
 ONE_PLANE: Final = 0.02
@@ -106,7 +106,7 @@ def first_surface(beams: Floats, xyz: Floats, intensity: Floats, trust: Floats) 
 
 def _lost(beams: Floats, xyz: Floats, trust: Floats, met: Met) -> Floats:
     """Lost beams around beams f64[B], each counted by its angle for the spacing of the returns."""
-    away = np.linalg.norm(xyz, axis=1)
+    away = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))  # faster than norm
     count = min(NEIGHBOURS, len(xyz))
     query = KDTree(xyz / away[:, None], balanced_tree=False, compact_nodes=False).query
     gaps, rows = (
@@ -126,7 +126,7 @@ def _surface(beams: Floats, xyz: Floats, intensity: Floats, trust: Floats) -> Me
     found = Met.nothing(len(beams))
     if len(xyz) < NEIGHBOURS or not len(beams):
         return found
-    away = np.linalg.norm(xyz, axis=1)
+    away = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))  # faster than norm
     directions = xyz / away[:, None]
     tree = KDTree(directions, balanced_tree=False, compact_nodes=False)
     gaps, rows = map(np.asarray, tree.query(beams, NEIGHBOURS, distance_upper_bound=REACH_RAD, workers=-1))
@@ -179,7 +179,7 @@ def _in_frames_of(beams: Floats, directions: Floats) -> tuple[Floats, Floats, Fl
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     up = np.cross(beams, right)
     axes = (right, up, beams)
-    x, y, z = ((directions * axis[:, None]).sum(2) for axis in axes)
+    x, y, z = (np.einsum("bki,bi->bk", directions, axis) for axis in axes)
     return x, y, z
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from mudg.base import geometry
-from mudg.base.types import EgoPath, Scene, Sweep, Track
+from mudg.base.types import EgoPath, Scene, Sweep, SweepPoints, Track
 from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, separate
 from mudg.core.returns import Returns
 from mudg.core.rows import Rows
@@ -231,7 +231,8 @@ def placed(
                 points = geometry.transform_points(poses[name], points)
                 seen_from = geometry.transform_points(poses[name], seen_from[None])[0]
             away = points - origin
-            shown = ((away * (points - seen_from)).sum(1) > 0) & ((away**2).sum(1) > 0.25)
+            square = np.einsum("ij,ij->i", away, away)
+            shown = (square > 0.25) & (square > away @ (seen_from - origin))  # towards the sensor of both
             xyz.append(away[shown])
             numbers.append(first + np.flatnonzero(shown))
         first += len(part)

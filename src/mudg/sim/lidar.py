@@ -229,7 +229,7 @@ def _meet(
     """Let beams of a slice meet what the log's sweeps measured, unless they meet an object before it that no sweep
     measured."""
     poses = session.poses(moment)
-    poses = known.poses(moment.time_s, poses) if moment.objects is None else poses
+    poses = known.poses(moment.time_s) | poses if moment.objects is None else poses
     met = known.meet(beams, moment.world_from_sensor, moment.time_s, poses)
     names = sorted(session.sizes_m())
     bare = np.array([False, *(name not in known.names for name in names)])
