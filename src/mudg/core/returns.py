@@ -80,7 +80,8 @@ class Met:
     def nothing(cls, count: int) -> Met:
         """Beams that met nothing."""
         nan, none = (np.full((4, count), value) for value in (np.nan, np.inf))
-        return cls(nan[0], nan[1], none[0], none[1], nan[2], *np.zeros((3, count)), np.full(count, -1))
+        heard, lost, light = np.zeros((3, count))
+        return cls(nan[0], nan[1], none[0], none[1], nan[2], heard, lost, light, np.full(count, -1))
 
     def put(self, own: NDArray[np.int64], part: Met) -> None:
         """Write what some of the beams met."""

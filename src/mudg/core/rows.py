@@ -65,7 +65,8 @@ class Rows:
         above = sums[:, -1:] - sums
         at = int((sums.max(0) + above.max(0)).argmax())
         height = lambda column: float(HEIGHTS_M[column.argmax()])
-        one = cls._with_peaks(xyz, turn, (height(sums[:, -1]),) * 2, 0.0)
+        whole = height(sums[:, -1])
+        one = cls._with_peaks(xyz, turn, (whole, whole), 0.0)
         two = cls._with_peaks(xyz, turn, (height(sums[:, at]), height(above[:, at])), at * BIN_DEG - MOST_DEG)
         found, share = max(one, two, key=lambda pair: pair[1])
         return found if share > ON_ROWS else cls(turn, found.heights_m, 0.0, np.zeros(0))
