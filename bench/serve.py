@@ -106,6 +106,23 @@ def in_session(session: Session) -> None:
         print(f"  {threads} threads  64 beams, 0.2 degrees       {taken:7.1f} ms")  # noqa: T201
 
 
+def footprints(session: Session) -> None:
+    """How large Gaussians are on the picture. A level of detail could merge those below half a pixel."""
+    table, optics = session.model.table, lens(960, 640)
+    means, scales = (table.columns[name].detach().numpy() for name in ("means", "log_scales"))
+    sizes = []
+    for _, pose in poses(session):
+        seen = (means - pose[:3, 3]) @ pose[:3, :3]
+        wide = optics.width / 2 / optics.fx * seen[:, 2] * 1.1
+        inside = (seen[:, 2] > 0.5) & (np.abs(seen[:, 0]) < wide)
+        sizes.append(optics.fx * np.exp(scales[inside].max(1)) / seen[inside, 2])
+    pixels = np.concatenate(sizes)
+    print(  # noqa: T201
+        f"  standard deviation at 960x640: median {np.median(pixels):.1f} px; {np.mean(pixels < 0.5):.2%} below 0.5 px,"
+        f" {np.mean(pixels < 1):.2%} below 1 px; {len(pixels) / len(means) / len(sizes):.0%} before the camera"
+    )
+
+
 def request_of(session: Session, number: int, size: tuple[int, int]) -> bytes:
     """A request on the wire."""
     types, (width, height) = wire.messages(), size
@@ -159,6 +176,7 @@ def main() -> int:
     print(f"{len(session.model.table.labels['node'])} Gaussians")  # noqa: T201
     if given.soak_minutes:
         return soak(session, given.soak_minutes)
+    footprints(session)
     in_session(session)
     for count in given.gaussians:
         with_gaussians(session, count)
