@@ -134,7 +134,7 @@ REFUSED = [
     ("shift", ["--methods", "difix", "--model", "embedded-tiny"], "--methods", "leave difix out"),
     ("shift", ["--synthesize.guidance", "7.5"], "--model", ""),
     ("shift", ["--preset", "paper"], "--model", "convert a checkpoint"),
-    ("shift", ["--synthesize.compiled"], "--compiled", "leave it out"),
+    ("shift", ["--synthesize.memory-budget-gb", "8"], "--memory-budget-gb", "leave it out"),
     ("shift", ["--methods", "pvg", "--fit.poses.learn"], "poses.learn", "leave the setting out"),
 ]
 

@@ -348,9 +348,8 @@ def test_what_a_device_does_not_do_is_said(street, small, tmp_path, monkeypatch)
         with pytest.raises(error, match="--device"):
             Annotate(scene=street / "scene", out=tmp_path / "out", settings=AnnotateConfig(device=device)).run()
     assert not (tmp_path / "out").exists()
-    for name in ("offload", "compiled"):
-        with pytest.raises(UsageError, match="published-type models only"):
-            check_config(SynthesizeConfig(model=str(tmp_path / "model"), **{name: True}), False)
+    with pytest.raises(UsageError, match="published-type models only"):
+        check_config(SynthesizeConfig(model=str(tmp_path / "model"), memory_budget_gb=4), False)
 
 
 def test_processes_take_a_device_each_and_the_number_format_follows_it(monkeypatch):

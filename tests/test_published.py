@@ -519,9 +519,8 @@ def test_short_trajectories_are_refused_in_words(street, tmp_path):
 
 
 @pytest.mark.slow
-def test_full_size_fits_ten_gigabytes():
-    """Counted, not run: see docs/research/published.md for the table."""
-    needs = memory_plan.needs_of(PublishedConfig(), 2)
+def test_full_size_fits_ten_gigabytes(needs):
+    """See docs/research/published.md for the table."""
     assert needs.parameters == pytest.approx(4.41e9, rel=0.01)
     plan, peak_bytes = memory_plan.choose(needs, 10_000_000_000)
     assert peak_bytes <= 10_000_000_000
@@ -531,25 +530,6 @@ def test_full_size_fits_ten_gigabytes():
     assert peak_bytes == needs.parameters + needs.clip + 3 * needs.one_video + memory_plan.RESERVE_BYTES
     roomy, _ = memory_plan.choose(needs, 80_000_000_000)
     assert (roomy.modalities_together, roomy.guidance_together, roomy.frames_at_once) == (True, True, 16)
-
-
-def test_memory_is_counted_right():
-    """A chain whose live set is known, and the proportion to the batch that the plan relies on."""
-    x = torch.empty(1000, device="meta")
-
-    def chain():
-        a = x + 1  # 4000
-        b = a * 2  # 8000
-        del a
-        c = torch.cat([b, b])  # 4000 + 8000
-        return c.view(2, 1000)[0].clone()  # + 4000
-
-    assert memory_plan.peak_activations(chain) == 16000
-    model = memory_plan.meta_model(TINY, torch.float32)
-    one, three = (memory_plan.denoise_bytes(model, 16, 24, n) for n in (1, 3))
-    assert three == pytest.approx(3 * one, rel=0.02)
-    one, three = (memory_plan.autoencoder_bytes(model, 16, 24, n) for n in (1, 3))
-    assert three == pytest.approx(3 * one, rel=0.02)
 
 
 @pytest.mark.slow
@@ -625,37 +605,10 @@ def test_keys_belong_to_their_layers(model):
     )
 
 
-@pytest.mark.slow
-def test_a_compiled_network_makes_the_same(model):
-    """Traced by torch.compile without its code generator, so that no compiler is needed."""
-    request = SampleRequest(2, 3)
-    plain = model.sample(some_condition(), request)
-    other = tiny_model()
-    names = list(other.state_dict())
-    other.net.compile(backend="eager")
-    made = other.sample(some_condition(), request)
-    assert list(other.state_dict()) == names
-    assert torch.allclose(made.rgb, plain.rgb, atol=1e-5) and torch.allclose(made.depth, plain.depth, atol=1e-2)
-    torch._dynamo.reset()
-
-
 @pytest.fixture(scope="module")
-def full():
-    """The full model in bfloat16 on the meta device, and what it needs."""
-    config = PublishedConfig()
-    return memory_plan.meta_model(config, torch.bfloat16), memory_plan.needs_of(config, 2)
-
-
-def test_inputs_that_die_hide_nothing():
-    """A tensor that gets the address of an input that is gone is counted all the same."""
-    inputs = [torch.empty(1, device="meta") for _ in range(64)]
-
-    def work():
-        while inputs:
-            inputs.pop().add(1)
-        return [torch.empty(1024, device="meta") for _ in range(256)]
-
-    assert memory_plan.peak_activations(work) == 256 * 4096
+def needs():
+    """What the published network needs at 576x1024 in bfloat16."""
+    return memory_plan.needs_of(PublishedConfig(), 2)
 
 
 @pytest.mark.parametrize(
@@ -663,29 +616,20 @@ def test_inputs_that_die_hide_nothing():
     [(16, (True, False), 8), (24, (True, True), 16), (40, (True, True), 16), (80, (True, True), 16)],
 )
 @pytest.mark.slow
-def test_what_fits_on_a_card(full, card_gb, together, frames):
-    """At 576x1024; a whole clip, run on the meta device as the plan says, takes no more."""
-    model, needs = full
+def test_what_fits_on_a_card(needs, card_gb, together, frames):
     split, peak_bytes = memory_plan.choose(needs, card_gb * 10**9)
     assert ((split.modalities_together, split.guidance_together), split.frames_at_once) == (together, frames)
     assert not split.offload
     assert peak_bytes <= card_gb * 10**9
-    if card_gb > 24:
-        return  # as with 24
-    counted = needs.parameters + memory_plan.sampling_bytes(model, split) + memory_plan.RESERVE_BYTES
-    assert 0.97 * peak_bytes < counted <= 1.01 * peak_bytes
 
 
 @pytest.mark.slow
-def test_the_tower_goes_where_that_avoids_a_smaller_cut(full):
-    _, needs = full
+def test_the_tower_goes_where_that_avoids_a_smaller_cut(needs):
     assert needs.tower == pytest.approx(1.26e9, rel=0.01)
     split, peak_bytes = memory_plan.choose(needs, 14_000_000_000)
     assert split.offload and split.modalities_together and peak_bytes <= 14_000_000_000
     kept, more = memory_plan.choose(needs, 14_000_000_000, offload=(False,))  # on a CPU
     assert not kept.offload and not kept.modalities_together and more > peak_bytes - needs.tower
-    asked, _ = memory_plan.choose(needs, 80_000_000_000, offload=(True,))
-    assert asked.offload and asked.guidance_together
     _, least = memory_plan.choose(needs, 1)
     assert least == pytest.approx(
         needs.parameters - needs.tower + needs.clip + needs.one_video + memory_plan.RESERVE_BYTES, rel=0.1
@@ -695,7 +639,6 @@ def test_the_tower_goes_where_that_avoids_a_smaller_cut(full):
 def test_settings_of_the_published_kind_alone(tmp_path):
     folder = write_tiny(tmp_path)
     config = SynthesizeConfig(model=str(folder), device="cpu", steps=20)
-    refused("on the CPU already", views.check_config, replace(config, offload=True), False, raises=UsageError)
     checked = views.check_config(config, False)
     assert (checked.processes, checked.device) == (1, "cpu")
     assert views.load_any(checked).split == WorkSplit(frames_at_once=1)

@@ -68,12 +68,6 @@ class SynthesizeConfig:
     memory_budget_gb: float = setting(default=0.0, ge=0)
     """Published-type models: memory in GB; the work is split to fit into it (0 = what is free on a CUDA device;
     elsewhere do not split). The result stays the same."""
-    offload: bool = False
-    """Published-type models: keep the image tower (1.3 GB in bfloat16) on the CPU except while it reads a reference.
-    Done without being asked where a memory budget needs it."""
-    compiled: bool = False
-    """Published-type models: compile the denoising network (torch.compile). The first step then takes minutes, further
-    ones less."""
     seed: int = 0
     """Seed of the noise."""
 

@@ -94,19 +94,11 @@ def check_config(config: SynthesizeConfig, fitted: bool, *, weather: bool = Fals
             got="--fitted: renders are left out of such a condition",
             remedy="leave out --condition or --fitted",
         )
-    if full_size and config.offload and device.type == "cpu":
-        raise UsageError(
-            "the image tower is on the CPU already",
-            where="--offload",
-            got="--device cpu",
-            remedy="leave one of them out",
-        )
     if full_size:
         return replace(config, processes=config.processes or 1)  # one copy of a large model in memory
-    for name in ("memory_budget_gb", "offload", "compiled"):
-        if getattr(config, name):
-            what, flag = "this setting applies to published-type models only", f"--{name.replace('_', '-')}"
-            raise UsageError(what, where=flag, remedy="leave it out")
+    if config.memory_budget_gb:
+        what = "this setting applies to published-type models only"
+        raise UsageError(what, where="--memory-budget-gb", remedy="leave it out")
     model = model_files.load(config.model)  # fails now rather than in every process
     if fitted and not model.config.renders:
         raise UsageError(
@@ -160,7 +152,7 @@ def load_any(config: SynthesizeConfig) -> DiffusionModel:
     half = half_of(config)
     dtype = None if device.type == "cpu" else half or torch.float32
     model = published.load(Path(config.model), dtype=dtype)
-    model.split = WorkSplit(frames_at_once=1, offload=config.offload)
+    model.split = WorkSplit(frames_at_once=1)
     free_gb = torch.cuda.mem_get_info(device)[0] / 1e9 if device.type == "cuda" else 0.0
     budget_gb = config.memory_budget_gb or free_gb  # 0: unknown
     if budget_gb:
@@ -169,8 +161,6 @@ def load_any(config: SynthesizeConfig) -> DiffusionModel:
     if model.split.offload:
         model.image = torch.nn.Identity()
     model.to(device).image = tower
-    if config.compiled:
-        model.net.compile()
     return model
 
 
@@ -180,7 +170,7 @@ def _choose_split(model: PublishedMDM, config: SynthesizeConfig, budget_gb: floa
         memory_plan.needs_of(model.config, bytes_per_value),
         int(budget_gb * 1e9),
         guidance=config.guidance != 1,
-        offload=(False,) if config.device == "cpu" else (True,) if config.offload else (False, True),
+        offload=(False,) if config.device == "cpu" else (False, True),
     )
     if peak_bytes > budget_gb * 1e9:
         raise ResourceError(

@@ -38,7 +38,7 @@ from mudg.labels import street_net
 from mudg.labels.by_geometry import RULES
 from mudg.labels.depth.networks import align_to_lidar, enough_returns, kind_of, load_depth_network
 from mudg.labels.ground import driven_path
-from mudg.labels.inputs import DepthInput, DepthNetwork, DepthOptions, LabelInput, Labels
+from mudg.labels.inputs import DepthInput, DepthNetwork, LabelInput, Labels
 from mudg.labels.labellers import labeller
 from mudg.labels.settings import AnnotateConfig
 from mudg.networks.folders import CPU, Compute, find, title
@@ -411,8 +411,8 @@ def label_into_staging(config: AnnotateConfig, scene: Scene, ids: Sequence[str],
     if not ids:
         return
     label = labeller(config.labeller, config.weights, place(config) if config.labeller != "geometry" else CPU)
-    options = DepthOptions(config.depth_guided, config.depth_steps)
-    network = load_depth_network(config.depth_network, place(config), options) if config.depth_network else None
+    folder = config.depth_network
+    network = load_depth_network(folder, place(config), config.depth_steps) if folder else None
     returns = NearbyReturns(scene, config.sweeps)
     path = driven_path(scene.ego.world_from_ego)
     frames = {frame.id: frame for frame in scene.frames}

@@ -67,7 +67,6 @@ class Synthesize(Output):
     result = "views"
     from_run = ("fused",)
     version, files = 3, below("*", (*OBSERVATION_FILES, "overview.png", "depth_fits.json", "state/"))
-    idle = ("offload", "compiled")
     short = (
         *("model", "cameras", "shifts_m", "paths", "steps", "width_px", "condition", "align_depth", "precision"),
         *("seed", "device", "processes"),
