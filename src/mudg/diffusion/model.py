@@ -100,14 +100,11 @@ class LossSettings:
     class_weights      f32[19], weights of the classes in the cross-entropy; None = all 1
     refined_share      share of each side of the image on which the refiner is trained at a step
     reference_dropout  share of the clips that go without their reference image; the published kind
-    frame_dropout      where the reference is left out, frame 0 of the colour condition goes without it too; the
-                       published kind
     """
 
     class_weights: Tensor | None
     refined_share: float
     reference_dropout: float
-    frame_dropout: bool = False
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -357,7 +357,6 @@ class PublishedMDM(nn.Module):
             InputError: the clips' condition is not the published one.
         """
         encoded, truths, dropout = [], [], ContextDropout.for_reference(settings.reference_dropout)
-        *_, no_reference = self._batch_draws(part.count, seeds.torch_generator(part.seed, part.step, "noise"), dropout)
         with torch.no_grad():
             for number, clip in enumerate(clips, part.first):
                 if clip.condition.warped is not None and bool(clip.condition.warped.any()):
@@ -367,10 +366,8 @@ class PublishedMDM(nn.Module):
                         expected="points alone, as the published-type model is given",
                         remedy="give another folder of clips; they are made anew",
                     )
-                draws, given = seeds.torch_generator(part.seed, part.step, f"posterior, clip {number}"), clip.condition
-                if settings.frame_dropout and bool(no_reference[number]):
-                    given = replace(given, reference_in="nowhere")
-                encoded.append(self.encode_condition(given, draws))
+                draws = seeds.torch_generator(part.seed, part.step, f"posterior, clip {number}")
+                encoded.append(self.encode_condition(clip.condition, draws))
                 truths.append(self.encode_truth(clip.rgb[None], clip.depth[None], clip.semantics[None], draws))
             truth: dict[Modality, Tensor] = {m: torch.cat([one[m] for one in truths]) for m in MODALITIES}
             classes = torch.stack([clip.semantics != palette.UNLABELLED for clip in clips]).unsqueeze(2)

@@ -29,7 +29,7 @@ class Learn(Watched):
     version, idle = 1, ("compute",)
     files = (
         *("clips/*.safetensors", "clips/log_clips.json", "codec/", "steps/", "cache/", "samples/*.png"),
-        *("loss.png", "metrics.json", "model/*", "model.part/"),
+        *("metrics.json", "model/*", "model.part/"),
     )
     short = (
         *("start", "steps", "seed", "precision", "data.scenes", "data.clips", "data.cities", "data.width"),
