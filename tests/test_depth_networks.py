@@ -15,7 +15,7 @@ from tiny_networks import package
 
 from mudg.base.errors import InputError, ResourceError
 from mudg.core.depth import CompletionRules
-from mudg.labels.depth.networks import align_to_lidar, kind_of, lidar_cue, load_depth_network, residual_confidence
+from mudg.labels.depth_networks import align_to_lidar, kind_of, lidar_cue, load_depth_network, residual_confidence
 from mudg.labels.inputs import DepthInput, Prediction
 from mudg.networks.folders import Compute
 

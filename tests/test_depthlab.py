@@ -25,10 +25,10 @@ from toy_scene import ToyStreet
 
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
 from mudg.diffusion.settings import ConvertConfig
-from mudg.labels.depth import depthlab
-from mudg.labels.depth import depthlab as conversion
-from mudg.labels.depth.depthlab import DepthLab, DepthLabSampling, clip_crop, known_depth, linear_fill, prepare
-from mudg.labels.depth.networks import kind_of, load_depth_network
+from mudg.labels import depthlab
+from mudg.labels import depthlab as conversion
+from mudg.labels.depth_networks import kind_of, load_depth_network
+from mudg.labels.depthlab import DepthLab, DepthLabSampling, clip_crop, known_depth, linear_fill, prepare
 from mudg.labels.inputs import DepthInput
 from mudg.labels.settings import AnnotateConfig
 from mudg.networks.folders import Compute

@@ -29,7 +29,7 @@ from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated, gen
 from mudg.diffusion.settings import ConvertConfig, SynthesizeConfig
 from mudg.diffusion.views import check_config, load_any
 from mudg.labels import street_net
-from mudg.labels.depth.networks import Preparation, TransformersDepth
+from mudg.labels.depth_networks import Preparation, TransformersDepth
 from mudg.labels.inputs import DepthInput
 from mudg.labels.segmenters import Segmenter
 from mudg.labels.settings import AnnotateConfig

@@ -87,9 +87,6 @@ class PublishedConfig:
     height: int = 576
     fps: int = 10
     """Frame rate given to the network; the published one never saw another."""
-    missing_is_zero: bool = True
-    """Give the network black and 0 m where nothing was seen, as in the published training, whatever the condition holds
-    there."""
 
     def __post_init__(self) -> None:
         net, tokens, latent = self.net, self.image_tokens, self.codec.latent_channels
@@ -263,9 +260,11 @@ class PublishedMDM(nn.Module):
         valid = valid.float()
         self.check_size(*color.shape[-2:])
         self.check_frames(color.shape[1])
-        if self.config.missing_is_zero:
-            color, depth = color * valid, depth * valid
-        seen = valid
+        color, depth, seen = (
+            color * valid,
+            depth * valid,
+            valid,
+        )  # missing is black and 0 m, as in the published training
         in_frame, in_tokens = (
             torch.tensor([c.reference_in in uses for c in batch], device=self.device)[:, None, None, None]
             for uses in (("tokens_and_frame", "frame"), ("tokens_and_frame",))

@@ -4,7 +4,7 @@
 |---|---|---|
 | PromptDepthAnything | metric depth | image and a small map of depth from LiDAR |
 | Depth Anything, V1 and V2 | inverse depth up to scale and shift, or metric depth | image alone |
-| DepthLab (``labels.depth.depthlab``) | depth, nearly metric | diffusion; completes LiDAR |
+| DepthLab (``labels.depthlab``) | depth, nearly metric | diffusion; completes LiDAR |
 
 The result is aligned to the visible LiDAR returns with one robust scale and shift per frame
 (``core.depth.fit_affine``), the sky gets its fixed distance, and the confidence follows from the error of the aligned
@@ -29,7 +29,7 @@ from torch.nn import functional
 from mudg.base.errors import InputError, ResourceError
 from mudg.core.depth import MIN_POINTS, AffineFit, CompletionRules, DenseDepth, Space, fit_affine
 from mudg.core.pictures import resize_bicubic
-from mudg.labels.depth.depthlab import DepthLab
+from mudg.labels.depthlab import DepthLab
 from mudg.labels.inputs import DepthInput, DepthNetwork, Prediction
 from mudg.networks import folders
 from mudg.networks.folders import CPU, Compute
