@@ -55,9 +55,9 @@ def test_an_affine_map_of_the_truth_comes_back_as_the_truth(
     measured[bad] = rng.uniform(1, 90, int(bad.sum()))
     given = DepthInput(given.rgb, measured, given.filled, given.sky)
     prediction = Prediction((scale * goal + shift).astype(np.float32), space)
-    found = align_to_lidar(prediction, given, RULES)
-    assert found.fit.used and found.dense is not None and np.abs(found.dense.depth / truth - 1).max() < 1e-3
-    assert (found.dense.depth[given.sky] == RULES.sky_m).all() and found.fit.residual < 1e-3
+    dense, fit = align_to_lidar(prediction, given, RULES)
+    assert fit.used and dense is not None and np.abs(dense.depth / truth - 1).max() < 1e-3
+    assert (dense.depth[given.sky] == RULES.sky_m).all() and fit.residual < 1e-3
 
 
 def test_wrong_returns_from_behind_do_not_pull_and_depth_that_does_not_fit_is_not_used() -> None:
@@ -68,15 +68,15 @@ def test_wrong_returns_from_behind_do_not_pull_and_depth_that_does_not_fit_is_no
     bad = np.isfinite(measured) & (np.random.default_rng(2).uniform(size=truth.shape) < 0.4)
     measured[bad] *= 1.4
     asked = DepthInput(given.rgb, measured, given.filled, given.sky)
-    found = align_to_lidar(Prediction(truth / 80 - 0.1, "depth"), asked, RULES)
-    assert found.dense is not None and np.abs(found.dense.depth / truth - 1).max() < 1e-3
+    dense, fit = align_to_lidar(Prediction(truth / 80 - 0.1, "depth"), asked, RULES)
+    assert dense is not None and np.abs(dense.depth / truth - 1).max() < 1e-3
     rng = np.random.default_rng(3)
     noise = rng.uniform(1, 2, truth.shape).astype(np.float32)
     for values in (noise, -truth, np.full_like(truth, 3.0)):
-        assert align_to_lidar(Prediction(values, "depth"), given, RULES).dense is None
+        assert align_to_lidar(Prediction(values, "depth"), given, RULES)[0] is None
     few = np.where(np.cumsum(np.isfinite(given.measured)).reshape(truth.shape) <= 20, given.measured, np.nan)
     asked = DepthInput(given.rgb, few, given.filled, given.sky)
-    assert align_to_lidar(Prediction(truth, "depth"), asked, RULES).dense is None
+    assert align_to_lidar(Prediction(truth, "depth"), asked, RULES)[0] is None
     with pytest.raises(InputError, match="size"):
         align_to_lidar(Prediction(truth[1:], "depth"), given, RULES)
 

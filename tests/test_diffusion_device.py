@@ -25,7 +25,7 @@ from mudg.diffusion import convert, memory_plan, model_files, parallel, publishe
 from mudg.diffusion.model import MDM
 from mudg.diffusion.models import model_config
 from mudg.diffusion.published import WorkSplit
-from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated, generated_and_finished
+from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated
 from mudg.diffusion.settings import ConvertConfig, SynthesizeConfig
 from mudg.diffusion.views import check_config, load_any
 from mudg.labels import street_net
@@ -96,11 +96,11 @@ def small():
 def test_a_clip_of_the_small_model_is_the_same_on_a_device_and_crosses_once(small):
     condition = made_up_clip(1).condition
     fine, request = enlarged(condition), SampleRequest(3, 5, 2)
-    clip, finished = generated_and_finished(small, condition, fine, request)
+    clip, finished = small.sampled_and_finished(condition, fine, request)
     with pretend_device() as there:
         small.to(there)
         with copies() as crossed:
-            clip_there, finished_there = generated_and_finished(small, condition, fine, request)
+            clip_there, finished_there = small.sampled_and_finished(condition, fine, request)
     check_same_clip(clip, clip_there)
     check_same_clip(finished, finished_there)
     noise = [sum(clip.latents[m].numel() for m in clip.latents)] * 3  # a draw at the start and one between steps

@@ -260,11 +260,8 @@ class PublishedMDM(nn.Module):
         valid = valid.float()
         self.check_size(*color.shape[-2:])
         self.check_frames(color.shape[1])
-        color, depth, seen = (
-            color * valid,
-            depth * valid,
-            valid,
-        )  # missing is black and 0 m, as in the published training
+        # missing is black and 0 m, as in the published training
+        color, depth, seen = color * valid, depth * valid, valid
         in_frame, in_tokens = (
             torch.tensor([c.reference_in in uses for c in batch], device=self.device)[:, None, None, None]
             for uses in (("tokens_and_frame", "frame"), ("tokens_and_frame",))

@@ -26,7 +26,7 @@ from mudg.diffusion.inputs import ConditionParts, ConditionSources, conditions_o
 from mudg.diffusion.memory_plan import half_format
 from mudg.diffusion.model import MDM
 from mudg.diffusion.published import PublishedMDM, WorkSplit, is_published
-from mudg.diffusion.requests import GeneratedClip, SampleRequest, StartClip, generated, generated_and_finished
+from mudg.diffusion.requests import GeneratedClip, SampleRequest, StartClip, generated
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.networks.codec import Modality
 from mudg.scene.labels import read_label, read_trusted_classes
@@ -320,7 +320,7 @@ class ViewMaker:
         sky."""
         model = self._model
         if self._full_size and isinstance(model, MDM) and model.finisher is not None:
-            sample, finished = generated_and_finished(model, condition, fine, request)
+            sample, finished = model.sampled_and_finished(condition, fine, request)
             return sample, without_sky_depth(finished, fine), tuple(views)
         sample = generated(model, condition, request)
         made = without_sky_depth(sample, condition)

@@ -128,12 +128,12 @@ def with_network(network: DepthNetwork, inputs: LabelInput, labels: Labels, fram
     asked = DepthInput(inputs.rgb, measured, labels.depth, labels.sky)
     reason = "too few LiDAR returns"
     if enough_returns(asked):
-        found = align_to_lidar(network(asked), asked, RULES)
-        if found.dense is not None:
-            return replace(labels, depth=found.dense.depth, depth_confidence=found.dense.confidence)
+        dense, fit = align_to_lidar(network(asked), asked, RULES)
+        if dense is not None:
+            return replace(labels, depth=dense.depth, depth_confidence=dense.confidence)
         reason = "the network's depth does not increase with the LiDAR's"
-        if np.isfinite(found.fit.residual):
-            off = f"half of the returns off by more than {found.fit.residual:.0%}"
+        if np.isfinite(fit.residual):
+            off = f"half of the returns off by more than {fit.residual:.0%}"
             reason = f"the network's depth does not fit the LiDAR ({off})"
     log.warn(f"frame {frame_id}: {reason}; its depth is filled from LiDAR instead")
     store.write_json(_mark(staging, frame_id), {"reason": reason})

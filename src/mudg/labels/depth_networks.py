@@ -180,16 +180,11 @@ def load_depth_network(folder: str | Path, compute: Compute = CPU, steps: int = 
 # --- alignment to LiDAR, for every network --------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Aligned:
-    """Dense depth and its confidence, or None where the fit to the LiDAR is not to be believed."""
-
-    dense: DenseDepth | None
-    fit: AffineFit
-
-
-def align_to_lidar(prediction: Prediction, inputs: DepthInput, rules: CompletionRules) -> Aligned:
-    """A network's depth brought to the frame's LiDAR: one scale and shift, the sky at ``rules.sky_m``, a confidence.
+def align_to_lidar(
+    prediction: Prediction, inputs: DepthInput, rules: CompletionRules
+) -> tuple[DenseDepth | None, AffineFit]:
+    """A network's depth brought to the frame's LiDAR: one scale and shift, the sky at ``rules.sky_m``, a confidence;
+    and the fit. None where the fit is not to be believed.
 
     Raises:
         InputError: prediction and image differ in size.
@@ -201,13 +196,13 @@ def align_to_lidar(prediction: Prediction, inputs: DepthInput, rules: Completion
     values, measured = prediction.values[known], inputs.measured[known]
     fit = fit_affine(torch.from_numpy(values), torch.from_numpy(measured), prediction.space)
     if not fit.used:
-        return Aligned(None, fit)
+        return None, fit
     depth = fit.depth(torch.from_numpy(prediction.values).double(), rules.near_m, rules.far_m).float().numpy()
     confidence = residual_confidence(
         depth, np.where(known, inputs.measured, np.float32(np.nan)), inputs.sky, rules.sky_m
     )
     depth[inputs.sky] = rules.sky_m
-    return Aligned(DenseDepth(depth, confidence), fit)
+    return DenseDepth(depth, confidence), fit
 
 
 def residual_confidence(
