@@ -67,14 +67,6 @@ def mask2former(folder: Path) -> Any:
     return _saved(seeded(t.Mask2FormerForUniversalSegmentation(config)), folder)
 
 
-def eomt(folder: Path) -> Any:
-    """EoMT that reads squares of 64 px."""
-    t = package("transformers")
-    tower = {"hidden_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2, "image_size": 64, "patch_size": 16}
-    config = t.EomtConfig(**tower, num_queries=6, num_blocks=1, num_upscale_blocks=1, **LABELS)
-    return _saved(seeded(t.EomtForUniversalSegmentation(config)), folder)
-
-
 def depth_anything(folder: Path, *, with_lidar: bool = False, metric: bool = False) -> Any:
     """Depth Anything or PromptDepthAnything on a DINOv2 backbone, for images whose shorter side is 42 px."""
     t = package("transformers")

@@ -131,7 +131,7 @@ def _load_transformers(folder: Path, compute: Compute, *, with_lidar: bool) -> T
     network_class = folders.member(folders.package("transformers"), class_name)
     network: Any = folders.load_network(network_class, folder, compute)
     preparation = Preparation.read(folder, 756 if with_lidar else 518, int(network.config.patch_size))
-    space = "depth" if with_lidar or network.config.depth_estimation_type == "metric" else "disparity"
+    space: Space = "depth" if with_lidar or network.config.depth_estimation_type == "metric" else "disparity"
     return TransformersDepth(network, preparation, space, with_lidar=with_lidar, compute=compute)
 
 

@@ -17,7 +17,7 @@ class AnnotateConfig:
     """Source of classes and sky. embedded: the small shipped network, from image, heights and boxes. geometry: rules on
     heights and boxes, without a network. network: a segmentation network from `weights`."""
     weights: str = ""
-    """labeller network: folder of a SegFormer, Mask2Former or EoMT with Cityscapes classes in the transformers format,
+    """labeller network: folder of a SegFormer or Mask2Former with Cityscapes classes in the transformers format,
     or its name in the Hugging Face cache (owner/name or owner/name@revision). labeller embedded: folder of a network
     trained with tools/train_segmenter.py (empty = the shipped network)."""
     depth: bool = True

@@ -30,7 +30,7 @@ def annotate(
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         config: YAML file of settings, read before those given here.
         labeller: Source of classes and sky. embedded: the small shipped network, from image, heights and boxes. geometry: rules on heights and boxes, without a network. network: a segmentation network from `weights`.
-        weights: labeller network: folder of a SegFormer, Mask2Former or EoMT with Cityscapes classes in the transformers format, or its name in the Hugging Face cache (owner/name or owner/name@revision). labeller embedded: folder of a network trained with tools/train_segmenter.py (empty = the shipped network).
+        weights: labeller network: folder of a SegFormer or Mask2Former with Cityscapes classes in the transformers format, or its name in the Hugging Face cache (owner/name or owner/name@revision). labeller embedded: folder of a network trained with tools/train_segmenter.py (empty = the shipped network).
         depth: Write dense depth, by default from the LiDAR points of several sweeps, filled with the image as guide.
         depth_network: Take dense depth from a network and align it to LiDAR: folder, or name in the Hugging Face cache, of a PromptDepthAnything or Depth Anything model (transformers); or folder of a DepthLab written by mudg convert.
         depth_steps: DepthLab: denoising steps (0 = as in the model folder).
