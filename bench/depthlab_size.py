@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save_file
 
-from mudg.labels.depth import depthlab
+from mudg.labels import depthlab
 
 UNET = {
     "_class_name": "UNet2DConditionModel",

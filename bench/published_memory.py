@@ -1,4 +1,4 @@
-"""Memory of the published-type model, counted on the meta device: no weights, no GPU, no allocation.
+"""Memory of the published-type model as it is planned for: no weights, no GPU, no allocation.
 
     python bench/published_memory.py
 
@@ -42,7 +42,7 @@ def report(needs: memory_plan.Needs) -> list[str]:
 
 
 def main() -> None:
-    """Count and print."""
+    """Print."""
     for bytes_per_value, name in ((2, "bfloat16"), (4, "float32")):
         for height, width in ((320, 512), (576, 1024)):
             needs = memory_plan.needs_of(PublishedConfig(height=height, width=width), bytes_per_value)

@@ -14,7 +14,6 @@ from toy_world import fused_cloud, truth, write_scene
 
 from mudg.base import config as configuration
 from mudg.base.types import FusedCloud, Scene
-from mudg.baselines.settings import MethodConfig
 from mudg.core import trajectory
 from mudg.gaussians import fit
 from mudg.gaussians.settings import FitConfig
@@ -23,11 +22,11 @@ from mudg.scene.observations import ObservationWriter
 from mudg.steps.fit import Fit
 
 
-def fit_config(**changes: Any) -> MethodConfig:
+def fit_config(**changes: Any) -> FitConfig:
     """A configuration with some fields changed; two underscores stand between a group and its field:
     ``densify__kind="none"``."""
     dotted = {name.replace("__", "."): value for name, value in changes.items()}
-    return configuration.load(MethodConfig, overrides=configuration.nested(dotted))
+    return configuration.load(FitConfig, overrides=configuration.nested(dotted))
 
 
 SMALL_RADIANCE = {"radiance__size": "tiny"}
@@ -39,7 +38,7 @@ def fit_to(world: Mapping[str, Path], out: Path, settings: FitConfig, **more: An
     return Fit(scene=world["scene"], fused=world["fuse"], out=out, settings=settings, **more)
 
 
-def small_fit(method: str, *, iterations: int = 24, **changes: Any) -> MethodConfig:
+def small_fit(method: str, *, iterations: int = 24, **changes: Any) -> FitConfig:
     """A fit of few Gaussians that writes neither checkpoints nor previews on the way."""
     few = {"start__gaussians": 900, "densify__max_gaussians": 1500, "checkpoint_every": 1000, "preview_every": 1000}
     return fit_config(method=method, iterations=iterations, **{**few, **changes})

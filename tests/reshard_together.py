@@ -24,7 +24,7 @@ class ToyBlocks(nn.Module):
 def state_of(ranks: Ranks, layout: str) -> tuple[TrainingState, nn.Module]:
     torch.manual_seed(0)
     trained = nn.ModuleDict({"net": ToyBlocks()})
-    Spread(trained, trained, ranks, layout, 2 if layout == "hsdp" else 0)
+    Spread(trained, trained, ranks, layout)
     optimizer = torch.optim.AdamW(trained.parameters(), lr=1e-2, fused=True)
     return TrainingState(trained, optimizer, {k: v.detach().clone() for k, v in trained.state_dict().items()}), trained
 

@@ -19,11 +19,11 @@ from mudg.base.types import EgoPath, Ref, Source, Sweep, View
 from mudg.core.depth import ray_elevation
 from mudg.labels import annotate
 from mudg.labels import annotate as annotate_depth
-from mudg.labels.annotate import nearest_sweeps, steady_bottom
+from mudg.labels.annotate import LABELLERS, nearest_sweeps, steady_bottom
 from mudg.labels.by_geometry import find_sky, label_by_geometry
 from mudg.labels.inputs import TRAIN_ID_OF, LabelInput, Prediction, box_outline
-from mudg.labels.labellers import LABELLERS, labeller
 from mudg.labels.settings import AnnotateConfig
+from mudg.networks.folders import CPU
 from mudg.scene.check import check_scene
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points, read_scene
@@ -282,10 +282,8 @@ def test_what_labellers_and_depth_networks_need_is_named(tmp_path: Path) -> None
         annotate_depth.digests(AnnotateConfig(depth_network=str(tmp_path)))
     assert annotate_depth.digests(AnnotateConfig(labeller="geometry")) == {}
     assert set(annotate_depth.digests(AnnotateConfig())) == {"weights"}
-    with pytest.raises(UsageError, match="labeller"):
-        labeller("magic")
     with pytest.raises(ResourceError, match="weights"):
-        labeller("network", str(tmp_path / "nothing"))
+        LABELLERS["network"](str(tmp_path / "nothing"), CPU)
 
 
 def test_bonnet_is_what_stays_the_same() -> None:

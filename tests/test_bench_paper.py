@@ -13,7 +13,6 @@ from tiny_networks import small_mdm
 from mudg.base import config as configuration
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
-from mudg.baselines.settings import MethodConfig
 from mudg.benchmarks import chain, paper, places
 from mudg.benchmarks import run as bench
 from mudg.benchmarks.chain import FillViews
@@ -29,7 +28,7 @@ from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing.settings import ScoreConfig
 from mudg.formats import ingest
 from mudg.formats.settings import IngestConfig
-from mudg.gaussians.settings import METHODS
+from mudg.gaussians.settings import METHODS, FitConfig
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.steps.ingest import Fuse, Ingest
@@ -70,8 +69,8 @@ def test_a_table_is_complete_and_its_rows_change_something(table):
     rows = paper_rows(BenchConfig(table=table.name), table)
     assert len({row.name for row in rows}) == len(rows)
     for row in table.rows:
-        kind = SynthesizeConfig if METHODS[row.method].made_by == "synthesize" else MethodConfig
-        usual = kind() if kind is SynthesizeConfig else MethodConfig(method=row.method)
+        kind = SynthesizeConfig if METHODS[row.method].made_by == "synthesize" else FitConfig
+        usual = kind() if kind is SynthesizeConfig else FitConfig(method=row.method)
         assert (configuration.load(kind, usual, overrides=dict(row.changes)) != usual) == bool(row.changes)
 
 

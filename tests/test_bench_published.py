@@ -14,7 +14,6 @@ from mudg.app import parse
 from mudg.base import config as configuration
 from mudg.base import store
 from mudg.base.errors import UsageError
-from mudg.baselines.settings import MethodConfig
 from mudg.benchmarks import run as bench
 from mudg.benchmarks import shift
 from mudg.benchmarks.rows import LONGER, RECORDED, TABLES, method_fit, shift_rows
@@ -29,6 +28,7 @@ from mudg.diffusion.settings import SynthesizeConfig
 from mudg.diffusion.views import recorded_images
 from mudg.formats import ingest
 from mudg.formats.settings import IngestConfig
+from mudg.gaussians.settings import FitConfig
 from mudg.scene.clouds import read_fused
 from mudg.scene.read import read_image, read_scene
 from mudg.scene.settings import FuseConfig
@@ -134,7 +134,7 @@ REFUSED = [
     ("shift", ["--methods", "difix", "--model", "embedded-tiny"], "--methods", "leave difix out"),
     ("shift", ["--synthesize.guidance", "7.5"], "--model", ""),
     ("shift", ["--preset", "paper"], "--model", "convert a checkpoint"),
-    ("shift", ["--synthesize.compiled"], "--compiled", "leave it out"),
+    ("shift", ["--synthesize.memory-budget-gb", "8"], "--memory-budget-gb", "leave it out"),
     ("shift", ["--methods", "pvg", "--fit.poses.learn"], "poses.learn", "leave the setting out"),
 ]
 
@@ -171,7 +171,7 @@ def test_a_method_for_comparison_keeps_what_the_preset_sets_and_it_does_not_know
     assert (fits["mudg_s"].poses.learn, fits["pvg"].poses.learn) == (True, False)
     assert fits["pvg"].start == fits["mudg_s"].start and fits["pvg"].iterations == fits["mudg_s"].iterations == 30_000
     with pytest.raises(UsageError, match="knows nothing of it"):
-        method_fit(MethodConfig(poses={"learn": True}), "pvg", "default")
+        method_fit(FitConfig(poses={"learn": True}), "pvg", "default")
 
 
 # ---- the published model through all three -------------------------------------------------------
@@ -215,7 +215,7 @@ def test_table_3_runs_with_a_published_type_model_as_recorded(weights, tmp_path,
     for row in TABLES["mudg3"].rows:
         state = store.read_json(log / "fit" / row.name / "run.json")
         assert state["summary"]["steps"] == 6 and "start" not in state["inputs"]  # from nothing, with all steps
-        ran = configuration.load(MethodConfig, yaml_path=log / "fit" / row.name / "run.yaml")
+        ran = configuration.load(FitConfig, yaml_path=log / "fit" / row.name / "run.yaml")
         assert (ran.loss.semantic_weight, ran.sh_degree) == (0.0, 3)
         assert (ran.virtual.beside, ran.virtual.perception) == (False, "lpips")
         assert math.isfinite(document["cells"][row.name][RECORDED]["psnr"]["mean"])

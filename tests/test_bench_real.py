@@ -16,7 +16,6 @@ from mudg.base.camera_colors import ColorMap
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, Observation, SweepPoints, View
-from mudg.baselines.settings import MethodConfig
 from mudg.benchmarks import columns, places, real
 from mudg.benchmarks.chain import FillViews
 from mudg.benchmarks.places import PROTOCOLS, SPLITS
@@ -34,6 +33,7 @@ from mudg.editing.settings import RenderConfig
 from mudg.formats import ingest
 from mudg.formats.importers.pandaset import read_frame
 from mudg.formats.settings import IngestConfig
+from mudg.gaussians.settings import FitConfig
 from mudg.scene.labels import read_label
 from mudg.scene.observations import ObservationWriter
 from mudg.scene.read import read_image, read_points, read_scene
@@ -159,7 +159,7 @@ def model(tmp_path_factory):
 
 def made_from(source, out, split, model):
     """Everything that methods make of a log under a split, by name, as bytes."""
-    settings = {"fit": MethodConfig(densify={"kind": "none"}), "synthesize": SynthesizeConfig(steps=1, shifts_m=(2.0,))}
+    settings = {"fit": FitConfig(densify={"kind": "none"}), "synthesize": SynthesizeConfig(steps=1, shifts_m=(2.0,))}
     config = BenchConfig(model=model, iterations=6, methods=("nearest_fill", "mudg_s"), **settings)
     job = job_of(out, source, split, config, real_rows(config))
     whole = read_scene(source)

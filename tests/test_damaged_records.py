@@ -23,7 +23,6 @@ from mudg.base import checkpoint, store
 from mudg.base.config import result_settings
 from mudg.base.types import FusedCloud, PointCloud
 from mudg.diffusion import convert
-from mudg.diffusion.score import plot_losses
 from mudg.editing import edit
 from mudg.editing.runs import RunParts
 from mudg.gaussians.storage import StartFit
@@ -112,7 +111,6 @@ def written(name: str, value: object) -> Callable[[Path], Path]:
     return save
 
 
-LOSSES = {"step": 60, "total": 0.5, "rgb": 0.25}
 MODEL = {"files": {"a.safetensors": ""}, "parts": {"unet": {"files": {"b.safetensors": ""}}}}
 BOXES = {
     "images": [{"id": 1, "file_name": "a/000001.png", "width": 48, "height": 32}],
@@ -132,7 +130,6 @@ READERS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object]]] = {
     "scores in a report": (scored, lambda folder: report.write_page(folder, [])),
     "times in a report": (functools.partial(scored, name="run.json"), lambda folder: report.write_page(folder, [])),
     "checkpoint": (saved_checkpoint, checkpoint.latest),
-    "log of a training": (written("log.jsonl", LOSSES), lambda f: plot_losses(f / "log.jsonl", f / "loss.png")),
     "model folder": (written("model.json", MODEL), convert.own_names),
     "boxes": (written("boxes.json", BOXES), lambda folder: read_detections(folder / "boxes.json")),
 }

@@ -13,11 +13,10 @@ import torch
 from PIL import Image
 from tiny_networks import package
 
-from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.errors import InputError, ResourceError
 from mudg.core.depth import CompletionRules
-from mudg.labels.depth.marigold import Marigold
-from mudg.labels.depth.networks import align_to_lidar, kind_of, lidar_cue, load_depth_network, residual_confidence
-from mudg.labels.inputs import DepthInput, DepthOptions, Prediction
+from mudg.labels.depth_networks import align_to_lidar, kind_of, lidar_cue, load_depth_network, residual_confidence
+from mudg.labels.inputs import DepthInput, Prediction
 from mudg.networks.folders import Compute
 
 RULES = CompletionRules()
@@ -56,9 +55,9 @@ def test_an_affine_map_of_the_truth_comes_back_as_the_truth(
     measured[bad] = rng.uniform(1, 90, int(bad.sum()))
     given = DepthInput(given.rgb, measured, given.filled, given.sky)
     prediction = Prediction((scale * goal + shift).astype(np.float32), space)
-    found = align_to_lidar(prediction, given, RULES)
-    assert found.fit.used and found.dense is not None and np.abs(found.dense.depth / truth - 1).max() < 1e-3
-    assert (found.dense.depth[given.sky] == RULES.sky_m).all() and found.fit.residual < 1e-3
+    dense, fit = align_to_lidar(prediction, given, RULES)
+    assert fit.used and dense is not None and np.abs(dense.depth / truth - 1).max() < 1e-3
+    assert (dense.depth[given.sky] == RULES.sky_m).all() and fit.residual < 1e-3
 
 
 def test_wrong_returns_from_behind_do_not_pull_and_depth_that_does_not_fit_is_not_used() -> None:
@@ -69,15 +68,15 @@ def test_wrong_returns_from_behind_do_not_pull_and_depth_that_does_not_fit_is_no
     bad = np.isfinite(measured) & (np.random.default_rng(2).uniform(size=truth.shape) < 0.4)
     measured[bad] *= 1.4
     asked = DepthInput(given.rgb, measured, given.filled, given.sky)
-    found = align_to_lidar(Prediction(truth / 80 - 0.1, "depth"), asked, RULES)
-    assert found.dense is not None and np.abs(found.dense.depth / truth - 1).max() < 1e-3
+    dense, fit = align_to_lidar(Prediction(truth / 80 - 0.1, "depth"), asked, RULES)
+    assert dense is not None and np.abs(dense.depth / truth - 1).max() < 1e-3
     rng = np.random.default_rng(3)
     noise = rng.uniform(1, 2, truth.shape).astype(np.float32)
     for values in (noise, -truth, np.full_like(truth, 3.0)):
-        assert align_to_lidar(Prediction(values, "depth"), given, RULES).dense is None
+        assert align_to_lidar(Prediction(values, "depth"), given, RULES)[0] is None
     few = np.where(np.cumsum(np.isfinite(given.measured)).reshape(truth.shape) <= 20, given.measured, np.nan)
     asked = DepthInput(given.rgb, few, given.filled, given.sky)
-    assert align_to_lidar(Prediction(truth, "depth"), asked, RULES).dense is None
+    assert align_to_lidar(Prediction(truth, "depth"), asked, RULES)[0] is None
     with pytest.raises(InputError, match="size"):
         align_to_lidar(Prediction(truth[1:], "depth"), given, RULES)
 
@@ -120,12 +119,6 @@ def test_what_is_missing_or_wrong_is_named(tmp_path: Path, monkeypatch: pytest.M
     tiny_networks.hide(monkeypatch, "transformers")
     with pytest.raises(ResourceError, match=r"mudg\[models\]"):
         load_depth_network(tmp_path)
-    (tmp_path / "m").mkdir()
-    (tmp_path / "m" / "model_index.json").write_text(json.dumps({"_class_name": "MarigoldPipeline"}))
-    assert kind_of(tmp_path / "m") == "MarigoldPipeline"
-    tiny_networks.hide(monkeypatch, "diffusers")
-    with pytest.raises(ResourceError, match=r"mudg\[models\]"):
-        load_depth_network(tmp_path / "m")
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / "model.json").write_text(json.dumps({"kind": "published"}))
     with pytest.raises(InputError, match="another kind"):
@@ -171,61 +164,12 @@ def test_networks_of_transformers_answer_as_in_their_package(with_lidar: bool, m
 
 
 @real_packages
-@pytest.mark.parametrize("prediction_type", ["v_prediction", "epsilon"])
-def test_marigold_without_guidance_answers_as_the_package_does(prediction_type: str, tmp_path: Path) -> None:
-    pipeline = tiny_networks.marigold(tmp_path, prediction_type=prediction_type)
-    model = load_depth_network(tmp_path, options=DepthOptions(guided=False))
-    assert isinstance(model, Marigold)
-    given, _ = street(30, 50)  # 28 x 48 of processing, then padding: odd cells
-    image, size = model._prepared(given.rgb)
-    noise = torch.randn(1, 4, image.shape[2] // 2, image.shape[3] // 2, generator=torch.Generator().manual_seed(1))
-    pipeline.set_progress_bar_config(disable=True)
-    options = {"latents": noise, "match_input_resolution": False, "output_type": "pt"}
-    expected = pipeline(Image.fromarray(given.rgb), **options).prediction
-    found = model.predict(image, size, noise)
-    assert found.shape == expected.shape and float(expected.max() - expected.min()) > 1e-2
-    np.testing.assert_allclose(found.numpy(), expected.numpy(), atol=2e-5)
-    assert np.array_equal(model(given).values, model(given).values)  # no chance
-
-
-@real_packages
-def test_marigold_of_another_kind_or_with_too_many_steps_is_refused(tmp_path: Path) -> None:
-    tiny_networks.marigold(tmp_path)
-    with pytest.raises(UsageError, match="--depth-steps"):
-        load_depth_network(tmp_path, options=DepthOptions(steps=100_000))
-    file = tmp_path / "scheduler" / "scheduler_config.json"
-    told = json.loads(file.read_text())
-    file.write_text(json.dumps({**told, "_class_name": "LCMScheduler"}))
-    with pytest.raises(InputError, match="LCMScheduler"):
-        load_depth_network(tmp_path)
-    file.write_text(json.dumps(told))
-    (tmp_path / "tokenizer" / "vocab.json").write_text(json.dumps({"a": 0}))
-    with pytest.raises(InputError, match="marks"):
-        load_depth_network(tmp_path)
-
-
-def test_guidance_brings_marigold_nearer_to_the_returns(tmp_path: Path) -> None:
-    """A random network knows nothing of depth: all the agreement that is gained comes from the returns."""
-    tiny_networks.marigold(tmp_path, longest_px=32)
-    given, _ = street(24, 32, measured=0.5)
-
-    def error(guided: bool) -> float:
-        prediction = load_depth_network(tmp_path, options=DepthOptions(guided=guided, steps=30))(given)
-        fit = align_to_lidar(prediction, given, RULES).fit
-        return fit.residual if np.isfinite(fit.residual) else 1.0
-
-    assert error(True) < 0.7 * error(False)
-
-
-@real_packages
 def test_bfloat16_gives_nearly_the_same(tmp_path: Path) -> None:
-    tiny_networks.depth_anything(tmp_path / "a", with_lidar=True)
-    tiny_networks.marigold(tmp_path / "b", longest_px=24)
+    tiny_networks.depth_anything(tmp_path, with_lidar=True)
     given, _ = street(16, 24)
-    for folder, options in (("a", DepthOptions()), ("b", DepthOptions(guided=True, steps=2))):
-        exact = load_depth_network(tmp_path / folder, Compute("cpu"), options)(given).values
-        rounded = load_depth_network(tmp_path / folder, Compute("cpu", bf16=True), options)(given).values
-        assert rounded.dtype == np.float32 and 0 < float(np.abs(rounded - exact).mean()) < 0.05 * float(np.ptp(exact))
+    exact = load_depth_network(tmp_path, Compute("cpu"))(given).values
+    rounded = load_depth_network(tmp_path, Compute("cpu", bf16=True))(given).values
+    assert rounded.dtype == np.float32 and 0 < float(np.abs(rounded - exact).mean()) < 0.05 * float(np.ptp(exact))
 
 
 def test_a_missing_device_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

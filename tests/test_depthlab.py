@@ -25,11 +25,11 @@ from toy_scene import ToyStreet
 
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
 from mudg.diffusion.settings import ConvertConfig
-from mudg.labels.depth import depthlab
-from mudg.labels.depth import depthlab as conversion
-from mudg.labels.depth.depthlab import DepthLab, DepthLabSampling, clip_crop, known_depth, linear_fill, prepare
-from mudg.labels.depth.networks import kind_of, load_depth_network
-from mudg.labels.inputs import DepthInput, DepthOptions
+from mudg.labels import depthlab
+from mudg.labels import depthlab as conversion
+from mudg.labels.depth_networks import kind_of, load_depth_network
+from mudg.labels.depthlab import DepthLab, DepthLabSampling, clip_crop, known_depth, linear_fill, prepare
+from mudg.labels.inputs import DepthInput
 from mudg.labels.settings import AnnotateConfig
 from mudg.networks.folders import Compute
 from mudg.scene.labels import read_label
@@ -442,16 +442,15 @@ def test_answers_are_of_the_images_size_and_always_the_same(converted: Path) -> 
 @pytest.mark.slow
 def test_bfloat16_gives_nearly_the_same(converted: Path) -> None:
     given, _ = street(24, 32)
-    options = DepthOptions(steps=3)
-    exact = load_depth_network(converted, Compute("cpu"), options)(given).values
-    rounded = load_depth_network(converted, Compute("cpu", bf16=True), options)(given).values
+    exact = load_depth_network(converted, Compute("cpu"), steps=3)(given).values
+    rounded = load_depth_network(converted, Compute("cpu", bf16=True), steps=3)(given).values
     assert 0 < float(np.abs(rounded - exact).mean()) < 0.05 * float(np.ptp(exact))
 
 
 def test_the_number_of_steps_is_honoured(converted: Path) -> None:
     given, _ = street(12, 16)
     for steps, made in ((0, 4), (2, 1), (10, 8)):
-        model = load_depth_network(converted, options=DepthOptions(steps=steps))
+        model = load_depth_network(converted, steps=steps)
         assert isinstance(model, DepthLab)
         calls: list[int] = []
         model._parts.denoising_unet.register_forward_pre_hook(lambda _, __, calls=calls: calls.append(1))
@@ -459,7 +458,7 @@ def test_the_number_of_steps_is_honoured(converted: Path) -> None:
         assert len(calls) == made
     for steps, message in ((1, "at least 2"), (2000, "<= 1000")):
         with pytest.raises(UsageError, match=message):
-            load_depth_network(converted, options=DepthOptions(steps=steps))
+            load_depth_network(converted, steps=steps)
 
 
 def test_annotate_reads_a_converted_folder(converted: Path, tmp_path: Path) -> None:

@@ -25,11 +25,11 @@ from mudg.diffusion import convert, memory_plan, model_files, parallel, publishe
 from mudg.diffusion.model import MDM
 from mudg.diffusion.models import model_config
 from mudg.diffusion.published import WorkSplit
-from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated, generated_and_finished
+from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated
 from mudg.diffusion.settings import ConvertConfig, SynthesizeConfig
 from mudg.diffusion.views import check_config, load_any
 from mudg.labels import street_net
-from mudg.labels.depth.networks import Preparation, TransformersDepth
+from mudg.labels.depth_networks import Preparation, TransformersDepth
 from mudg.labels.inputs import DepthInput
 from mudg.labels.segmenters import Segmenter
 from mudg.labels.settings import AnnotateConfig
@@ -96,11 +96,11 @@ def small():
 def test_a_clip_of_the_small_model_is_the_same_on_a_device_and_crosses_once(small):
     condition = made_up_clip(1).condition
     fine, request = enlarged(condition), SampleRequest(3, 5, 2)
-    clip, finished = generated_and_finished(small, condition, fine, request)
+    clip, finished = small.sampled_and_finished(condition, fine, request)
     with pretend_device() as there:
         small.to(there)
         with copies() as crossed:
-            clip_there, finished_there = generated_and_finished(small, condition, fine, request)
+            clip_there, finished_there = small.sampled_and_finished(condition, fine, request)
     check_same_clip(clip, clip_there)
     check_same_clip(finished, finished_there)
     noise = [sum(clip.latents[m].numel() for m in clip.latents)] * 3  # a draw at the start and one between steps
@@ -348,9 +348,8 @@ def test_what_a_device_does_not_do_is_said(street, small, tmp_path, monkeypatch)
         with pytest.raises(error, match="--device"):
             Annotate(scene=street / "scene", out=tmp_path / "out", settings=AnnotateConfig(device=device)).run()
     assert not (tmp_path / "out").exists()
-    for name in ("offload", "compiled"):
-        with pytest.raises(UsageError, match="published-type models only"):
-            check_config(SynthesizeConfig(model=str(tmp_path / "model"), **{name: True}), False)
+    with pytest.raises(UsageError, match="published-type models only"):
+        check_config(SynthesizeConfig(model=str(tmp_path / "model"), memory_budget_gb=4), False)
 
 
 def test_processes_take_a_device_each_and_the_number_format_follows_it(monkeypatch):

@@ -73,8 +73,8 @@ def test_spans_cover_the_length_without_overlap(length, longest):
 @torch.no_grad()
 def test_tiles_equal_the_whole_image(blocks, size, tile_px):
     finisher, given, made = random_finisher(blocks), some_pixels(*size), some_made(24, 32)
-    whole = finish_in_tiles(finisher, made, given, 1000)
-    tiled = finish_in_tiles(finisher, made, given, tile_px)
+    whole = finish_in_tiles(finisher, made, given.color.shape[-2:], given.crop, 1000)
+    tiled = finish_in_tiles(finisher, made, given.color.shape[-2:], given.crop, tile_px)
     assert whole.rgb.shape == (2, 3, *size)
     for name in ("rgb", "depth_code", "log_error"):
         assert torch.allclose(getattr(tiled, name), getattr(whole, name), atol=2e-5), name
@@ -86,21 +86,22 @@ def test_the_whole_image_is_one_pass_and_memory_that_of_a_tile(monkeypatch):
     finisher, given, made = random_finisher(), some_pixels(32, 48), some_made(16, 24)
     enlarged = made.enlarged((32, 48), (0, 32), (0, 48))
     once = finisher(enlarged, given, 2, torch.full((2,), 2.0))
-    whole = finish_in_tiles(finisher, made, given)
+    whole = finish_in_tiles(finisher, made, given.color.shape[-2:], given.crop)
     assert torch.allclose(whole.rgb, once.rgb, atol=1e-6)
     assert torch.equal(whole.ids[:, 0], once.shares.argmax(1).to(torch.uint8))
     forward, seen = finisher.forward, []
     noted = lambda made, given, *rest: (seen.append(given.color.shape), forward(made, given, *rest))[1]
     monkeypatch.setattr(finisher, "forward", noted)
-    finish_in_tiles(finisher, some_made(24, 32), some_pixels(150, 202), 40)
+    finish_in_tiles(finisher, some_made(24, 32), (150, 202), some_pixels(150, 202).crop, 40)
     longest = 40 + 2 * finisher.margin_px + 2 * network.STRIDE_PX
     assert len(seen) == 4 * 6
     assert all(max(shape[-2:]) <= longest for shape in seen)
     # with a smaller margin, seams would show: what the test above compares does depend on it
     given, made = some_pixels(93, 131), some_made(24, 32)
-    whole = finish_in_tiles(finisher, made, given, 1000)
+    whole = finish_in_tiles(finisher, made, given.color.shape[-2:], given.crop, 1000)
     monkeypatch.setattr(Finisher, "margin_px", 4)
-    assert float((finish_in_tiles(finisher, made, given, 40).rgb - whole.rgb).abs().max()) > 1e-3
+    tiled = finish_in_tiles(finisher, made, given.color.shape[-2:], given.crop, 40)
+    assert float((tiled.rgb - whole.rgb).abs().max()) > 1e-3
 
 
 def test_enlarging_is_what_interpolation_does():

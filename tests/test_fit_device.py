@@ -24,7 +24,6 @@ from mudg.base import store
 from mudg.base.camera_colors import CameraColors, ColorMap
 from mudg.base.config import result_settings
 from mudg.base.errors import NumericsError, ResourceError, UsageError
-from mudg.baselines.settings import MethodConfig
 from mudg.benchmarks import chain, rows
 from mudg.benchmarks import cities as bench_poses
 from mudg.benchmarks.settings import BenchConfig
@@ -41,7 +40,7 @@ from mudg.gaussians.nodes import SkyNode, StaticNode
 from mudg.gaussians.perception import perception_of
 from mudg.gaussians.rendering import render_planes
 from mudg.gaussians.schedule import FiniteCheck
-from mudg.gaussians.settings import VirtualConfig
+from mudg.gaussians.settings import FitConfig, VirtualConfig
 from mudg.scene.observations import read_observations
 from mudg.scoring import score
 from mudg.steps.render import RenderViews, Score
@@ -64,13 +63,13 @@ def world(tmp_path_factory) -> dict[str, Path]:
 def early_densification(monkeypatch):
     """Rounds within a few steps."""
 
-    def schedule(config: MethodConfig, *_given: float) -> DensifySettings | None:
+    def schedule(config: FitConfig, *_given: float) -> DensifySettings | None:
         return DensifySettings(2, 4, 2, static_gradient=1e-4, max_rows=config.densify.max_gaussians, reset_every=3)
 
     monkeypatch.setattr(fit, "densify_schedule", schedule)
 
 
-def settings(method: str, device: str, **changes) -> MethodConfig:
+def settings(method: str, device: str, **changes) -> FitConfig:
     few = {"iterations": 6, "start__gaussians": 120, "densify__max_gaussians": 400, "raster": "torch"}
     virtual = {"loss__semantic_every": 2, "virtual__probability": 0.5, "virtual__gaussians": 50}
     return small_fit(method, device=device, **{**few, **virtual, **changes})
@@ -97,7 +96,7 @@ def assert_same_fit(mine: Path, theirs: Path) -> None:
         torch.testing.assert_close(value, other[name], atol=1e-5, rtol=1e-5, msg=told)
 
 
-def fitted(world: dict[str, Path], out: Path, config: MethodConfig, **more: Path) -> Path:
+def fitted(world: dict[str, Path], out: Path, config: FitConfig, **more: Path) -> Path:
     return fit_to(world, out, config, observations=(world["virtual"],), **more).run()
 
 
@@ -370,7 +369,7 @@ def test_a_backend_that_does_not_draw_on_the_device_is_refused(world, tmp_path):
 
 
 def test_steps_and_benchmarks_follow_the_device_of_a_run_unless_they_have_their_own(monkeypatch):
-    made = with_device(RunConfig(device="cuda:1", fit=MethodConfig(device="cpu")))
+    made = with_device(RunConfig(device="cuda:1", fit=FitConfig(device="cpu")))
     assert (made.fit.device, made.render.device, made.score.device) == ("cpu", "cuda:1", "cuda:1")
     assert made.fuse == RunConfig().fuse
     assert with_device(RunConfig()) == RunConfig()

@@ -12,13 +12,10 @@ import time
 from pathlib import Path
 
 import pytest
-import torch
 from test_learn_parallel import environment
 from toy_clips import losses_of, training_words, write_clips
 
 from mudg.base import checkpoint
-from mudg.base.errors import UsageError
-from mudg.diffusion.parallel import Ranks, mesh_shape
 
 pytestmark = pytest.mark.slow
 SAME = 1e-6
@@ -72,7 +69,7 @@ def test_two_processes_then_one_then_four(clips, tmp_path):
     for processes, fault, changes in (
         (2, "warn:2:1", {"compute.parallel": "fsdp"}),
         (1, "warn:4:0", {}),
-        (4, "", {"compute.parallel": "hsdp", "compute.processes-per-replica": 2}),
+        (4, "", {"compute.parallel": "fsdp"}),
     ):
         done = start(processes, clips, parts, fault, **changes)
         said.append(done.stdout + done.stderr)
@@ -88,7 +85,7 @@ def test_two_processes_then_one_then_four(clips, tmp_path):
     assert kept == ["step_00000005", "step_00000006", "step_00000008"]
     newest = checkpoint.latest(parts / "steps")
     assert newest is not None and newest.state["processes"] == 4
-    assert len(list(newest.path.glob("net.*.safetensors"))) == 2  # of one replica
+    assert len(list(newest.path.glob("net.*.safetensors"))) == 4
 
 
 def test_a_node_that_vanishes_leaves_the_training_to_the_other(clips, tmp_path):
@@ -142,9 +139,9 @@ def max_difference(one, other, steps=STEPS):
 
 
 def test_checkpoints_are_cut_anew_bit_equal(tmp_path):
-    """Saved by 1, 2 and 4 processes, sharded and in replicas, read by each other number: the same bytes."""
+    """Saved by 1, 2 and 4 processes, read by each other number: the same bytes."""
     here, sums, before = Path(__file__).parent, {}, ""
-    for processes, layout in ((1, "fsdp"), (2, "fsdp"), (4, "fsdp"), (4, "hsdp"), (2, "fsdp"), (1, "fsdp")):
+    for processes, layout in ((1, "fsdp"), (2, "fsdp"), (4, "fsdp"), (2, "fsdp"), (1, "fsdp")):
         into = tmp_path / f"{len(sums)}"
         words = f"-m torch.distributed.run --standalone --nproc-per-node {processes}".split()
         command = [sys.executable, *words, str(here / "reshard_together.py"), layout, before, str(into)]
@@ -153,12 +150,3 @@ def test_checkpoints_are_cut_anew_bit_equal(tmp_path):
         sums[into] = done.stdout.split()[-1]
         before = str(into)
     assert len(set(sums.values())) == 1 and len(hashlib.sha256().hexdigest()) == len(next(iter(sums.values())))
-
-
-def test_replicas_divide_the_processes(monkeypatch):
-    ranks = Ranks(0, 8, torch.device("cpu"))
-    assert mesh_shape(ranks, 2) == (4, 2) and mesh_shape(ranks, 8) == (1, 8)
-    monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
-    assert mesh_shape(ranks, 0) == (2, 4)
-    with pytest.raises(UsageError, match="divisor of 8"):
-        mesh_shape(ranks, 3)

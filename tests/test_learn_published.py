@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from test_learn_parallel import SAME, assert_same_training, both_run
-from toy_clips import losses_of, with_settings, write_clips
+from toy_clips import losses_of, write_clips
 from toy_published import published_settings, write_tiny
 from toy_scene import ToyStreet
 
@@ -20,7 +20,7 @@ from mudg.diffusion.condition import ConditionRules, build_conditions, filled_de
 from mudg.diffusion.log_clips import LogClipRules, LogSource
 from mudg.diffusion.model import BatchPart, LossSettings
 from mudg.diffusion.published import PAPER_DROPOUT, ContextDropout, PublishedMDM
-from mudg.diffusion.settings import LearnConfig, SynthesizeConfig
+from mudg.diffusion.settings import SynthesizeConfig
 from mudg.diffusion.views import recorded_images
 from mudg.scene.observations import read_observations
 from mudg.scene.read import read_scene
@@ -174,34 +174,15 @@ def test_the_reference_is_left_out_once(converted, clips, tmp_path, monkeypatch)
     assert ContextDropout.for_reference(0.0) == ContextDropout(0.05, 0.0, 0.0)
 
 
-@pytest.mark.parametrize(("share", "frame", "matters"), [(1.0, False, True), (1.0, True, False), (0.0, True, True)])
-def test_what_goes_without_the_reference(converted, clips, share, frame, matters):
-    """Left out of tokens and frame, another reference image changes nothing; left out of the tokens alone, frame 0
-    still shows it."""
+def test_frame_0_shows_the_reference_also_where_the_tokens_go_without(converted, clips):
     settings = published_settings(converted, clips)
     model, _ = models.starting_model(settings)
     (clip,) = corners(settings, clips, 0, 1, 4, "batch")
     other = replace(clip, condition=replace(clip.condition, reference=1 - clip.condition.reference))
-    rules = LossSettings(None, 1.0, share, frame_dropout=frame)
+    rules = LossSettings(None, 1.0, 1.0)
     with torch.no_grad():
         loss, again, changed = (float(model([one], BatchPart(0, 0, 0, 1), rules).total) for one in (clip, clip, other))
-    assert loss == again
-    assert (changed != loss) == matters
-
-
-def test_the_scope_of_dropout_changes_no_clip_that_keeps_its_reference(converted, clips):
-    settings = published_settings(converted, clips)
-    model, _ = models.starting_model(settings)
-    (clip,) = corners(settings, clips, 0, 1, 4, "batch")
-    scopes = ({}, {"reference_dropout_scope": "tokens_and_frame"})
-    rules = [learn.loss_settings(with_settings(LearnConfig(), **scope), torch.ones(19)) for scope in scopes]
-    assert [rule.frame_dropout for rule in rules] == [False, True]
-
-    @torch.no_grad()
-    def loss(share, frame):
-        return float(model([clip], BatchPart(0, 0, 0, 1), LossSettings(None, 1.0, share, frame_dropout=frame)).total)
-
-    assert loss(0.0, False) == loss(0.0, True) and loss(1.0, False) != loss(1.0, True)
+    assert loss == again != changed
 
 
 def test_what_does_not_fit_is_refused_in_words(converted, clips, tmp_path):

@@ -273,19 +273,11 @@ def test_damaged_and_foreign_models_are_refused(tmp_path):
 
 
 def test_configuration_is_strict():
-    """What the shipped models say of fields that were taken out is accepted, every other value of these is not."""
     values = asdict(TINY)
     assert model_files.config_from_dict(values) == TINY
     refused("patches", model_files.config_from_dict, {**values, "patches": 3})
     for change in ({"blocks": (1,)}, {"widths": (16, 20)}):
         refused(".", replace, TINY, raises=UsageError, **change)
-    former = model_files.FORMER_FIELDS
-    values = {**values, **former["top"], "codec": {**values["codec"], **former["codec"]}}
-    assert model_files.config_from_dict(values) == TINY
-    for name in former["top"]:
-        refused(f"no longer has[^$]*{name}", model_files.config_from_dict, {**values, name: "other"})
-    palette = {**values["codec"], "semantics_code": "palette"}
-    refused("no longer has[^$]*semantics_code", model_files.config_from_dict, {**values, "codec": palette})
 
 
 def test_wrong_requests_are_refused():

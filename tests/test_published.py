@@ -22,6 +22,7 @@ from mudg.base.types import Camera, Condition, View
 from mudg.core import noise
 from mudg.diffusion import memory_plan, published, views
 from mudg.diffusion.condition import ConditionRules, build_conditions
+from mudg.diffusion.parallel import recompute
 from mudg.diffusion.published import PublishedConfig, PublishedMDM, WorkSplit
 from mudg.diffusion.published_network import (
     LATENT_SCALE,
@@ -226,9 +227,8 @@ def test_posterior_is_sampled_or_not_as_asked():
 
 
 def test_missing_is_zero_and_the_reference_is_frame_zero():
-    config = replace(TINY, codec=replace(TINY.codec, posterior="mean"))
     model = tiny_model()
-    model.config = config
+    model.config = replace(TINY, codec=replace(TINY.codec, posterior="mean"))
     condition = some_condition()
     planes = model.encode_condition(condition).planes
     encode = lambda image: model.codec.encode(image).detach()
@@ -237,14 +237,11 @@ def test_missing_is_zero_and_the_reference_is_frame_zero():
     assert torch.allclose(planes[0, 1, :4], encode(color[1] * 2 - 1), atol=1e-5)
     depth = condition.depth * condition.valid
     assert torch.allclose(planes[0, 0, 4:], encode(model.codec.depth_image(depth[0])), atol=1e-5)
-    model.config = replace(config, missing_is_zero=False)
-    filled = model.encode_condition(condition).planes
-    assert torch.allclose(filled[0, 1, :4], encode(condition.color[1] * 2 - 1), atol=1e-5)
     generated = torch.rand(2, 3, 8, 12, generator=torch.Generator().manual_seed(5))
     continued = model.encode_condition(condition, known=generated).planes
-    assert torch.allclose(continued[0, 0], filled[0, 0], atol=1e-5)
+    assert torch.allclose(continued[0, 0], planes[0, 0], atol=1e-5)
     assert torch.allclose(continued[0, 1, :4], encode(generated[1] * 2 - 1), atol=1e-5)
-    assert torch.allclose(continued[0, 2], filled[0, 2], atol=1e-5)
+    assert torch.allclose(continued[0, 2], planes[0, 2], atol=1e-5)
 
 
 # sampling -----------------------------------------------------------------------------------------
@@ -375,15 +372,16 @@ def test_a_training_step_moves_what_its_stage_says(stage, temporal):
 
 
 @pytest.mark.slow
-def test_checkpointing_gives_the_same_gradients():
+def test_recomputing_gives_the_same_gradients():
     """Also where dropout draws: the second computation of a stage draws what the first one drew."""
     gradients = []
-    for checkpointing in (False, True):
+    for again in (False, True):
         model = tiny_model()
         truth, encoded = batch_of(model, 2)
         moving = choose_trainable(model, 1)
         model.net.train()
-        model.net.checkpointing = checkpointing
+        if again:
+            recompute(model.net)
         model.velocity_loss(truth, encoded, torch.Generator().manual_seed(4)).total.backward()
         gradients.append(torch.cat([p.grad.flatten() for p in moving]))
     assert error(gradients[1], gradients[0]) < 1e-5
@@ -519,9 +517,8 @@ def test_short_trajectories_are_refused_in_words(street, tmp_path):
 
 
 @pytest.mark.slow
-def test_full_size_fits_ten_gigabytes():
-    """Counted, not run: see docs/research/published.md for the table."""
-    needs = memory_plan.needs_of(PublishedConfig(), 2)
+def test_full_size_fits_ten_gigabytes(needs):
+    """See docs/research/published.md for the table."""
     assert needs.parameters == pytest.approx(4.41e9, rel=0.01)
     plan, peak_bytes = memory_plan.choose(needs, 10_000_000_000)
     assert peak_bytes <= 10_000_000_000
@@ -531,25 +528,6 @@ def test_full_size_fits_ten_gigabytes():
     assert peak_bytes == needs.parameters + needs.clip + 3 * needs.one_video + memory_plan.RESERVE_BYTES
     roomy, _ = memory_plan.choose(needs, 80_000_000_000)
     assert (roomy.modalities_together, roomy.guidance_together, roomy.frames_at_once) == (True, True, 16)
-
-
-def test_memory_is_counted_right():
-    """A chain whose live set is known, and the proportion to the batch that the plan relies on."""
-    x = torch.empty(1000, device="meta")
-
-    def chain():
-        a = x + 1  # 4000
-        b = a * 2  # 8000
-        del a
-        c = torch.cat([b, b])  # 4000 + 8000
-        return c.view(2, 1000)[0].clone()  # + 4000
-
-    assert memory_plan.peak_activations(chain) == 16000
-    model = memory_plan.meta_model(TINY, torch.float32)
-    one, three = (memory_plan.denoise_bytes(model, 16, 24, n) for n in (1, 3))
-    assert three == pytest.approx(3 * one, rel=0.02)
-    one, three = (memory_plan.autoencoder_bytes(model, 16, 24, n) for n in (1, 3))
-    assert three == pytest.approx(3 * one, rel=0.02)
 
 
 @pytest.mark.slow
@@ -625,37 +603,10 @@ def test_keys_belong_to_their_layers(model):
     )
 
 
-@pytest.mark.slow
-def test_a_compiled_network_makes_the_same(model):
-    """Traced by torch.compile without its code generator, so that no compiler is needed."""
-    request = SampleRequest(2, 3)
-    plain = model.sample(some_condition(), request)
-    other = tiny_model()
-    names = list(other.state_dict())
-    other.net.compile(backend="eager")
-    made = other.sample(some_condition(), request)
-    assert list(other.state_dict()) == names
-    assert torch.allclose(made.rgb, plain.rgb, atol=1e-5) and torch.allclose(made.depth, plain.depth, atol=1e-2)
-    torch._dynamo.reset()
-
-
 @pytest.fixture(scope="module")
-def full():
-    """The full model in bfloat16 on the meta device, and what it needs."""
-    config = PublishedConfig()
-    return memory_plan.meta_model(config, torch.bfloat16), memory_plan.needs_of(config, 2)
-
-
-def test_inputs_that_die_hide_nothing():
-    """A tensor that gets the address of an input that is gone is counted all the same."""
-    inputs = [torch.empty(1, device="meta") for _ in range(64)]
-
-    def work():
-        while inputs:
-            inputs.pop().add(1)
-        return [torch.empty(1024, device="meta") for _ in range(256)]
-
-    assert memory_plan.peak_activations(work) == 256 * 4096
+def needs():
+    """What the published network needs at 576x1024 in bfloat16."""
+    return memory_plan.needs_of(PublishedConfig(), 2)
 
 
 @pytest.mark.parametrize(
@@ -663,29 +614,20 @@ def test_inputs_that_die_hide_nothing():
     [(16, (True, False), 8), (24, (True, True), 16), (40, (True, True), 16), (80, (True, True), 16)],
 )
 @pytest.mark.slow
-def test_what_fits_on_a_card(full, card_gb, together, frames):
-    """At 576x1024; a whole clip, run on the meta device as the plan says, takes no more."""
-    model, needs = full
+def test_what_fits_on_a_card(needs, card_gb, together, frames):
     split, peak_bytes = memory_plan.choose(needs, card_gb * 10**9)
     assert ((split.modalities_together, split.guidance_together), split.frames_at_once) == (together, frames)
     assert not split.offload
     assert peak_bytes <= card_gb * 10**9
-    if card_gb > 24:
-        return  # as with 24
-    counted = needs.parameters + memory_plan.sampling_bytes(model, split) + memory_plan.RESERVE_BYTES
-    assert 0.97 * peak_bytes < counted <= 1.01 * peak_bytes
 
 
 @pytest.mark.slow
-def test_the_tower_goes_where_that_avoids_a_smaller_cut(full):
-    _, needs = full
+def test_the_tower_goes_where_that_avoids_a_smaller_cut(needs):
     assert needs.tower == pytest.approx(1.26e9, rel=0.01)
     split, peak_bytes = memory_plan.choose(needs, 14_000_000_000)
     assert split.offload and split.modalities_together and peak_bytes <= 14_000_000_000
     kept, more = memory_plan.choose(needs, 14_000_000_000, offload=(False,))  # on a CPU
     assert not kept.offload and not kept.modalities_together and more > peak_bytes - needs.tower
-    asked, _ = memory_plan.choose(needs, 80_000_000_000, offload=(True,))
-    assert asked.offload and asked.guidance_together
     _, least = memory_plan.choose(needs, 1)
     assert least == pytest.approx(
         needs.parameters - needs.tower + needs.clip + needs.one_video + memory_plan.RESERVE_BYTES, rel=0.1
@@ -695,7 +637,6 @@ def test_the_tower_goes_where_that_avoids_a_smaller_cut(full):
 def test_settings_of_the_published_kind_alone(tmp_path):
     folder = write_tiny(tmp_path)
     config = SynthesizeConfig(model=str(folder), device="cpu", steps=20)
-    refused("on the CPU already", views.check_config, replace(config, offload=True), False, raises=UsageError)
     checked = views.check_config(config, False)
     assert (checked.processes, checked.device) == (1, "cpu")
     assert views.load_any(checked).split == WorkSplit(frames_at_once=1)

@@ -18,7 +18,7 @@ from mudg.base import geometry, seeds, store
 from mudg.base.errors import NumericsError, UsageError
 from mudg.baselines import emernerf as loop
 from mudg.baselines import emernerf_field as fields
-from mudg.baselines.emernerf import extent_of, flow_colors, lidar_rays, load_field, view_rays
+from mudg.baselines.emernerf import extent_of, lidar_rays, load_field, view_rays
 from mudg.baselines.emernerf_field import SIZES, Budget, Extent, RadianceField, RayDraws, Rays, aggregated
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing.settings import RenderConfig
@@ -343,13 +343,6 @@ def test_a_batch_of_pixels_shows_what_the_rays_meet(world):
     state.pixels.errors[3] = 1.0
     chosen = state.pixels.batch(40, 1.0, seeds.torch_generator(0, 2, "batch"))
     assert (chosen.cells == 3).all()
-
-
-def test_flow_pictures_are_black_at_rest():
-    flow = np.zeros((3, 2, 2))
-    flow[0, 0, 0], flow[1, 1, 1] = 2.0, 0.5
-    picture = flow_colors(flow)
-    assert picture[0, 1].tolist() == [0, 0, 0] and picture[0, 0].tolist() == [255, 64, 64] and picture[1, 1].max() < 128
 
 
 def test_rays_move_to_a_device_and_back(world):

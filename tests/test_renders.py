@@ -1,6 +1,6 @@
 """Renders of a fitted scene in the condition: what they tell, how they are stored, varied and taken up."""
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from mudg import native
 from mudg.base import palette
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera, FusedCloud, Photo, PointCloud, RenderPlanes, Track
-from mudg.diffusion import city_clips, clips, model_files
+from mudg.diffusion import city_clips, clips
 from mudg.diffusion import condition as conditions
 from mudg.diffusion import model as mdm
 from mudg.diffusion.city_clips import CityClipRules
@@ -471,13 +471,3 @@ def test_a_model_without_renders_ignores_them():
 def test_renders_are_not_given_up_again():
     with pytest.raises(UsageError, match="another kind"):
         extended(randomised(WITH_RENDERS), TINY)
-
-
-def test_models_described_before_there_were_renders_load():
-    values = asdict(TINY)
-    for name in model_files.LATER_FIELDS:
-        del values[name]
-    assert model_files.config_from_dict(values) == TINY
-    assert model_files.config_from_dict(asdict(WITH_RENDERS)) == WITH_RENDERS
-    with pytest.raises(InputError):
-        model_files.config_from_dict({**values, "later": 1})

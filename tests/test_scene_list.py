@@ -71,17 +71,16 @@ def test_without_weights_every_scene_counts_the_same():
     assert "12 scenes" in listed.summary() and "75 % of the clips" in listed.summary()
 
 
-def test_lists_are_read_in_three_formats(tmp_path):
+def test_lists_are_read_in_two_formats(tmp_path):
     (tmp_path / "l.yaml").write_text(
         "data_sets: {k: 2.0}\nscenes:\n- a\n- {path: b, data_set: k, weight: 2, held_out: true}\n- {path: c, data_set:"
         " k}\n"
     )
     (tmp_path / "l.json").write_text('["a", {"path": "b", "data_set": "k"}]')
-    (tmp_path / "l.txt").write_text("# scenes\na\nb\tk\t2.5\n\n")
-    a, b, c = (read_list(str(tmp_path / f"l.{end}")) for end in ("yaml", "json", "txt"))
+    a, b = (read_list(str(tmp_path / f"l.{end}")) for end in ("yaml", "json"))
     assert a.shares == {"scenes": 1 / 3, "k": 2 / 3} and a.scored == [1]
-    assert [s.path for s in b.scenes] == ["a", "b"] and c.scenes[1].weight == 2.5
-    assert is_list([str(tmp_path / "l.txt")]) and not is_list(["runs/a"]) and not is_list([])
+    assert [s.path for s in b.scenes] == ["a", "b"]
+    assert is_list([str(tmp_path / "l.json")]) and not is_list(["runs/a"]) and not is_list([])
     for content, words in (
         ("[]", "scenes"),
         ('[{"path": "a", "wieght": 1}]', "did you mean 'weight'"),
@@ -90,8 +89,6 @@ def test_lists_are_read_in_three_formats(tmp_path):
     ):
         (tmp_path / "bad.json").write_text(content)
         refused(words, read_list, str(tmp_path / "bad.json"))
-    (tmp_path / "bad.txt").write_text("a\tb\tmuch\n")
-    refused("line 1", read_list, str(tmp_path / "bad.txt"))
 
 
 def listed_folder(clips, tmp_path, count=6, bad=()):

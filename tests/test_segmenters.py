@@ -18,7 +18,7 @@ import pytest
 import torch
 from refusals import refused
 from tiny_networks import NAMES as TINY_NAMES
-from tiny_networks import eomt, mask2former, segformer
+from tiny_networks import mask2former, segformer
 
 from mudg.base.errors import ResourceError
 from mudg.base.palette import CLASSES, ID, UNLABELLED
@@ -27,7 +27,6 @@ from mudg.labels.segmenters import KINDS, Segmenter, match_classes, tile_starts
 from mudg.networks import folders
 
 NAMES = {"0": "Road", "1": "traffic light", "2": "sky", "3": "unicorn"}
-SQUARE_PX = 64
 MEAN, DEVIATION = [0.5, 0.5, 0.5], [0.25, 0.25, 0.25]
 
 
@@ -43,7 +42,6 @@ class Network(torch.nn.Module):
     def __init__(self, masks: bool) -> None:
         super().__init__()
         self.masks, self.seen = masks, []
-        self.config = SimpleNamespace(image_size=SQUARE_PX)
 
     def forward(self, pixel_values: torch.Tensor) -> SimpleNamespace:
         self.seen.append(tuple(pixel_values.shape))
@@ -66,13 +64,13 @@ def folder_of(tmp_path: Path, kind: str, names: dict[str, str] | None = None) ->
 def package(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str, dict[str, bool]]]:
     loaded: list[tuple[str, str, dict[str, bool]]] = []
     module = ModuleType("transformers")
-    for kind, row in KINDS.items():
+    for kind, (class_name, _) in KINDS.items():
 
         def from_pretrained(path: str, _kind: str = kind, **named: bool) -> tuple[Network, dict[str, list[str]]]:
             loaded.append((_kind, path, named))
             return Network(masks=_kind != "segformer"), {"missing_keys": []}
 
-        setattr(module, row.class_name, type(row.class_name, (), {"from_pretrained": staticmethod(from_pretrained)}))
+        setattr(module, class_name, type(class_name, (), {"from_pretrained": staticmethod(from_pretrained)}))
     monkeypatch.setitem(sys.modules, "transformers", module)
     return loaded
 
@@ -104,8 +102,7 @@ def test_classes_come_out_by_name_whole_and_in_tiles(
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(
-    ("make", "size"),
-    [(segformer, (64, 96)), (segformer, (45, 70)), (mask2former, (64, 96)), (mask2former, (45, 70)), (eomt, (64, 64))],
+    ("make", "size"), [(segformer, (64, 96)), (segformer, (45, 70)), (mask2former, (64, 96)), (mask2former, (45, 70))]
 )
 def test_real_networks_answer_as_the_package_says(
     make: Callable[[Path], Any], size: tuple[int, int], tmp_path: Path
@@ -134,7 +131,7 @@ def test_real_networks_answer_as_the_package_says(
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("make", [segformer, mask2former, eomt])
+@pytest.mark.parametrize("make", [segformer, mask2former])
 def test_real_networks_read_images_of_any_size_in_tiles(
     make: Callable[[Path], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -156,16 +153,6 @@ def test_a_network_without_its_head_is_refused(tmp_path: Path) -> None:
     refused("decode_head", Segmenter.load, tmp_path)
 
 
-def test_squares_are_scaled_to_the_network(package: list, tmp_path: Path) -> None:
-    """EoMT reads squares of one size: an image of other size is scaled, and its classes come back at its own size."""
-    segmenter = Segmenter.load(folder_of(tmp_path, "eomt"))
-    large = flag().repeat(3, 0).repeat(3, 1)
-    ids, _ = segmenter.classes(large)
-    assert ids.shape == (192, 288) and set(segmenter._network.seen) == {(2, 3, SQUARE_PX, SQUARE_PX)}
-    for stripe, name in enumerate(("road", "traffic light", "sky")):
-        assert (ids[:, 96 * stripe + 20 : 96 * stripe + 76] == ID[name]).all()
-
-
 def test_tiles_cover_everything_and_overlap() -> None:
     for length, tile in ((50, 64), (64, 64), (65, 64), (300, 64), (1920, 1024)):
         starts = tile_starts(length, tile)
@@ -179,7 +166,7 @@ def test_tiles_cover_everything_and_overlap() -> None:
 def test_what_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     refused("weights", Segmenter.load, "", raises=ResourceError)
     refused("another kind", Segmenter.load, folder_of(tmp_path, "bert"))
-    folder_of(tmp_path, "eomt")
+    folder_of(tmp_path, "segformer")
     monkeypatch.setitem(sys.modules, "transformers", None)
     refused("models", Segmenter.load, tmp_path, raises=ResourceError)
     assert match_classes(NAMES, "here").tolist() == [ID["road"], ID["traffic light"], ID["sky"], UNLABELLED]

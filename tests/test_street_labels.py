@@ -22,10 +22,11 @@ from mudg.core.depth import ray_elevation
 from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import visible_depth
 from mudg.labels import street_net
+from mudg.labels.annotate import LABELLERS
 from mudg.labels.evidence import BOX_GROUPS, PLANE_COUNT, PLANES, Evidence, encode, gather
 from mudg.labels.inputs import TRAIN_ID_OF
-from mudg.labels.labellers import labeller
 from mudg.labels.street_net import StreetNet, StreetNetConfig, at_size, reduced, settled, settled_by_color
+from mudg.networks.folders import CPU
 
 TOOLS = Path(__file__).resolve().parent.parent / "tools"
 TINY = StreetNetConfig(widths=(8, 8, 8, 8, 8), blocks=(1, 1, 1, 1, 1))
@@ -211,14 +212,14 @@ def test_every_pixel_gets_scores_at_any_size() -> None:
 
 def test_the_shipped_network_knows_a_street_it_never_saw_also_without_lidar() -> None:
     given, truth = given_at(STREET)
-    labels = labeller("embedded")(given)
+    labels = LABELLERS["embedded"]("", CPU)(given)
     assert overlap(labels.semantics, truth, "road") > 0.9 and overlap(labels.semantics, truth, "car") > 0.75
     assert overlap(labels.semantics, truth, "sky") > 0.8 and labels.confidence.dtype == np.float32
     assert ((labels.confidence > 0) & (labels.confidence <= 1)).all() and (labels.depth[labels.sky] == 100).all()
-    again = labeller("embedded")(given)
+    again = LABELLERS["embedded"]("", CPU)(given)
     assert (again.semantics == labels.semantics).all() and (again.confidence == labels.confidence).all()
     given, truth = given_at(STREET, lidar=False, boxes=False)
-    labels = labeller("embedded")(given)
+    labels = LABELLERS["embedded"]("", CPU)(given)
     assert overlap(labels.semantics, truth, "sky") > 0.9 and np.isnan(labels.depth[~labels.sky]).all()
 
 

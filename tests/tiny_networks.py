@@ -67,14 +67,6 @@ def mask2former(folder: Path) -> Any:
     return _saved(seeded(t.Mask2FormerForUniversalSegmentation(config)), folder)
 
 
-def eomt(folder: Path) -> Any:
-    """EoMT that reads squares of 64 px."""
-    t = package("transformers")
-    tower = {"hidden_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2, "image_size": 64, "patch_size": 16}
-    config = t.EomtConfig(**tower, num_queries=6, num_blocks=1, num_upscale_blocks=1, **LABELS)
-    return _saved(seeded(t.EomtForUniversalSegmentation(config)), folder)
-
-
 def depth_anything(folder: Path, *, with_lidar: bool = False, metric: bool = False) -> Any:
     """Depth Anything or PromptDepthAnything on a DINOv2 backbone, for images whose shorter side is 42 px."""
     t = package("transformers")
@@ -96,47 +88,31 @@ def depth_anything(folder: Path, *, with_lidar: bool = False, metric: bool = Fal
     return network
 
 
-def marigold(folder: Path, *, prediction_type: str = "v_prediction", longest_px: int = 48) -> Any:
-    """Folder of a Marigold pipeline: latents of half the size, two tokens of text."""
-    t, d = package("transformers"), package("diffusers")
+def _marigold(folder: Path) -> tuple[Any, Any]:
+    """What DepthLab reads of a Marigold folder; its U-Net and autoencoder, with latents of half the size."""
+    d = package("diffusers")
     size = {"block_out_channels": (8, 16), "layers_per_block": 1, "norm_num_groups": 4}
     down, up = ("DownBlock2D", "CrossAttnDownBlock2D"), ("CrossAttnUpBlock2D", "UpBlock2D")
     width = {"in_channels": 8, "out_channels": 4, "cross_attention_dim": 8, "attention_head_dim": 4, **size}
     unet = d.UNet2DConditionModel(**width, down_block_types=down, up_block_types=up)
     down, up = ("DownEncoderBlock2D",) * 2, ("UpDecoderBlock2D",) * 2
     vae = d.AutoencoderKL(**size, latent_channels=4, down_block_types=down, up_block_types=up)
-    tower = {"hidden_size": 8, "intermediate_size": 8, "num_hidden_layers": 1, "num_attention_heads": 2}
-    words = {"vocab_size": 8, "max_position_embeddings": 8, "bos_token_id": 6, "eos_token_id": 7}
-    text = t.CLIPTextModel(t.CLIPTextConfig(**tower, **words))
     betas = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
-    steps = {"steps_offset": 1, "prediction_type": prediction_type, "timestep_spacing": "trailing"}
+    steps = {"steps_offset": 1, "prediction_type": "v_prediction", "timestep_spacing": "trailing"}
     scheduler = d.DDIMScheduler(**betas, clip_sample=False, set_alpha_to_one=False, **steps)
-    for seed, (name, network) in enumerate({"unet": unet, "vae": vae, "text_encoder": text}.items()):
+    for seed, (name, network) in enumerate({"unet": unet, "vae": vae}.items()):
         seeded(network, seed).save_pretrained(folder / name)
     scheduler.save_pretrained(folder / "scheduler")
-    (folder / "tokenizer").mkdir()
-    words = {w: n for n, w in enumerate(["a", "b", "c", "a</w>", "b</w>", "c</w>", "<|startoftext|>", "<|endoftext|>"])}
-    (folder / "tokenizer" / "vocab.json").write_text(json.dumps(words))
-    (folder / "tokenizer" / "merges.txt").write_text("#version: 0.2\n")
-    described = {"tokenizer_class": "CLIPTokenizer", "model_max_length": 8}
-    (folder / "tokenizer" / "tokenizer_config.json").write_text(json.dumps(described))
-    defaults = {"default_denoising_steps": 3, "default_processing_resolution": longest_px}
-    index = {"_class_name": "MarigoldDepthPipeline", "_diffusers_version": d.__version__, "prediction_type": "depth"}
-    index |= {"scale_invariant": True, "shift_invariant": True, **defaults}
-    index |= {"unet": ["diffusers", "UNet2DConditionModel"], "vae": ["diffusers", "AutoencoderKL"]}
-    index |= {"text_encoder": ["transformers", "CLIPTextModel"], "tokenizer": ["transformers", "CLIPTokenizer"]}
-    index["scheduler"] = ["diffusers", "DDIMScheduler"]
-    (folder / "model_index.json").write_text(json.dumps(index))
-    tokenizer = t.CLIPTokenizer.from_pretrained(str(folder / "tokenizer"))
-    return d.MarigoldDepthPipeline(unet, vae, scheduler, text, tokenizer, prediction_type="depth", **defaults)
+    (folder / "model_index.json").write_text(json.dumps({"_class_name": "MarigoldPipeline"}))
+    return unet, vae
 
 
 def depthlab(folder: Path) -> dict[str, Any]:
-    """DepthLab's files as they are published, around a Marigold of ``marigold`` and a CLIP of vectors of six numbers;
+    """DepthLab's files as they are published, around a Marigold and a CLIP of vectors of six numbers;
     the networks."""
     t, d = package("transformers"), package("diffusers")
-    base = marigold(folder / "marigold-depth-v1-0")
-    config = {name: value for name, value in base.unet.config.items() if not name.startswith("_")}
+    unet, vae = _marigold(folder / "marigold-depth-v1-0")
+    config = {name: value for name, value in unet.config.items() if not name.startswith("_")}
     tower = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2}
     words = {"vocab_size": 8, "max_position_embeddings": 8, "bos_token_id": 6, "eos_token_id": 7}
     parts = {"text_config": {**tower, **words}, "vision_config": {**tower, "image_size": 28, "patch_size": 14}}
@@ -146,7 +122,7 @@ def depthlab(folder: Path) -> dict[str, Any]:
         "denoising_unet": seeded(d.UNet2DConditionModel(**{**config, "in_channels": 12}), 5),
         "reference_unet": seeded(d.UNet2DConditionModel(**{**config, "in_channels": 4}), 6),
         "mapping_layer": seeded(torch.nn.Linear(6, 8), 7),
-        "vae": base.vae,
+        "vae": vae,
         "clip": _saved(clip, folder / "CLIP"),
     }
     (folder / "DepthLab").mkdir()

@@ -19,6 +19,7 @@ import torch
 from shared import SMALL_PUBLISHED, device_of, drawn_model, finish, flags, generator_of, measured
 
 from mudg.base import seeds
+from mudg.diffusion.parallel import recompute
 from mudg.diffusion.published import PublishedConfig, PublishedLatents, PublishedMDM
 
 MODALITIES = ("rgb", "depth", "semantics")
@@ -30,7 +31,7 @@ def trained_weights(model: PublishedMDM, stage: int) -> list[torch.nn.Parameter]
     model.requires_grad_(False)
     moving = [p.requires_grad_(True) for name, p in model.trained_part().named_parameters() if name not in frozen]
     model.net.train()
-    model.net.checkpointing = True
+    recompute(model.net)
     return moving
 
 

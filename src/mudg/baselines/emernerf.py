@@ -2,7 +2,7 @@
 with its own gradient step.
 
     OUT/model.json, field.safetensors    the field (``fit.py``)
-    OUT/preview/*.png                    truth, colour, depth, what moves, flow
+    OUT/preview/*.png                    truth, colour, depth, what moves
     OUT/log.jsonl, steps/                how it went; checkpoints, while it runs
 """
 
@@ -18,7 +18,6 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from mudg.base import checkpoint, geometry, log, seeds, store
@@ -29,9 +28,9 @@ from mudg.base.records import understood
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Frame, Observation, Scene, View
 from mudg.baselines import emernerf_field as fields
-from mudg.baselines.settings import MethodConfig
 from mudg.core.pictures import depth_colors, gray, side_by_side, to_bytes
 from mudg.gaussians.rendering import COVERED
+from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.storage import RADIANCE, description_of, kind_of
 from mudg.gaussians.views import StoredView, load_recorded, training_frames
 from mudg.scene.read import read_points, read_scene
@@ -211,20 +210,17 @@ def recorded_pixels(
 
 RAYS_AT_ONCE = 2048
 PREVIEW_RAYS = 6000
-FULL_FLOW_M = 1.0
-"""Flow per time step, in metres, that is drawn in full colour."""
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
     """A view of a field, on the CPU: rgb ``[3, H, W]``; depth (of the median, along z, metres), opacity and share of
-    what moves ``[H, W]``; flow to the next time step ``[3, H, W]`` in metres, of what moves."""
+    what moves ``[H, W]``."""
 
     rgb: Tensor
     depth: Tensor
     opacity: Tensor
     moving: Tensor
-    flow: Tensor
 
 
 @torch.no_grad()
@@ -235,17 +231,15 @@ def see(field: fields.RadianceField, view: View, budget: fields.Budget, stride: 
     begins = range(0, len(rays), RAYS_AT_ONCE)
     parts = [_part(field, rays.part(begin, begin + RAYS_AT_ONCE), budget) for begin in begins]
     width = -(-view.camera.width // stride)
-    every = torch.cat(parts).view(-1, width, 9).permute(2, 0, 1)
-    return Seen(every[:3], every[3] * z_per_m.view(-1, width), every[4], every[5], every[6:9])
+    every = torch.cat(parts).view(-1, width, 6).permute(2, 0, 1)
+    return Seen(every[:3], every[3] * z_per_m.view(-1, width), every[4], every[5])
 
 
 def _part(field: fields.RadianceField, rays: fields.Rays, budget: fields.Budget) -> Tensor:
     rays = rays.to(field.device)
     marched = fields.march(field, rays, budget)
-    moving = marched.dynamic_weights()
-    flow = (moving[..., None] * marched.values.flow[:, :3].view(*moving.shape, 3)).sum(1)
-    rest = torch.stack([marched.median_m, marched.opacity, moving.sum(1)], 1)
-    return torch.cat([fields.colors(field, rays, marched)[0], rest, flow], 1).cpu()
+    rest = torch.stack([marched.median_m, marched.opacity, marched.dynamic_weights().sum(1)], 1)
+    return torch.cat([fields.colors(field, rays, marched)[0], rest], 1).cpu()
 
 
 def observe(field: fields.RadianceField, view: View, budget: fields.Budget, source: str = "") -> Observation:
@@ -262,24 +256,14 @@ def observe(field: fields.RadianceField, view: View, budget: fields.Budget, sour
 def write_preview(
     field: fields.RadianceField, stored: StoredView, budget: fields.Budget, path: Path, whole: bool = False
 ) -> None:
-    """A picture of five panels: truth, colour, depth, opacity of what moves, its flow. Coarser than the view unless
+    """A picture of four panels: truth, colour, depth, opacity of what moves. Coarser than the view unless
     ``whole``."""
     pixels = stored.view.camera.width * stored.view.camera.height
     stride = 1 if whole else max(1, round((pixels / PREVIEW_RAYS) ** 0.5))
     seen = see(field, stored.view, budget, stride)
     depth = np.where(seen.opacity >= 0.5, seen.depth, np.nan)
-    moving = gray(seen.moving.numpy()), flow_colors(seen.flow.numpy())
-    panels = [stored.rgb[::stride, ::stride], to_bytes(seen.rgb), depth_colors(depth), *moving]
+    panels = [stored.rgb[::stride, ::stride], to_bytes(seen.rgb), depth_colors(depth), gray(seen.moving.numpy())]
     store.write_image(path, side_by_side(panels))
-
-
-def flow_colors(flow: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Flow ``[3, H, W]`` in metres as a picture: the hue is the direction on the ground, black is at rest, bright one
-    metre or more."""
-    angle = np.arctan2(flow[1], flow[0])
-    strength = np.clip(np.hypot(flow[0], flow[1]) / FULL_FLOW_M, 0, 1)
-    hues = [0.5 + 0.5 * np.cos(angle - turn) for turn in (0.0, 2 * np.pi / 3, 4 * np.pi / 3)]
-    return (255 * np.stack(hues, -1) * strength[..., None]).round().astype(np.uint8)
 
 
 # on disk ------------------------------------------------------------------------------------------
@@ -357,7 +341,7 @@ class RadianceState:
         return {"parameters": count, "steps": self.step, "seconds": round(self.seconds, 2), **(self.last or {})}
 
 
-def fit_radiance(config: MethodConfig, scene: Path, device: torch.device, folder: RunDir) -> dict[str, Any]:
+def fit_radiance(config: FitConfig, scene: Path, device: torch.device, folder: RunDir) -> dict[str, Any]:
     """Fit a field to a scene and write it to the folder; an interrupted fit goes on from its newest checkpoint. Returns
     a summary."""
     with one_torch_thread(), memory_of(device, "fit"):
@@ -370,7 +354,7 @@ def fit_radiance(config: MethodConfig, scene: Path, device: torch.device, folder
     return state.summary()
 
 
-def prepare(config: MethodConfig, scene: Scene, folder: RunDir, device: torch.device) -> RadianceState:
+def prepare(config: FitConfig, scene: Scene, folder: RunDir, device: torch.device) -> RadianceState:
     """Read what is fitted to, and start from the newest checkpoint or from nothing."""
     frames = training_frames(scene, config.cameras)
     cameras = tuple(dict.fromkeys(frame.view.camera.name for frame in frames))
@@ -392,7 +376,7 @@ def prepare(config: MethodConfig, scene: Scene, folder: RunDir, device: torch.de
 # ---- the loop ------------------------------------------------------------------------------------
 
 
-def optimise(state: RadianceState, config: MethodConfig, folder: RunDir) -> None:
+def optimise(state: RadianceState, config: FitConfig, folder: RunDir) -> None:
     """Fit up to step ``config.iterations``. Same inputs, same result, also across an interruption."""
     pace = checkpoint.Pace()
     with log.task(f"fit {config.method}", config.iterations, state.step) as bar, Interruption() as interruption:
@@ -416,7 +400,7 @@ def optimise(state: RadianceState, config: MethodConfig, folder: RunDir) -> None
                 interruption.stop_now()
 
 
-def take_step(state: RadianceState, config: MethodConfig, step: int) -> dict[str, Tensor]:
+def take_step(state: RadianceState, config: FitConfig, step: int) -> dict[str, Tensor]:
     """A gradient step from pixels and one from LiDAR rays; the weighted loss terms of both."""
     field, device = state.field, state.field.device
     budget, (pixels, lidar_rays) = BUDGETS[config.radiance.size], BATCHES[config.radiance.size]

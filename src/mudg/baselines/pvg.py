@@ -134,13 +134,13 @@ class VibrationRecipe(OwnRecipe):
     ) -> SceneModel:
         """See ``Recipe``. Of the fused cloud only the cameras' colours are used."""
         node = VibrationNode.of_times([frame.view.time_s for frame in scene.frames])
-        found = timed_points(scene, views, classes, config, fused.colors)
+        points, time_s = timed_points(scene, views, classes, config, fused.colors)
         duration = FRAME * (len({frame.view.time_s for frame in scene.frames}) - 1)
-        random = seeds.numpy_rng(config.seed, 0, "start times").random(len(found.time_s))
+        random = seeds.numpy_rng(config.seed, 0, "start times").random(len(time_s))
         drawn = (random - 0.5) * FILLED_SPAN * duration
-        measured = (found.time_s - node.middle_s) / node.frame_s * FRAME
-        tau = torch.from_numpy(np.where(np.isnan(found.time_s), drawn, measured))
-        columns = found.points.columns(classes, config.sh_degree) | starting_columns(len(tau), tau, duration)
+        measured = (time_s - node.middle_s) / node.frame_s * FRAME
+        tau = torch.from_numpy(np.where(np.isnan(time_s), drawn, measured))
+        columns = points.columns(classes, config.sh_degree) | starting_columns(len(tau), tau, duration)
         log.info(f"start: {len(tau)} vibrating Gaussians")
         return world_model(node, columns, classes, config, fused.colors, painted_sky(views, fused.colors))
 

@@ -203,8 +203,8 @@ class FieldRecipe(OwnRecipe):
         self, scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
     ) -> SceneModel:
         """See ``Recipe``. Of the fused cloud only the cameras' colours are used."""
-        found = timed_points(scene, views, classes, config, fused.colors)
-        measured = found.points.xyz[~np.isnan(found.time_s)].astype(np.float64)
+        points, time_s = timed_points(scene, views, classes, config, fused.colors)
+        measured = points.xyz[~np.isnan(time_s)].astype(np.float64)
         low, high = measured.min(0), measured.max(0)
         margin = BOX_MARGIN * (high - low) + 0.1
         times = [frame.view.time_s for frame in scene.frames]
@@ -212,9 +212,9 @@ class FieldRecipe(OwnRecipe):
         sizes = replace(SIZES, time=max(2, min(SIZES.time, len(set(times)) // FRAMES_PER_CELL)))
         gain = SHORT_GAIN if config.iterations < FIELD_STEPS else 1.0
         node = HexPlaneNode.fresh([*(low - margin), first], [*(high + margin), last], sizes, config.seed, gain)
-        columns = found.points.columns(classes, config.sh_degree)
+        columns = points.columns(classes, config.sh_degree)
         numbers = node.learnt["planes"].numel()
-        log.info(f"start: {len(found.time_s)} Gaussians, {numbers} numbers in {sizes.levels} x 6 planes")
+        log.info(f"start: {len(time_s)} Gaussians, {numbers} numbers in {sizes.levels} x 6 planes")
         return world_model(node, columns, classes, config, fused.colors)
 
     def drawn_model(self, model: SceneModel, view: TrainView, step: int, config: FitConfig) -> SceneModel:

@@ -40,20 +40,11 @@ MOMENT_FRAMES = 2
 LARGEST_M = 150.0
 
 
-@dataclass(frozen=True, eq=False)
-class TimedPoints:
-    """Points and when they were measured, f64[N] seconds; NaN: no time belongs to the point (what LiDAR did not
-    reach)."""
-
-    points: StartPoints
-    time_s: NDArray[np.float64]
-
-
 def timed_points(
     scene: Scene, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig, colors: CameraColors
-) -> TimedPoints:
+) -> tuple[StartPoints, NDArray[np.float64]]:
     """Starting points of a log, thinned to ``config.start.gaussians``, and what LiDAR did not reach (as in
-    ``gaussians/start.py``).
+    ``gaussians/start.py``); and when they were measured, f64[N] seconds, NaN where LiDAR did not reach.
 
     Half of them are one per cube of space, half one per cube and every few frames, so that what moves has points all
     along its way. InputError: no photograph shows any LiDAR point."""
@@ -70,7 +61,7 @@ def timed_points(
     filled = fill_unreached(views, xyz, classes, colors)
     if filled is not None:
         chosen.append((filled, np.full(len(filled), np.nan)))
-    return TimedPoints(StartPoints.joined([part for part, _ in chosen]), np.concatenate([times for _, times in chosen]))
+    return StartPoints.joined([part for part, _ in chosen]), np.concatenate([times for _, times in chosen])
 
 
 def world_model(

@@ -26,7 +26,6 @@ from mudg.base.layout import OBSERVATION_FILES, below
 from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import RunDir, is_temporary
 from mudg.base.types import Trajectory
-from mudg.baselines.settings import MethodConfig
 from mudg.benchmarks.rows import EXACT, FILL, FULL, LONGER, MIXED, REPAIRED, Row, usual_fit
 from mudg.benchmarks.settings import BenchConfig
 from mudg.core.pictures import resize_area
@@ -34,6 +33,7 @@ from mudg.core.raster.rasterize import drawing_device
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing.settings import RenderConfig
 from mudg.formats.exporters.video import Encoding, jpeg_bytes, mp4_within, video_encoders
+from mudg.gaussians.settings import FitConfig
 from mudg.scene.clouds import read_fused
 from mudg.scene.observations import ObservationSet, ObservationWriter, list_observation_sets, read_observations
 from mudg.scene.read import read_scene
@@ -206,7 +206,7 @@ class Chain:
             return self._fit(settings, out)
         return self._fit(fits_of(settings, self.config.guided_share)[1], out, virtual)
 
-    def _repaired(self, name: str, settings: MethodConfig) -> Path:
+    def _repaired(self, name: str, settings: FitConfig) -> Path:
         """Step by step towards the places of generated views: render there, repair, and fit under all that was repaired
         so far. Every fit goes on with the first one. Where steps pass the same place (2 m is the end of the way to 2 m,
         and two thirds of that to 3 m), the newest views count."""
@@ -221,7 +221,7 @@ class Chain:
             model = self._fit(settings, out, tuple(seen.values()), self.first())
         return model
 
-    def _fit(self, settings: MethodConfig, out: Path, virtual: Sequence[Path] = (), begun: Path | None = None) -> Path:
+    def _fit(self, settings: FitConfig, out: Path, virtual: Sequence[Path] = (), begun: Path | None = None) -> Path:
         read = {"scene": self.scene, "fused": self.fused, "observations": tuple(virtual), "start_from": begun}
         return self.run(Fit(**read, out=out, settings=settings))
 

@@ -16,12 +16,11 @@ from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.plain_yaml import parse_yaml
 from mudg.base.records import StrictRecord, checked_by, parse_record
-from mudg.baselines.settings import MethodConfig
 from mudg.benchmarks.settings import BenchConfig, bench_preset
 from mudg.diffusion import model_files, views
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.gaussians.recipes import recipe_of
-from mudg.gaussians.settings import METHODS, PUBLISHED, UNFIT, WEIGHTS
+from mudg.gaussians.settings import METHODS, PUBLISHED, UNFIT, WEIGHTS, FitConfig
 from mudg.networks.inception import ResizeRule
 from mudg.scoring import score
 from mudg.scoring.tables import title_of
@@ -234,7 +233,7 @@ class Row:
     name: str
     title: str
     method: str = ""
-    fit: MethodConfig | None = None
+    fit: FitConfig | None = None
     changes: Mapping[str, Any] = field(default_factory=dict)
     varied: bool = False
 
@@ -258,16 +257,16 @@ def generator_of(config: BenchConfig) -> SynthesizeConfig:
     return replace(config.synthesize, **own, processes=1)
 
 
-def usual_fit(config: BenchConfig) -> MethodConfig:
+def usual_fit(config: BenchConfig) -> FitConfig:
     """The settings of fits, as ``mudg run`` takes them for the whole chain."""
     return replace(config.fit, method=FULL, iterations=config.iterations, seed=config.seed, device=config.device)
 
 
-def method_fit(usual: MethodConfig, method: str, preset: PresetName) -> MethodConfig:
+def method_fit(usual: FitConfig, method: str, preset: PresetName) -> FitConfig:
     """The usual settings with a method. What a preset sets and a method for comparison does not know has its default
     there. UsageError: a setting beyond the preset that the method does not know."""
-    named, plain = bench_preset(preset).fit, MethodConfig()
-    settings = configuration.load(MethodConfig, usual, overrides={"method": method})
+    named, plain = bench_preset(preset).fit, FitConfig()
+    settings = configuration.load(FitConfig, usual, overrides={"method": method})
     for name in (*UNFIT.get(method, ()), *WEIGHTS.get(method, ())):
         group, _, setting = name.partition(".")
         own, set_by_preset = getattr(settings, group), getattr(getattr(named, group), setting)
@@ -332,7 +331,7 @@ def refuse_unfit(
                 what = "this setting would change nothing"
                 raise UsageError(what, where=flag_of(name), got=reason, remedy="leave it out")
     if generators or virtual:
-        refuse_missing(generator_of(config), virtual[0] if virtual else MethodConfig(), "--model")
+        refuse_missing(generator_of(config), virtual[0] if virtual else FitConfig(), "--model")
     for generator in dict.fromkeys((*generators, *((generator_of(config),) if virtual else ()))):
         views.check_config(generator, fitted=False)
 
@@ -348,7 +347,7 @@ def shift_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row
     _refuse_unknown(wanted, known)
     rows = [_method_row(name, usual, preset) for name in known if name in wanted]
     for name, (description, weights) in ABLATION.items() if config.ablation else ():
-        ablated = configuration.load(MethodConfig, usual, overrides={"virtual": weights})
+        ablated = configuration.load(FitConfig, usual, overrides={"virtual": weights})
         rows.append(Row(name, f"with {description}", FULL, ablated))
     return _without_twins([*rows, *(variant_of(text, usual) for text in config.variant)])
 
@@ -389,21 +388,21 @@ def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "def
     for row in rows:
         if METHODS[row.method].made_by == "render" and not row.left_out:
             fit = method_fit(usual_fit(config), row.method, preset)
-            row = replace(row, fit=configuration.load(MethodConfig, fit, overrides=dict(row.changes)))
+            row = replace(row, fit=configuration.load(FitConfig, fit, overrides=dict(row.changes)))
         complete.append(row)
     return tuple(complete)
 
 
-def _method_row(name: str, usual: MethodConfig, preset: PresetName) -> Row:
+def _method_row(name: str, usual: FitConfig, preset: PresetName) -> Row:
     if name in (FILL, DIFFUSION):
         return Row(name, title_of(name), "" if name == FILL else name)
     method = {LONGER: BASE, MIXED: FULL}.get(name, name)
     return Row(name, LONGER_TITLE if name == LONGER else title_of(name), method, method_fit(usual, method, preset))
 
 
-def variant_of(text: str, usual: MethodConfig) -> Row:
+def variant_of(text: str, usual: FitConfig) -> Row:
     """A row of ``mudg_s`` from ``NAME=FIELD:VALUE,FIELD:VALUE``; values as in YAML, a dot between a group and its
-    field. UsageError if malformed or no field of ``MethodConfig``."""
+    field. UsageError if malformed or no field of ``FitConfig``."""
     name, separator, rest = text.partition("=")
     fields: dict[str, Any] = {}
     for part in rest.split(","):
@@ -414,7 +413,7 @@ def variant_of(text: str, usual: MethodConfig) -> Row:
             fields[setting.strip()] = parse_yaml(value, setting)
         except InputError as error:
             raise UsageError("malformed value", where=f"--variant {name}: {setting}", got=value) from error
-    changed = configuration.load(MethodConfig, usual, overrides=configuration.nested(fields))
+    changed = configuration.load(FitConfig, usual, overrides=configuration.nested(fields))
     return Row(name, f"{name}: {rest}", FULL, changed, varied=True)
 
 

@@ -17,12 +17,12 @@ from mudg.base.config import result_settings
 from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
-from mudg.baselines.settings import MethodConfig
 from mudg.benchmarks import cities, edit_runs, loop, paper, real, shift
 from mudg.benchmarks.rows import changed_settings, flag_of, generator_of
 from mudg.benchmarks.settings import BenchConfig, bench_preset
 from mudg.diffusion import model_files
 from mudg.diffusion.published import is_published
+from mudg.gaussians.settings import FitConfig
 from mudg.steps.pipeline import refuse_missing
 from mudg.steps.settings import PresetName
 
@@ -128,7 +128,7 @@ def refuse_unused(name: str, config: BenchConfig, preset: PresetName) -> None:
         what = "without --harmonize no diffusion model is used"
         raise UsageError(what, where="--model", got=config.model, remedy="leave it out")
     if name in CHAINS:
-        refuse_missing(generator_of(config), MethodConfig(), "--model")
+        refuse_missing(generator_of(config), FitConfig(), "--model")
     if name == "mdm" and is_published(config.model):
         what = "mudg bench mdm measures small models"
         remedy = "mudg bench paper --table mudg2 measures published-type ones"

@@ -6,9 +6,9 @@ from typing import Literal
 
 from mudg.base.config import changed, setting, settings
 from mudg.base.devices import DeviceName
-from mudg.baselines.settings import MethodConfig
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing.settings import ScoreConfig
+from mudg.gaussians.settings import FitConfig
 from mudg.scene.settings import FuseConfig
 from mudg.steps.settings import PresetName, run_preset
 
@@ -103,7 +103,7 @@ class BenchConfig(BenchOwn):
     """shift, real, paper: how views are generated. Model, number format, seed and device are the benchmark's own flags;
     where views are generated is the benchmark's matter (real: `--synthesize.shifts-m` for the views that fits learn
     from)."""
-    fit: MethodConfig = setting(default_factory=MethodConfig)
+    fit: FitConfig = setting(default_factory=FitConfig)
     """shift, real, paper: how scenes are fitted. Method, steps, seed and device are the benchmark's own flags."""
     score: ScoreConfig = setting(default_factory=ScoreConfig)
     """paper: how every row is scored; files of weights are given here."""
@@ -123,6 +123,6 @@ def bench_preset(name: PresetName = "default") -> BenchConfig:
             "guided_share": run.guided_share,
             "fuse": run.fuse,
             "synthesize": changed(run.synthesize, {"model": usual.model, "cameras": usual.cameras}),
-            "fit": changed(run.fit, {"iterations": MethodConfig().iterations}),
+            "fit": changed(run.fit, {"iterations": FitConfig().iterations}),
         },
     )

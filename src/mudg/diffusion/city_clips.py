@@ -319,8 +319,6 @@ class CityClipRules:
     clips: int = 4
     fine: int = 2
     """Recorded images are this many times larger than the clips; their colours are gathered at that size."""
-    point_colors: bool = False
-    """Also keep the colours of the nearest points, without images, in training clips (clips for scoring always do)."""
     published: bool = False
     """The published system's condition: points alone, 0 where nothing was seen; the reference is the image recorded at
     the time of the first view, from where it was recorded."""
@@ -581,7 +579,7 @@ def write_city(rules: CityClipRules, city: int, folder: Path, fit: FitCity | Non
     native.set_threads(1)
     log = make_log(rules, city, rules.frames)
     clips = make_clips(rules, city, log, None if fit is None else fit(rules, city, log))
-    if city >= HELD_OUT or rules.point_colors:
+    if city >= HELD_OUT:  # the colours of the nearest points, without images
         plain = ConditionRules(*size_of(rules, city), warp=False)
         tracks = log.tracks()
         points = [build_conditions(log.cloud, tracks, c.condition.views, (), plain)[0].color for c in clips]

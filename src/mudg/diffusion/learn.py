@@ -9,7 +9,7 @@ rounding if the number of processes or the layout changed meanwhile.
 OUT/clips/    one shard per city or clip of a log (or the folder `data.clips` of the configuration)
 OUT/codec/    checkpoints of the codec         OUT/steps/   checkpoints of the network, its moving average, the
               optimiser
-OUT/samples/  picture grids during training    OUT/loss.png, OUT/log.jsonl, OUT/metrics.json
+OUT/samples/  picture grids during training    OUT/log.jsonl, OUT/metrics.json
 OUT/model/    the exported model: fp16 weights, model.json, MODEL_CARD.md
 OUT/cache/    clips that were fetched or made when they were drawn; removed at the end
 """
@@ -414,7 +414,7 @@ def _begin(model: Model, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[
     if config.compute.recompute:
         for part in trained.values():
             parallel.recompute(part)
-    spread = Spread(model, trained, ranks, config.compute.parallel, config.compute.processes_per_replica)
+    spread = Spread(model, trained, ranks, config.compute.parallel)
     rules, moving = config.optimizer, [p for p in trained.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(moving, lr=rules.lr, betas=rules.betas, weight_decay=WEIGHT_DECAY, fused=True)
     average = None
@@ -499,7 +499,6 @@ def _train_network(model: Model, source: TrainingClips, run_dir: RunDir, bf16: b
                 if ranks.leads:
                     values = {"frames": frames, "rate": round(rate, 3), **mean_of(recent)}
                     run_dir.log(step=done, **values)
-                    score.plot_losses(run_dir.path / "log.jsonl", run_dir.path / "loss.png")
                 recent = []
             if done % config.compute.checkpoint_every == 0 or last or stop:
                 took_s = state.save(out, ranks, facts, config.compute.checkpoints_kept)
@@ -520,5 +519,4 @@ def _picture(run_dir: RunDir, step: int) -> Path:
 
 def loss_settings(config: LearnConfig, weights: Tensor) -> LossSettings:
     """What a configuration says about the loss."""
-    frame_dropout = config.data.reference_dropout_scope == "tokens_and_frame"
-    return LossSettings(weights, config.loss.refined_share, config.data.reference_dropout, frame_dropout)
+    return LossSettings(weights, config.loss.refined_share, config.data.reference_dropout)

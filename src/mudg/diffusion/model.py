@@ -44,6 +44,7 @@ from mudg.diffusion.network import (
     shares,
 )
 from mudg.diffusion.requests import (
+    CPU,
     GeneratedClip,
     SampleRequest,
     check_image_size,
@@ -100,14 +101,11 @@ class LossSettings:
     class_weights      f32[19], weights of the classes in the cross-entropy; None = all 1
     refined_share      share of each side of the image on which the refiner is trained at a step
     reference_dropout  share of the clips that go without their reference image; the published kind
-    frame_dropout      where the reference is left out, frame 0 of the colour condition goes without it too; the
-                       published kind
     """
 
     class_weights: Tensor | None
     refined_share: float
     reference_dropout: float
-    frame_dropout: bool = False
 
 
 @dataclass(frozen=True)
@@ -487,13 +485,29 @@ class MDM(nn.Module):
             raise UsageError("this model has no finisher, or the clip is another model's", where="MDM.finish")
         code = self.codec.linear_depth_code(clip.depth)
         made = Made(clip.rgb * 2 - 1, code, clip.semantics.unsqueeze(1).to(torch.uint8), clip.log_error)
+
+        def crop(rows: slice, columns: slice) -> ConditionPixels:
+            """What the finisher reads of the condition, made tile by tile: all of it is large."""
+            part = fine.cropped(rows, columns)
+            scratch.rest_mapped()
+            return self._pixels_of(Stacked.of([part]))
+
         with torch.autocast(self.device.type, torch.bfloat16, enabled=bf16):
-            made = finish_in_tiles(self.finisher, made, _FinePixels(self, fine), detail=True)
+            made = finish_in_tiles(self.finisher, made, fine.color.shape[-2:], crop, detail=True)
         decoded = self._decoded(made)
         confidence = torch.exp(-_expected_error(made.log_error) / TRUSTED_ERROR) * depth_agreement(decoded.depth, fine)
         depth = settle_depth(decoded.depth, fine, self.config.codec.far_m)
         own = {"rgb": decoded.rgb, "semantics": decoded.semantics, "log_error": made.log_error}
         return replace(clip, depth=depth, confidence=confidence, **own)
+
+    def sampled_and_finished(
+        self, condition: Condition, fine: Condition, request: SampleRequest
+    ) -> tuple[GeneratedClip, GeneratedClip]:
+        """As `requests.generated`, and the same clip at the size of `fine`, made by the finisher; all on the CPU."""
+        clip = self.sample(condition.to(self.device), request)
+        finished = self.finish(clip, fine.to(self.device), bf16=request.bf16)
+        clip = clip.to(CPU)
+        return clip, replace(finished, latents=clip.latents).to(CPU)
 
     def _decoded(self, generated: Made) -> Decoded:
         """Colour in [0, 1], depth in metres and classes i64[T,H,W] of what the refiner or the finisher made; takes its
@@ -530,26 +544,6 @@ class MDM(nn.Module):
             x, estimates = denoised(denoise, draw, self.schedule, request, "x0")
         color = lambda z: z[:, :, : sizes[0]]
         return dict(zip(MODALITIES, x.split(sizes, 2))), mean_change([color(e) for e in estimates], color(x))
-
-
-@dataclass(frozen=True)
-class _FinePixels:
-    """A condition at the camera's resolution; what the finisher reads of it is made tile by tile, for all of it is
-    large."""
-
-    model: MDM
-    fine: Condition
-
-    @property
-    def grid(self) -> tuple[int, int, int]:
-        """Frames, height, width."""
-        return len(self.fine.views), int(self.fine.color.shape[-2]), int(self.fine.color.shape[-1])
-
-    def crop(self, rows: slice, columns: slice) -> ConditionPixels:
-        """A rectangle of pixels."""
-        found = self.fine.cropped(rows, columns)
-        scratch.rest_mapped()
-        return self.model._pixels_of(Stacked.of([found]))
 
 
 def _around(start_px: int, side_px: int, factor: int, count: int) -> slice:

@@ -24,23 +24,6 @@ MODEL_FILE = "model.json"
 EMBEDDED: dict[str, Path] = {"embedded": SHIPPED, "embedded-tiny": SHIPPED.with_name("mdm_tiny")}
 """Models that come with the package, by the names that stand for their folders."""
 SHARD_BYTES = 15 * 1024 * 1024
-FORMER_FIELDS: dict[str, dict[str, Any]] = {
-    "top": {
-        "joint": True,
-        "head": "x0",
-        "copy_condition": True,
-        "backdrop": True,
-        "mask_planes": "valid_image",
-        "reference": "warped",
-        "given_classes": True,
-        "effects": 0,
-    },
-    "codec": {"kind": "patch", "depth_code": "log", "semantics_code": "shares"},
-}
-"""Fields of earlier model files whose variants were taken out (`docs/diffusion.md`), each with the one value that is
-still built."""
-LATER_FIELDS: dict[str, Any] = {"renders": False, "finish_widths": [], "finish_blocks": []}
-"""Fields that earlier model files lack, with what their models are."""
 
 
 def folder_of(path: Path | str) -> Path:
@@ -83,36 +66,16 @@ def digest(path: Path | str) -> str:
 def uses_renders(path: Path | str) -> bool:
     """Whether a model's condition may hold renders of a fitted scene; published-type models' cannot."""
     config = read_description(path).get("config")
-    return isinstance(config, Mapping) and bool(config.get("renders", LATER_FIELDS["renders"]))
+    return isinstance(config, Mapping) and bool(config.get("renders"))
 
 
 def config_from_dict(values: Any, where: str = "model configuration") -> MDMConfig:
     """Inverse of `dataclasses.asdict`.
 
     Raises:
-        InputError: names unknown or missing fields, a value of a wrong type, and a variant that is no longer built.
+        InputError: names unknown or missing fields, and a value of a wrong type.
     """
-
-    top = _without_former(values, "top", where)
-    if isinstance(top, Mapping):
-        top = {**LATER_FIELDS, **top, "codec": _without_former(top.get("codec"), "codec", f"{where}: codec")}
-    return records.parse_dataclass(MDMConfig, top, f"{where}: ")
-
-
-def _without_former(values: Any, group: str, where: str) -> Any:
-    """A group of a configuration without its `FORMER_FIELDS`; InputError for a variant that is no longer built."""
-    if not isinstance(values, Mapping):
-        return values
-    for name, value in FORMER_FIELDS[group].items():
-        if values.get(name, value) != value:
-            raise InputError(
-                "the model is of a variant that this version no longer has",
-                where=f"{where}.{name}",
-                expected=repr(value),
-                got=repr(values[name]),
-                remedy="train it anew with mudg learn",
-            )
-    return {name: value for name, value in values.items() if name not in FORMER_FIELDS[group]}
+    return records.parse_dataclass(MDMConfig, values, f"{where}: ")
 
 
 def save(model: MDM, folder: Path, card: str, facts: Mapping[str, Any]) -> None:

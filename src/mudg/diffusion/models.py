@@ -145,21 +145,12 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
             f" {before.config.window}"
         )
     wanted = wanted if can_grow else _with_renders_of(wanted, before.config)
-    resized = model_of_window(before, wanted.window, wanted.area_px)
-    if wanted != resized.config and not same_denoiser(resized.config, wanted) and usual:
+    resized = replace(before.config, window=wanted.window, area_px=wanted.area_px)
+    if wanted != resized and not same_denoiser(resized, wanted) and usual:
         log.info("learn: the network has the shape of --start")
-        wanted = resized.config
-    if wanted == resized.config:
-        return resized, set()
+        wanted = resized
     grown = {name for name, had in (("refiner", before.refiner), ("finisher", before.finisher)) if had is None}
-    return extended(resized, wanted), grown
-
-
-def model_of_window(model: MDM, window: int, area_px: int = 0) -> MDM:
-    """The same model, made for clips of `window` frames (and of `area_px` pixels)."""
-    made = MDM(replace(model.config, window=window, area_px=area_px or model.config.area_px))
-    made.load_state_dict(model.state_dict())
-    return made.eval()
+    return extended(before, wanted), set() if wanted == resized else grown
 
 
 def _with_renders_of(wanted: MDMConfig, before: MDMConfig | None) -> MDMConfig:
@@ -340,9 +331,9 @@ _AFTER_DENOISER = {"refine_widths": (), "refine_blocks": (), "finish_widths": ()
 
 
 def same_denoiser(one: MDMConfig, other: MDMConfig) -> bool:
-    """Whether two networks differ at most in what follows the denoiser, in the use of renders, and in the size trained
-    at."""
-    without = lambda config: replace(config, **_AFTER_DENOISER, renders=False, area_px=0)
+    """Whether two networks differ at most in what follows the denoiser, in the use of renders, and in the clips trained
+    on."""
+    without = lambda config: replace(config, **_AFTER_DENOISER, renders=False, area_px=0, window=0)
     return without(one) == without(other)
 
 
@@ -352,14 +343,14 @@ def extended(before: MDM, config: MDMConfig) -> MDM:
     first.
 
     Raises:
-        UsageError: the two differ in more than the refiner, the use of renders and the size trained at.
+        UsageError: the two differ in more than the refiner, the use of renders and the clips trained on.
     """
     if not same_denoiser(before.config, config) or (before.config.renders and not config.renders):
         raise UsageError(
             "the model to continue from is of another kind",
             expected=str(config),
             got=str(before.config),
-            remedy="give its widths, blocks, attention, patch, window and renders",
+            remedy="give its widths, blocks, attention, patch and renders",
         )
     model = MDM(config)
     state = model.state_dict()

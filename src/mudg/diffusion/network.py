@@ -22,9 +22,9 @@ bounds the memory: a tile's margin is wider than the receptive field, so the res
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Protocol, Self
+from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -321,11 +321,6 @@ class ConditionPixels(PixelPlanes):
     alpha: Tensor | None = None
     certainty: Tensor | None = None
     render_ids: Tensor | None = None
-
-    @property
-    def grid(self) -> tuple[int, int, int]:
-        """N, H, W."""
-        return len(self.color), int(self.color.shape[-2]), int(self.color.shape[-1])
 
 
 @dataclass(frozen=True)
@@ -631,31 +626,24 @@ def spans(length: int, longest: int = TILE_PX) -> list[tuple[int, int]]:
     return [(first, last) for first, last in zip(borders, borders[1:], strict=False) if first < last]
 
 
-class PixelSource(Protocol):
-    """The condition of a clip at the size that is wanted (N, H, W), of which one rectangle at a time is asked."""
-
-    @property
-    def grid(self) -> tuple[int, int, int]:
-        """N, H, W."""
-        ...
-
-    def crop(self, rows: slice, columns: slice) -> ConditionPixels:
-        """A rectangle of pixels."""
-        ...
-
-
 def finish_in_tiles(
-    finisher: Finisher, generated: Made, given: PixelSource, tile_px: int = TILE_PX, *, detail: bool = False
+    finisher: Finisher,
+    generated: Made,
+    size: Sequence[int],
+    crop: Callable[[slice, slice], ConditionPixels],
+    tile_px: int = TILE_PX,
+    *,
+    detail: bool = False,
 ) -> Made:
-    """Finish one clip at the size of its condition `given` [N,..,H,W], whatever that is.
+    """Finish one clip at any size.
 
     Args:
-        generated: the clip as generated, [N,..,h,w].
+        generated: the clip as generated, [N,..,h,w]. size: height and width that are wanted.
+        crop: makes a rectangle, rows x columns, of the clip's condition at that size; asked tile by tile.
         tile_px: longest side of a tile's core; memory depends on it, the result does not.
         detail: colours get the finest structure of what was warped in (`with_detail`).
     """
-    frames, *size = given.grid
-    small, device = generated.rgb.shape[-2:], generated.rgb.device
+    frames, small, device = len(generated.rgb), generated.rgb.shape[-2:], generated.rgb.device
     scale = torch.full((frames,), (size[0] * size[1] / (small[0] * small[1])) ** 0.5, device=device)
     margin = finisher.margin_px
     empty = lambda c, kind=torch.float32: torch.empty(frames, c, *size, dtype=kind, device=device)
@@ -666,7 +654,7 @@ def finish_in_tiles(
                 (max(0, first - margin), min(length, last + margin))
                 for first, last, length in ((top, bottom, size[0]), (left, right, size[1]))
             )
-            bare = given.crop(slice(*rows), slice(*columns))
+            bare = crop(slice(*rows), slice(*columns))
             part = _padded(bare)
             reach = (rows[0], rows[0] + part.color.shape[-2]), (columns[0], columns[0] + part.color.shape[-1])
             found = finisher(generated.enlarged((size[0], size[1]), *reach), part, frames, scale)

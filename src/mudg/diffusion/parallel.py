@@ -4,9 +4,8 @@ Started by `torchrun`, every process runs the same program. They meet in a proce
 devices) and differ only in their number, the rank. Rank 0 leads: it alone makes clips, writes logs and pictures, and
 scores.
 
-Four layouts give the same losses up to rounding: one process; `ddp`, a whole copy of the network per process; `fsdp`,
-parameters, moments and average cut into pieces along their first axis (`torch.distributed.fsdp.fully_shard`); `hsdp`,
-the same pieces within each group of processes, usually a node, and whole replicas of the network in all groups.
+Three layouts give the same losses up to rounding: one process; `ddp`, a whole copy of the network per process; `fsdp`,
+parameters, moments and average cut into pieces along their first axis (`torch.distributed.fsdp.fully_shard`).
 
 What processes tell each other is numbers and JSON text. Nothing is pickled.
 """
@@ -47,7 +46,7 @@ PARTING_S = 0.5
 """Rest after the last message. Threads of gloo let go of its tensors a moment later, and need the interpreter for that;
 one that comes when the interpreter is already shutting down aborts the process, after all the work is done and
 saved."""
-Layout = Literal["ddp", "fsdp", "hsdp"]
+Layout = Literal["ddp", "fsdp"]
 
 
 @dataclass(frozen=True)
@@ -217,9 +216,7 @@ def _ranks_on_device(rank: int, size: int, wanted: str) -> Ranks:
 class Spread:
     """A model in one of the layouts: call `network` as the model itself, in `portion` for each portion of a step."""
 
-    def __init__(
-        self, model: nn.Module, trained: nn.ModuleDict, ranks: Ranks, layout: Layout, per_replica: int = 0
-    ) -> None:
+    def __init__(self, model: nn.Module, trained: nn.ModuleDict, ranks: Ranks, layout: Layout) -> None:
         self.network = model
         self._sharded: list[nn.Module] = []
         if ranks.size == 1:
@@ -233,11 +230,7 @@ class Spread:
         from torch.distributed.device_mesh import init_device_mesh
         from torch.distributed.fsdp import fully_shard
 
-        if layout == "hsdp":
-            shape = mesh_shape(ranks, per_replica)
-            mesh = init_device_mesh(ranks.device.type, shape, mesh_dim_names=("replica", "shard"))
-        else:
-            mesh = init_device_mesh(ranks.device.type, (ranks.size,))
+        mesh = init_device_mesh(ranks.device.type, (ranks.size,))
         for part in trained.values():
             with torch.no_grad():  # channels-last weights to row-major, which sharding asks for
                 for value in part.parameters():
@@ -255,26 +248,6 @@ class Spread:
         holds = isinstance(self.network, nn.parallel.DistributedDataParallel) and not last
         with self.network.no_sync() if holds else contextlib.nullcontext():
             yield
-
-
-def mesh_shape(ranks: Ranks, per_replica: int) -> tuple[int, int]:
-    """Replicas of the network, and the processes over which each is sharded; 0: those that the launcher started on this
-    node.
-
-    Raises:
-        UsageError: the processes cannot be divided so.
-    """
-    text = os.environ.get("LOCAL_WORLD_SIZE", "")
-    size = per_replica or (int(text) if text.isdecimal() else 0) or ranks.size
-    if ranks.size % size:
-        raise UsageError(
-            "the processes cannot be divided into replicas",
-            where="--compute.processes-per-replica",
-            expected=f"a divisor of {ranks.size} processes",
-            got=str(size),
-            remedy="give the number of processes of a node, the same on all",
-        )
-    return ranks.size // size, size
 
 
 def blocks(part: nn.Module) -> list[nn.Module]:
@@ -328,32 +301,16 @@ def first_row(value: Tensor) -> int:
     """Which row of the whole tensor `local(value)` begins with."""
     if not is_sharded(value):
         return 0
-    axis = _shard_axis(value)
-    mesh = value.device_mesh
-    per_rank = -(-value.shape[0] // mesh.size(axis))
-    return min(value.shape[0], per_rank * mesh.get_local_rank(axis))
+    from torch.distributed.tensor.placement_types import Shard
 
-
-def is_copy(value: Tensor) -> bool:
-    """Whether another process, of a replica before this one, holds the same piece of a sharded tensor."""
-    if not is_sharded(value):
-        return False
-    axis, mesh = _shard_axis(value), value.device_mesh
-    return any(mesh.get_local_rank(n) > 0 for n in range(mesh.ndim) if n != axis)
-
-
-def _shard_axis(value: Tensor) -> int:
-    """The axis of the mesh over which a tensor's rows are divided; over all others it is replicated."""
-    from torch.distributed.tensor.placement_types import Replicate, Shard
-
-    placements = list(value.placements)
-    if placements.count(Shard(0)) != 1 or any(p not in (Shard(0), Replicate()) for p in placements):
+    if tuple(value.placements) != (Shard(0),):
         raise ResourceError(
             "a tensor is sharded in a way that checkpoints do not support",
-            expected="Shard(0), or replicas of it",
-            got=str(placements),
+            expected="Shard(0)",
+            got=str(value.placements),
         )
-    return placements.index(Shard(0))
+    per_rank = -(-value.shape[0] // value.device_mesh.size())
+    return min(value.shape[0], per_rank * value.device_mesh.get_local_rank())
 
 
 # a step's end -------------------------------------------------------------------------------------
@@ -393,7 +350,7 @@ def agreed_terms(
 #
 #     steps/step_00000100/
 #         net.0000.safetensors  net.0000.json     weights: rank 0's rows
-#         net.0001.safetensors  net.0001.json     rank 1's, if parameters were sharded; of replicas the first one's
+#         net.0001.safetensors  net.0001.json     rank 1's, if parameters were sharded
 #         average.*  exp_avg.*  exp_avg_sq.*      moving average and AdamW's moments, in the same way
 #         state.json  manifest.json               step, seed, layout; SHA-256 of every file
 #
@@ -455,10 +412,9 @@ class TrainingState:
             groups["average"] = self.average
         partial = checkpoint.partial_path(folder, self.step)
         sharded = any(map(is_sharded, weights.values()))
-        writes = ranks.leads or (sharded and not any(map(is_copy, weights.values())))
 
         def write_own() -> None:
-            if writes:
+            if ranks.leads or sharded:
                 for name, tensors in groups.items():
                     write_rows(partial, name, ranks.rank, tensors)
 

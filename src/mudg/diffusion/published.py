@@ -14,7 +14,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -87,9 +87,6 @@ class PublishedConfig:
     height: int = 576
     fps: int = 10
     """Frame rate given to the network; the published one never saw another."""
-    missing_is_zero: bool = True
-    """Give the network black and 0 m where nothing was seen, as in the published training, whatever the condition holds
-    there."""
 
     def __post_init__(self) -> None:
         net, tokens, latent = self.net, self.image_tokens, self.codec.latent_channels
@@ -263,9 +260,8 @@ class PublishedMDM(nn.Module):
         valid = valid.float()
         self.check_size(*color.shape[-2:])
         self.check_frames(color.shape[1])
-        if self.config.missing_is_zero:
-            color, depth = color * valid, depth * valid
-        seen = valid
+        # missing is black and 0 m, as in the published training
+        color, depth, seen = color * valid, depth * valid, valid
         in_frame, in_tokens = (
             torch.tensor([c.reference_in in uses for c in batch], device=self.device)[:, None, None, None]
             for uses in (("tokens_and_frame", "frame"), ("tokens_and_frame",))
@@ -357,7 +353,6 @@ class PublishedMDM(nn.Module):
             InputError: the clips' condition is not the published one.
         """
         encoded, truths, dropout = [], [], ContextDropout.for_reference(settings.reference_dropout)
-        *_, no_reference = self._batch_draws(part.count, seeds.torch_generator(part.seed, part.step, "noise"), dropout)
         with torch.no_grad():
             for number, clip in enumerate(clips, part.first):
                 if clip.condition.warped is not None and bool(clip.condition.warped.any()):
@@ -367,10 +362,8 @@ class PublishedMDM(nn.Module):
                         expected="points alone, as the published-type model is given",
                         remedy="give another folder of clips; they are made anew",
                     )
-                draws, given = seeds.torch_generator(part.seed, part.step, f"posterior, clip {number}"), clip.condition
-                if settings.frame_dropout and bool(no_reference[number]):
-                    given = replace(given, reference_in="nowhere")
-                encoded.append(self.encode_condition(given, draws))
+                draws = seeds.torch_generator(part.seed, part.step, f"posterior, clip {number}")
+                encoded.append(self.encode_condition(clip.condition, draws))
                 truths.append(self.encode_truth(clip.rgb[None], clip.depth[None], clip.semantics[None], draws))
             truth: dict[Modality, Tensor] = {m: torch.cat([one[m] for one in truths]) for m in MODALITIES}
             classes = torch.stack([clip.semantics != palette.UNLABELLED for clip in clips]).unsqueeze(2)

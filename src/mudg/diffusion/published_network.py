@@ -21,7 +21,6 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.utils.checkpoint import checkpoint
 
 from mudg.base import palette
 from mudg.base.errors import UsageError
@@ -627,8 +626,6 @@ class VideoUNet(nn.Module):
     def __init__(self, config: VideoUNetConfig) -> None:
         super().__init__()
         self.config = config
-        self.checkpointing = False
-        """Training: keep only what passes between stages, and compute the rest again in the backward pass."""
         width, top = config.width, len(config.multipliers) - 1
         self.time, self.label, self.fps = _embedding(width), _embedding(width), _embedding(width)
         _zero(self.fps[2])
@@ -695,17 +692,11 @@ class VideoUNet(nn.Module):
         h = x.flatten(0, 1)
         skips = []
         for number, stage in enumerate(self.down):
-            h = self._run(stage, h, embedding, seen(stage), frames)
+            h = stage(h, embedding, seen(stage), frames)
             if number == 0:
                 h = self.first(h, frames)
             skips.append(h)
-        h = self._run(self.middle, h, embedding, seen(self.middle), frames)
+        h = self.middle(h, embedding, seen(self.middle), frames)
         for stage in self.up:
-            h = self._run(stage, torch.cat([h, skips.pop()], 1), embedding, seen(stage), frames)
+            h = stage(torch.cat([h, skips.pop()], 1), embedding, seen(stage), frames)
         return self.leave(functional.silu(self.norm(h))).unflatten(0, (batch, frames))
-
-    def _run(self, stage: nn.Module, *inputs: Tensor | Context | ContextKeys | int) -> Tensor:
-        """A stage, kept for the backward pass or not. Dropout draws the same numbers when it is computed again."""
-        if not (self.checkpointing and self.training and torch.is_grad_enabled()):
-            return stage(*inputs)
-        return checkpoint(stage, *inputs, use_reentrant=False, preserve_rng_state=False)

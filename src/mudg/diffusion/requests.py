@@ -120,30 +120,12 @@ class Sampling(Protocol):
         ...
 
 
-class Finishing(Sampling, Protocol):
-    """What `generated_and_finished` asks of a model."""
-
-    def finish(self, clip: GeneratedClip, fine: Condition, *, bf16: bool = False) -> GeneratedClip:
-        """A generated clip at the size of `fine`."""
-        ...
-
-
 CPU = torch.device("cpu")
 
 
 def generated(model: Sampling, condition: Condition, request: SampleRequest) -> GeneratedClip:
     """A clip generated on the model's device; condition and clip are on the CPU."""
     return model.sample(condition.to(model.device), request).to(CPU)
-
-
-def generated_and_finished(
-    model: Finishing, condition: Condition, fine: Condition, request: SampleRequest
-) -> tuple[GeneratedClip, GeneratedClip]:
-    """As `generated`, and the same clip at the size of `fine`, made by the model's finisher."""
-    clip = model.sample(condition.to(model.device), request)
-    finished = model.finish(clip, fine.to(model.device), bf16=request.bf16)
-    clip = clip.to(CPU)
-    return clip, replace(finished, latents=clip.latents).to(CPU)
 
 
 def check_image_size(height: int, width: int, multiple: int) -> None:

@@ -10,11 +10,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw
 from torch import Tensor
 
 from mudg.base import palette, store
-from mudg.base.records import understood
 from mudg.base.types import Clip
 from mudg.core import metrics
 from mudg.core.metrics import TrueFrame, flicker
@@ -202,40 +200,3 @@ def save_grid(path: Path, pairs: Sequence[tuple[Clip, GeneratedClip]], frame: in
         ]
         rows.append(np.concatenate(cells, 1))
     store.write_image(path, np.concatenate(rows, 0))
-
-
-def plot_losses(log_file: Path, path: Path, width: int = 900, height: int = 420) -> None:
-    """Draw the loss terms over the steps, both axes logarithmic, from the lines of log.jsonl."""
-    points: dict[str, dict[int, float]] = {}
-    for line in store.read_text(log_file).splitlines():
-        with understood("a log of losses", str(log_file)):
-            entry = store.parse_json(line, str(log_file))
-            if "total" in entry and "step" in entry:
-                for name in ("total", "rgb", "depth", "semantics"):
-                    if name in entry:  # separate passes: a step has one modality
-                        points.setdefault(name, {})[int(entry["step"])] = float(entry[name])
-    series = {n: sorted(p.items()) for n, p in points.items()}
-    values = [v for p in series.values() for _, v in p if v > 0 and math.isfinite(v)]
-    if not values:
-        return
-    image = Image.new("RGB", (width, height), "white")
-    draw = ImageDraw.Draw(image)
-    last = max(s for p in series.values() for s, _ in p)
-    low, high = math.log10(min(values)) - 0.05, math.log10(max(values)) + 0.05
-    left = math.log10(50)
-    right = max(left + 0.01, math.log10(max(last, 1)))
-
-    def place(step: int, value: float) -> tuple[float, float]:
-        x = 50 + (width - 70) * (math.log10(max(step, 50)) - left) / (right - left)
-        return x, 20 + (height - 50) * (high - math.log10(max(value, 1e-9))) / (high - low)
-
-    for power in np.arange(math.floor(low * 5) / 5, high, 0.2):
-        if low < power:
-            y = place(50, 10**power)[1]
-            draw.line([(50, y), (width - 20, y)], fill="#dddddd")
-            draw.text((4, y - 6), f"{10**power:.3f}", fill="black")
-    for (name, line), color in zip(series.items(), ("black", "#c03030", "#2050c0", "#209050"), strict=False):
-        draw.line([place(s, v) for s, v in line], fill=color, width=2)
-        draw.text((width - 110, place(*line[-1])[1] - 14), f"{name} {line[-1][1]:.3f}", fill=color)
-    draw.text((50, height - 18), f"steps, logarithmic, 50 to {last}", fill="black")
-    store.write_image(path, image)

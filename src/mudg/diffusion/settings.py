@@ -68,12 +68,6 @@ class SynthesizeConfig:
     memory_budget_gb: float = setting(default=0.0, ge=0)
     """Published-type models: memory in GB; the work is split to fit into it (0 = what is free on a CUDA device;
     elsewhere do not split). The result stays the same."""
-    offload: bool = False
-    """Published-type models: keep the image tower (1.3 GB in bfloat16) on the CPU except while it reads a reference.
-    Done without being asked where a memory budget needs it."""
-    compiled: bool = False
-    """Published-type models: compile the denoising network (torch.compile). The first step then takes minutes, further
-    ones less."""
     seed: int = 0
     """Seed of the noise."""
 
@@ -159,12 +153,8 @@ class LearnData:
     augment: bool = True
     """Vary the training clips: change colours, mirror, and corrupt the classes in the condition."""
     reference_dropout: float = setting(default=0.2, ge=0, le=1)
-    """Published-type models: share of the clips that are trained without their reference image (paper: 0.2, released
-    code: 0.1)."""
-    reference_dropout_scope: Literal["tokens", "tokens_and_frame"] = "tokens"
-    """Published-type models: what such a clip lacks. tokens: the image tokens, as in the released code; frame 0 of the
-    colour condition still shows the reference. tokens_and_frame: frame 0 shows points like all others, too, which the
-    paper's sentence may mean."""
+    """Published-type models: share of the clips that are trained without their reference in the image tokens (paper:
+    0.2, released code: 0.1)."""
     cities: int = setting(default=240, ge=1)
     """Number of generated cities to train on."""
     skip_cities: int = setting(default=0, ge=0)
@@ -198,7 +188,7 @@ class LearnData:
     """Number of additional cities that are used for scoring only."""
     scenes: tuple[str, ...] = ()
     """Recorded logs to train on instead of cities: output folders of mudg run, or SCENE=FUSED for each. Or one list of
-    many scenes, a file that ends in .yaml, .json or .txt (docs/training.md)."""
+    many scenes, a file that ends in .yaml or .json (docs/training.md)."""
     bad_scenes: float = setting(default=0.02, ge=0, le=1)
     """Scenes of a list: share that may be missing or damaged. These are named and left out; more end the training."""
     cameras: tuple[str, ...] = ()
@@ -307,11 +297,9 @@ class LearnCompute:
     device: DeviceName = "auto"
     """Device on which the networks are trained and scored: auto (CUDA if there is one), cpu, cuda, cuda:N, mps. Under
     torchrun cuda is one device for each process. Clips are made on the CPU."""
-    parallel: Literal["ddp", "fsdp", "hsdp"] = "ddp"
+    parallel: Literal["ddp", "fsdp"] = "ddp"
     """Under torchrun: ddp keeps the whole network in every process; fsdp shards parameters and optimizer state over all
-    processes; hsdp shards them within each node and keeps a replica on every node."""
-    processes_per_replica: int = setting(default=0, ge=0)
-    """hsdp: processes over which one replica is sharded (0 = the processes of a node)."""
+    processes."""
     accumulate: int = setting(default=1, ge=1)
     """Gradient accumulation: each process computes its share of a step in this many portions. Larger needs less memory
     and gives the same result."""

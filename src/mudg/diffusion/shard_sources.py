@@ -201,13 +201,12 @@ def read_present(find: Callable[[], Path], read: Callable[[Path], Result]) -> Re
 #       - s3://bucket/clips/0001                          a folder of clips, or
 #       - {path: runs/0002, data_set: kitti, weight: 2, held_out: true}
 #
-# or plain text: a scene in each line, `PATH`, or `PATH<tab>DATA_SET<tab>WEIGHT`. Nothing of a scene is read before it
-# is drawn.
+# Nothing of a scene is read before it is drawn.
 
 
-SUFFIXES: Final = (".yaml", ".yml", ".json", ".txt")
+SUFFIXES: Final = (".yaml", ".yml", ".json")
 LARGEST_LIST: Final = 4_000_000
-"""Bytes of a list in YAML; one in JSON, or of plain lines, may be larger."""
+"""Bytes of a list in YAML; one in JSON may be larger."""
 SPAN: Final = 100_000_000
 """Shard k of the list's n-th scene has the number n * SPAN + k + 1."""
 _OPEN: Final = 512
@@ -299,38 +298,9 @@ def read_list(text: str, held_out: int = 0) -> SceneList:
     """
     suffix = PurePosixPath(text).suffix.lower()
     content = Location.of(text).load()
-    if suffix == ".txt":
-        return SceneList(_plain_lines(content, text), {}, held_out, text)
     value = store.parse_json(content, text) if suffix == ".json" else plain_yaml.parse_yaml(content, text, LARGEST_LIST)
     listed = parse_record(_Listed, {"scenes": value} if isinstance(value, list) else value, f"{text}: ")
     return SceneList(listed.scenes, listed.data_sets, held_out, text)
-
-
-def _plain_lines(content: bytes, where: str) -> list[ListedScene]:
-    try:
-        lines = content.decode().splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError("a list is no text", where=where, expected="UTF-8", got=str(error)) from error
-    found = []
-    for number, line in enumerate(lines, 1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        path, *rest = line.strip().split("\t")
-        try:
-            weight = float(rest[1]) if len(rest) > 1 else 1.0
-        except ValueError:
-            weight = -1.0
-        if len(rest) > 2 or not 0 <= weight < float("inf"):
-            raise InputError(
-                "not a line of a list of scenes",
-                where=f"{where}, line {number}",
-                got=line[:200],
-                expected="PATH, or PATH<tab>DATA_SET<tab>WEIGHT",
-            )
-        found.append(ListedScene(path=path, data_set=rest[0] if rest else "scenes", weight=weight))
-    if not found:
-        raise InputError("a list names no scene", where=where)
-    return found
 
 
 # shards of listed scenes --------------------------------------------------------------------------

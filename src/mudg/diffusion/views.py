@@ -26,7 +26,7 @@ from mudg.diffusion.inputs import ConditionParts, ConditionSources, conditions_o
 from mudg.diffusion.memory_plan import half_format
 from mudg.diffusion.model import MDM
 from mudg.diffusion.published import PublishedMDM, WorkSplit, is_published
-from mudg.diffusion.requests import GeneratedClip, SampleRequest, StartClip, generated, generated_and_finished
+from mudg.diffusion.requests import GeneratedClip, SampleRequest, StartClip, generated
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.networks.codec import Modality
 from mudg.scene.labels import read_label, read_trusted_classes
@@ -94,19 +94,11 @@ def check_config(config: SynthesizeConfig, fitted: bool, *, weather: bool = Fals
             got="--fitted: renders are left out of such a condition",
             remedy="leave out --condition or --fitted",
         )
-    if full_size and config.offload and device.type == "cpu":
-        raise UsageError(
-            "the image tower is on the CPU already",
-            where="--offload",
-            got="--device cpu",
-            remedy="leave one of them out",
-        )
     if full_size:
         return replace(config, processes=config.processes or 1)  # one copy of a large model in memory
-    for name in ("memory_budget_gb", "offload", "compiled"):
-        if getattr(config, name):
-            what, flag = "this setting applies to published-type models only", f"--{name.replace('_', '-')}"
-            raise UsageError(what, where=flag, remedy="leave it out")
+    if config.memory_budget_gb:
+        what = "this setting applies to published-type models only"
+        raise UsageError(what, where="--memory-budget-gb", remedy="leave it out")
     model = model_files.load(config.model)  # fails now rather than in every process
     if fitted and not model.config.renders:
         raise UsageError(
@@ -160,7 +152,7 @@ def load_any(config: SynthesizeConfig) -> DiffusionModel:
     half = half_of(config)
     dtype = None if device.type == "cpu" else half or torch.float32
     model = published.load(Path(config.model), dtype=dtype)
-    model.split = WorkSplit(frames_at_once=1, offload=config.offload)
+    model.split = WorkSplit(frames_at_once=1)
     free_gb = torch.cuda.mem_get_info(device)[0] / 1e9 if device.type == "cuda" else 0.0
     budget_gb = config.memory_budget_gb or free_gb  # 0: unknown
     if budget_gb:
@@ -169,8 +161,6 @@ def load_any(config: SynthesizeConfig) -> DiffusionModel:
     if model.split.offload:
         model.image = torch.nn.Identity()
     model.to(device).image = tower
-    if config.compiled:
-        model.net.compile()
     return model
 
 
@@ -180,7 +170,7 @@ def _choose_split(model: PublishedMDM, config: SynthesizeConfig, budget_gb: floa
         memory_plan.needs_of(model.config, bytes_per_value),
         int(budget_gb * 1e9),
         guidance=config.guidance != 1,
-        offload=(False,) if config.device == "cpu" else (True,) if config.offload else (False, True),
+        offload=(False,) if config.device == "cpu" else (False, True),
     )
     if peak_bytes > budget_gb * 1e9:
         raise ResourceError(
@@ -330,7 +320,7 @@ class ViewMaker:
         sky."""
         model = self._model
         if self._full_size and isinstance(model, MDM) and model.finisher is not None:
-            sample, finished = generated_and_finished(model, condition, fine, request)
+            sample, finished = model.sampled_and_finished(condition, fine, request)
             return sample, without_sky_depth(finished, fine), tuple(views)
         sample = generated(model, condition, request)
         made = without_sky_depth(sample, condition)

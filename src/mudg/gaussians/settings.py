@@ -147,6 +147,14 @@ class VirtualConfig:
 
 
 @settings
+class RadianceConfig:
+    """Method emernerf (``baselines/emernerf.py``)."""
+
+    size: Literal["small", "published", "tiny"] = "small"
+    """emernerf: sizes of the networks, and numbers of rays and samples (docs/baselines.md)."""
+
+
+@settings
 class FitConfig:
     """Fit a dynamic Gaussian scene to recorded and, optionally, virtual views."""
 
@@ -188,6 +196,7 @@ class FitConfig:
     drawing: DrawingConfig = setting(default_factory=DrawingConfig)
     loss: RecordedLossConfig = setting(default_factory=RecordedLossConfig)
     virtual: VirtualConfig = setting(default_factory=VirtualConfig)
+    radiance: RadianceConfig = setting(default_factory=RadianceConfig)
 
 
 # methods ------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -35,16 +35,39 @@ from mudg.core.pictures import class_colors, depth_colors, gray, resize_area
 from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import visible_depth
 from mudg.labels import street_net
-from mudg.labels.by_geometry import RULES
-from mudg.labels.depth.networks import align_to_lidar, enough_returns, kind_of, load_depth_network
+from mudg.labels.by_geometry import RULES, label_by_geometry, label_by_network
+from mudg.labels.depth_networks import align_to_lidar, enough_returns, kind_of, load_depth_network
 from mudg.labels.ground import driven_path
-from mudg.labels.inputs import DepthInput, DepthNetwork, DepthOptions, LabelInput, Labels
-from mudg.labels.labellers import labeller
+from mudg.labels.inputs import DepthInput, DepthNetwork, LabelInput, Labeller, Labels
+from mudg.labels.segmenters import Segmenter
 from mudg.labels.settings import AnnotateConfig
 from mudg.networks.folders import CPU, Compute, find, title
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points, read_scene, spread
 from mudg.scene.write import SceneWriter
+
+# labellers ----------------------------------------------------------------------------------------
+#
+# geometry: rules on LiDAR, tracked boxes and colour (`by_geometry.py`), without parameters. embedded: classes from the
+# small shipped network, which reads image and `evidence.py` (`street_net.py`). network: classes from a segmentation
+# network in a folder (`segmenters.py`). Depth and dynamic objects are found in the same way for all three.
+
+
+def _network(weights: str, compute: Compute) -> Labeller:
+    segmenter = Segmenter.load(weights, compute)
+    return lambda given: label_by_network(given, *segmenter.classes(given.rgb))
+
+
+LABELLERS: Mapping[str, Callable[[str, Compute], Labeller]] = {
+    "geometry": lambda *_: label_by_geometry,
+    "embedded": street_net.StreetLabeller.load,
+    "network": _network,
+}
+"""Name -> what makes a labeller of one image from a folder of weights and a place to compute (unused by those that hold
+no parameters).
+
+Raises: ResourceError: weights, or the packages that read them, are missing."""
+
 
 # depth --------------------------------------------------------------------------------------------
 #
@@ -105,12 +128,12 @@ def with_network(network: DepthNetwork, inputs: LabelInput, labels: Labels, fram
     asked = DepthInput(inputs.rgb, measured, labels.depth, labels.sky)
     reason = "too few LiDAR returns"
     if enough_returns(asked):
-        found = align_to_lidar(network(asked), asked, RULES)
-        if found.dense is not None:
-            return replace(labels, depth=found.dense.depth, depth_confidence=found.dense.confidence)
+        dense, fit = align_to_lidar(network(asked), asked, RULES)
+        if dense is not None:
+            return replace(labels, depth=dense.depth, depth_confidence=dense.confidence)
         reason = "the network's depth does not increase with the LiDAR's"
-        if np.isfinite(found.fit.residual):
-            off = f"half of the returns off by more than {found.fit.residual:.0%}"
+        if np.isfinite(fit.residual):
+            off = f"half of the returns off by more than {fit.residual:.0%}"
             reason = f"the network's depth does not fit the LiDAR ({off})"
     log.warn(f"frame {frame_id}: {reason}; its depth is filled from LiDAR instead")
     store.write_json(_mark(staging, frame_id), {"reason": reason})
@@ -410,9 +433,9 @@ def label_into_staging(config: AnnotateConfig, scene: Scene, ids: Sequence[str],
     """Label these frames one after the other, write each to ``staging``, and name it when it is there."""
     if not ids:
         return
-    label = labeller(config.labeller, config.weights, place(config) if config.labeller != "geometry" else CPU)
-    options = DepthOptions(config.depth_guided, config.depth_steps)
-    network = load_depth_network(config.depth_network, place(config), options) if config.depth_network else None
+    label = LABELLERS[config.labeller](config.weights, place(config) if config.labeller != "geometry" else CPU)
+    folder = config.depth_network
+    network = load_depth_network(folder, place(config), config.depth_steps) if folder else None
     returns = NearbyReturns(scene, config.sweeps)
     path = driven_path(scene.ego.world_from_ego)
     frames = {frame.id: frame for frame in scene.frames}

@@ -169,18 +169,4 @@ class Prediction:
         return cls((found if least is None else found.clamp(min=least))[0, 0].cpu().numpy(), space)
 
 
-@dataclass(frozen=True, slots=True)
-class DepthOptions:
-    """Options of networks that denoise; others do not use them.
-
-    Args:
-        guided: Marigold: LiDAR steers every denoising step, instead of aligning the result only.
-        steps: denoising steps; 0 = the folder's own number, or 50 where LiDAR steers.
-    """
-
-    guided: bool = True
-    steps: int = 0
-
-
-PLAIN: Final = DepthOptions()
 DepthNetwork = Callable[[DepthInput], Prediction]

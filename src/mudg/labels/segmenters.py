@@ -1,16 +1,13 @@
-"""Classes by a pretrained segmentation network from a folder on disk: SegFormer, Mask2Former or EoMT with Cityscapes
-classes.
+"""Classes by a pretrained segmentation network from a folder on disk: SegFormer or Mask2Former with Cityscapes classes.
 
 The networks come from the ``transformers`` package (see ``networks.folders``); nothing is downloaded: the folder holds
 ``config.json``, ``preprocessor_config.json`` and ``model.safetensors`` as that package writes them. Class names of the
-folder are matched with ours by name. Large images are cut into overlapping tiles whose probabilities are averaged. EoMT
-reads squares of one size only: images are scaled until their shorter side has that size.
+folder are matched with ours by name. Large images are cut into overlapping tiles whose probabilities are averaged.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -37,29 +34,19 @@ def _dense(output: Any, size: tuple[int, int]) -> Tensor:
 
 
 def _masks(output: Any, size: tuple[int, int]) -> Tensor:
-    """Mask2Former, EoMT: classes [B, Q, C + 1] (the last: none), masks [B, Q, h, w] -> probabilities [B, C, H, W]."""
+    """Mask2Former: classes [B, Q, C + 1] (the last: none), masks [B, Q, h, w] -> probabilities [B, C, H, W]."""
     classes = output.class_queries_logits.float().softmax(-1)[..., :-1]
     masks = functional.interpolate(output.masks_queries_logits.float(), size=size, mode="bilinear", align_corners=False)
     scores = torch.einsum("bqc,bqhw->bchw", classes, masks.sigmoid())
     return scores / scores.sum(1, keepdim=True).clamp(min=1e-6)
 
 
-@dataclass(frozen=True, slots=True)
-class _Kind:
-    """Class of transformers that holds the network, how its output becomes probabilities, and whether it reads squares
-    of the one size that its configuration names."""
-
-    class_name: str
-    probabilities: Callable[[Any, tuple[int, int]], Tensor]
-    square: bool = False
-
-
-KINDS: Final[Mapping[str, _Kind]] = {
-    "segformer": _Kind("SegformerForSemanticSegmentation", _dense),
-    "mask2former": _Kind("Mask2FormerForUniversalSegmentation", _masks),
-    "eomt": _Kind("EomtForUniversalSegmentation", _masks, square=True),
+KINDS: Final[Mapping[str, tuple[str, Callable[[Any, tuple[int, int]], Tensor]]]] = {
+    "segformer": ("SegformerForSemanticSegmentation", _dense),
+    "mask2former": ("Mask2FormerForUniversalSegmentation", _masks),
 }
-"""``model_type`` of a folder's ``config.json`` -> network."""
+"""``model_type`` of a folder's ``config.json`` -> class of transformers that holds the network, and how its output
+becomes probabilities."""
 
 
 class Segmenter:
@@ -72,15 +59,14 @@ class Segmenter:
         train_ids: NDArray[np.intp],
         mean: Sequence[float],
         deviation: Sequence[float],
-        square_px: int = 0,
         compute: Compute = CPU,
     ) -> None:
         """``train_ids`` [C]: our class of each of the network's, UNLABELLED = none; mean and deviation of colours in
-        0..1; ``square_px``: side of the only tile that the network reads, 0 = any."""
-        self._network, self._kind, self._train_ids = network, KINDS[kind], train_ids
+        0..1."""
+        self._network, self._becomes, self._train_ids = network, KINDS[kind][1], train_ids
         self._mean = torch.tensor(mean, dtype=torch.float32)[:, None, None]
         self._deviation = torch.tensor(deviation, dtype=torch.float32)[:, None, None]
-        self._square_px, self._compute = square_px, compute
+        self._compute = compute
 
     @classmethod
     def load(cls, folder: str | Path, compute: Compute = CPU) -> Segmenter:
@@ -105,29 +91,22 @@ class Segmenter:
         train_ids = match_classes(settings.get("id2label", {}), str(path / "config.json"))
         prepared = path / "preprocessor_config.json"
         colors = folders.read_settings(prepared) if prepared.is_file() else {}
-        network_class = folders.member(folders.package("transformers"), KINDS[kind].class_name)
+        network_class = folders.member(folders.package("transformers"), KINDS[kind][0])
         network = folders.load_network(network_class, path, compute)
-        square_px = int(network.config.image_size) if KINDS[kind].square else 0
         mean, deviation = colors.get("image_mean", folders.MEAN), colors.get("image_std", folders.DEVIATION)
-        return cls(network, kind, train_ids, mean, deviation, square_px, compute)
+        return cls(network, kind, train_ids, mean, deviation, compute)
 
     def classes(self, rgb: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Train ids u8[H, W] and the probability of each f32[H, W] of an image u8[H, W, 3]."""
-        size = rgb.shape[:2]
         image = torch.from_numpy(rgb.copy()).permute(2, 0, 1).float() / 255
-        if self._square_px:
-            image = _with_shorter_side(image, self._square_px)
         total = self._probabilities((image - self._mean) / self._deviation)
-        if total.shape[1:] != size:
-            total = functional.interpolate(total[None], size=size, mode="bilinear", align_corners=False)[0]
         confidence, ids = total.max(0)
         return ids.numpy().astype(np.uint8), confidence.clamp(0, 1).numpy()
 
     def _probabilities(self, image: Tensor) -> Tensor:
         """Probability of each of our classes [C, H, W] of a normalised image [3, H, W], tile by tile."""
         height, width = image.shape[1:]
-        side = self._square_px or TILE_PX
-        tile = (min(height, side), min(width, side))
+        tile = (min(height, TILE_PX), min(width, TILE_PX))
         corners = [(y, x) for y in tile_starts(height, tile[0]) for x in tile_starts(width, tile[1])]
         total = torch.zeros(len(CLASSES), height, width)
         weight = torch.zeros(1, height, width)
@@ -140,22 +119,12 @@ class Segmenter:
             with torch.inference_mode(), self._compute.autocast():
                 output = self._network(pixel_values=tiles.to(self._compute.device))
             with torch.inference_mode():
-                found = self._kind.probabilities(output, tile).cpu()
+                found = self._becomes(output, tile).cpu()
             for (y, x), probabilities in zip(chosen, found, strict=True):
                 window = total[:, y : y + tile[0], x : x + tile[1]]
                 window.index_add_(0, ours[known], probabilities[known] * fade)
                 weight[:, y : y + tile[0], x : x + tile[1]] += fade
         return total / weight
-
-
-def _with_shorter_side(image: Tensor, side_px: int) -> Tensor:
-    """An image [3, H, W] scaled, smoothly, until its shorter side has ``side_px`` pixels."""
-    height, width = image.shape[1:]
-    scale = side_px / min(height, width)
-    size = (max(side_px, round(height * scale)), max(side_px, round(width * scale)))
-    if size == (height, width):
-        return image
-    return functional.interpolate(image[None], size=size, mode="bilinear", align_corners=False, antialias=True)[0]
 
 
 def match_classes(names: Mapping[str, str], where: str) -> NDArray[np.intp]:

@@ -17,19 +17,16 @@ class AnnotateConfig:
     """Source of classes and sky. embedded: the small shipped network, from image, heights and boxes. geometry: rules on
     heights and boxes, without a network. network: a segmentation network from `weights`."""
     weights: str = ""
-    """labeller network: folder of a SegFormer, Mask2Former or EoMT with Cityscapes classes in the transformers format,
+    """labeller network: folder of a SegFormer or Mask2Former with Cityscapes classes in the transformers format,
     or its name in the Hugging Face cache (owner/name or owner/name@revision). labeller embedded: folder of a network
     trained with tools/train_segmenter.py (empty = the shipped network)."""
     depth: bool = True
     """Write dense depth, by default from the LiDAR points of several sweeps, filled with the image as guide."""
     depth_network: str = ""
     """Take dense depth from a network and align it to LiDAR: folder, or name in the Hugging Face cache, of a
-    PromptDepthAnything, Depth Anything (transformers) or Marigold (diffusers) model; or folder of a DepthLab written by
-    mudg convert."""
-    depth_guided: bool = True
-    """Marigold: use LiDAR in every denoising step (slower). Off: only align the result to LiDAR."""
+    PromptDepthAnything or Depth Anything model (transformers); or folder of a DepthLab written by mudg convert."""
     depth_steps: int = setting(default=0, ge=0)
-    """Marigold and DepthLab: denoising steps (0 = as in the model folder, or 50 for Marigold guided by LiDAR)."""
+    """DepthLab: denoising steps (0 = as in the model folder)."""
     device: DeviceName = "auto"
     """Device of the networks of labeller and `depth_network`: auto (CUDA if there is one), cpu, cuda, cuda:N, mps."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"

@@ -271,7 +271,7 @@ def settled_by_color(
     """Probabilities f32[19, H, W], with sum 1, without the classes that the colours of the image u8[H, W, 3]
     contradict.
 
-    Hardly any sky where the image does not look like it (``labellers.find_sky``: bright or blue, smooth), unless
+    Hardly any sky where the image does not look like it (``by_geometry.find_sky``: bright or blue, smooth), unless
     nothing in it does, as at night. Ground that the path reaches directly and that is not green is road rather than
     terrain.
     """

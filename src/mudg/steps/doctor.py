@@ -37,7 +37,7 @@ _OPTIONAL: Mapping[str, tuple[str, str]] = {
     # module: (what it is for, how to get it)
     "pyarrow": ("logs of Argoverse 2 and format 2 of Waymo", "pip install 'mudg[data]'"),
     "transformers": ("networks of annotate from folders", "pip install 'mudg[models]'"),
-    "diffusers": ("Marigold in annotate", "pip install 'mudg[models]'"),
+    "diffusers": ("DepthLab in annotate", "pip install 'mudg[models]'"),
     "gsplat": ("faster rasteriser on CUDA devices", "pip install 'mudg[gsplat]'"),
     "grpcio": ("simulators of mudg serve", "pip install 'mudg[sim]'"),
     "zstandard": ("SPZ files of version 4", "pip install zstandard"),

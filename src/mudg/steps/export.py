@@ -181,7 +181,7 @@ class Convert(Step):
     def _conversion(self, to: Path) -> tuple[Callable[[], None], int]:
         """What converts this checkpoint to a folder, and the address space that it may take."""
         from mudg.diffusion import convert
-        from mudg.labels.depth import depthlab
+        from mudg.labels import depthlab
         from mudg.scoring.converted import convert_weights
 
         config, source = self.settings, self.checkpoint

@@ -16,7 +16,7 @@ from mudg.steps.step import SCENE, Flag, flag_name, hint_of
 
 if TYPE_CHECKING:
     from mudg.base.run_folder import VerbOutput
-    from mudg.baselines.settings import MethodConfig
+    from mudg.gaussians.settings import FitConfig
 
 
 class Fit(Watched):
@@ -46,14 +46,14 @@ class Fit(Watched):
     start_from: Annotated[Path | None, Flag("FOLDER", "", "start_from")] = None
     """Finished fit of method street_gaussians to the same scene, to continue for `iterations` more steps. Virtual views
     are used from the first of them on."""
-    settings: MethodConfig
+    settings: FitConfig
 
     def required(self) -> tuple[str, ...]:
         alone = self.reads_scene_alone or (self.scene / "scene.json").exists()
         return () if alone else ("fused",)
 
     @classmethod
-    def settings_from(cls, inputs: Mapping[str, Any], file: Path | None, given: Mapping[str, Any]) -> MethodConfig:
+    def settings_from(cls, inputs: Mapping[str, Any], file: Path | None, given: Mapping[str, Any]) -> FitConfig:
         """UsageError for a setting that was given and does not apply to the method."""
         settings = super().settings_from(inputs, file, given)
         for name in configuration.dotted(given):

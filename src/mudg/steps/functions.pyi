@@ -14,7 +14,6 @@ def annotate(
     weights: str = '',
     depth: bool = True,
     depth_network: str = '',
-    depth_guided: bool = True,
     depth_steps: int = 0,
     device: str = 'auto',
     precision: Literal['auto', 'float32', 'bfloat16'] = 'auto',
@@ -31,11 +30,10 @@ def annotate(
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         config: YAML file of settings, read before those given here.
         labeller: Source of classes and sky. embedded: the small shipped network, from image, heights and boxes. geometry: rules on heights and boxes, without a network. network: a segmentation network from `weights`.
-        weights: labeller network: folder of a SegFormer, Mask2Former or EoMT with Cityscapes classes in the transformers format, or its name in the Hugging Face cache (owner/name or owner/name@revision). labeller embedded: folder of a network trained with tools/train_segmenter.py (empty = the shipped network).
+        weights: labeller network: folder of a SegFormer or Mask2Former with Cityscapes classes in the transformers format, or its name in the Hugging Face cache (owner/name or owner/name@revision). labeller embedded: folder of a network trained with tools/train_segmenter.py (empty = the shipped network).
         depth: Write dense depth, by default from the LiDAR points of several sweeps, filled with the image as guide.
-        depth_network: Take dense depth from a network and align it to LiDAR: folder, or name in the Hugging Face cache, of a PromptDepthAnything, Depth Anything (transformers) or Marigold (diffusers) model; or folder of a DepthLab written by mudg convert.
-        depth_guided: Marigold: use LiDAR in every denoising step (slower). Off: only align the result to LiDAR.
-        depth_steps: Marigold and DepthLab: denoising steps (0 = as in the model folder, or 50 for Marigold guided by LiDAR).
+        depth_network: Take dense depth from a network and align it to LiDAR: folder, or name in the Hugging Face cache, of a PromptDepthAnything or Depth Anything model (transformers); or folder of a DepthLab written by mudg convert.
+        depth_steps: DepthLab: denoising steps (0 = as in the model folder).
         device: Device of the networks of labeller and `depth_network`: auto (CUDA if there is one), cpu, cuda, cuda:N, mps.
         precision: Number format of these networks. auto is float32; bfloat16 is faster on some devices and rounds depth to 0.4 percent.
         sweeps: Number of sweeps per LiDAR, nearest in time, whose points are merged for dense depth.
@@ -773,8 +771,6 @@ def synthesize(
     guidance: float | None = None,
     guidance_rescale: float | None = None,
     memory_budget_gb: float = 0.0,
-    offload: bool = False,
-    compiled: bool = False,
     seed: int = 0,
 ) -> Any:
     """Generate dense RGB, depth and semantics on laterally shifted trajectories.
@@ -806,8 +802,6 @@ def synthesize(
         guidance: Published-type models: scale of classifier-free guidance; 1 = none, which halves the work (not given: 7.5).
         guidance_rescale: Published-type models: guidance rescale, 0 (off) to 1; limits overexposure by guidance (not given: 0.7).
         memory_budget_gb: Published-type models: memory in GB; the work is split to fit into it (0 = what is free on a CUDA device; elsewhere do not split). The result stays the same.
-        offload: Published-type models: keep the image tower (1.3 GB in bfloat16) on the CPU except while it reads a reference. Done without being asked where a memory budget needs it.
-        compiled: Published-type models: compile the denoising network (torch.compile). The first step then takes minutes, further ones less.
         seed: Seed of the noise.
     """
     ...

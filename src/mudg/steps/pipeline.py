@@ -19,8 +19,8 @@ from mudg.base.memory import Meter, Usage, folder_bytes, in_words
 from mudg.base.records import ForeignRecord, Number, parse_record
 from mudg.base.run_folder import is_temporary, locked, refuse_overlap
 from mudg.base.versions import environment, version
-from mudg.baselines.settings import MethodConfig
 from mudg.diffusion.settings import SynthesizeConfig
+from mudg.gaussians.settings import FitConfig
 from mudg.steps.engine import Output
 from mudg.steps.fit import Fit
 from mudg.steps.ingest import Annotate, Fuse, Ingest
@@ -35,7 +35,7 @@ WITH_DIFFUSION = "mudg_s"
 CONVERTED = "a folder written by mudg convert"
 
 
-def fits_of(config: MethodConfig, guided_share: float) -> tuple[MethodConfig, MethodConfig]:
+def fits_of(config: FitConfig, guided_share: float) -> tuple[FitConfig, FitConfig]:
     """Settings of the chain's two fits, both from nothing: the one on recorded views, and the one under virtual views,
     with ``guided_share`` times as many iterations."""
     guided = max(1, round(guided_share * config.iterations))
@@ -114,7 +114,7 @@ def _write_viewer(out: Path) -> Path:
     return view.write_page(page, out / VIEWER, (out / VIEWER).with_name(f"{Path(VIEWER).stem}_page"))["page"]
 
 
-def refuse_missing(generator: SynthesizeConfig, fit: MethodConfig, flag: str = "--synthesize.model") -> None:
+def refuse_missing(generator: SynthesizeConfig, fit: FitConfig, flag: str = "--synthesize.model") -> None:
     """UsageError where weights that are not shipped are asked for and not given; InputError where there is no diffusion
     model. Before anything is written: the first of these is needed only after a fit. ``flag``: what names the diffusion
     model on this command line."""

@@ -13,10 +13,10 @@ from typing import Any, Final, Literal, get_args
 from mudg.base.config import changed, setting, settings
 from mudg.base.devices import DeviceName
 from mudg.base.errors import UsageError
-from mudg.baselines.settings import MethodConfig
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing.settings import RenderConfig, ScoreConfig
 from mudg.formats.settings import IngestConfig
+from mudg.gaussians.settings import FitConfig
 from mudg.labels.settings import AnnotateConfig
 from mudg.scene.settings import FuseConfig
 
@@ -34,7 +34,7 @@ class RunConfig:
     annotate: AnnotateConfig = setting(default_factory=AnnotateConfig)
     fuse: FuseConfig = setting(default_factory=FuseConfig)
     synthesize: SynthesizeConfig = setting(default_factory=SynthesizeConfig)
-    fit: MethodConfig = setting(default_factory=MethodConfig)
+    fit: FitConfig = setting(default_factory=FitConfig)
     render: RenderConfig = setting(default_factory=RenderConfig)
     score: ScoreConfig = setting(default_factory=ScoreConfig)
 

@@ -201,7 +201,7 @@ HOMES: Final[Mapping[str, str]] = {
     "HarmonizeConfig": "mudg.diffusion.settings",
     "IngestConfig": "mudg.formats.settings",
     "LearnConfig": "mudg.diffusion.settings",
-    "MethodConfig": "mudg.baselines.settings",
+    "FitConfig": "mudg.gaussians.settings",
     "ServeConfig": "mudg.sim.settings",
     "SynthesizeConfig": "mudg.diffusion.settings",
     **dict.fromkeys(("BenchConfig", "BenchOwn"), "mudg.benchmarks.settings"),

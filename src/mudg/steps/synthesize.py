@@ -29,7 +29,7 @@ class Learn(Watched):
     version, idle = 1, ("compute",)
     files = (
         *("clips/*.safetensors", "clips/log_clips.json", "codec/", "steps/", "cache/", "samples/*.png"),
-        *("loss.png", "metrics.json", "model/*", "model.part/"),
+        *("metrics.json", "model/*", "model.part/"),
     )
     short = (
         *("start", "steps", "seed", "precision", "data.scenes", "data.clips", "data.cities", "data.width"),
@@ -67,7 +67,6 @@ class Synthesize(Output):
     result = "views"
     from_run = ("fused",)
     version, files = 3, below("*", (*OBSERVATION_FILES, "overview.png", "depth_fits.json", "state/"))
-    idle = ("offload", "compiled")
     short = (
         *("model", "cameras", "shifts_m", "paths", "steps", "width_px", "condition", "align_depth", "precision"),
         *("seed", "device", "processes"),

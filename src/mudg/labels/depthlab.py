@@ -38,9 +38,7 @@ from mudg.base import checkpoint, records, seeds, store, weights
 from mudg.base.config import STRICT
 from mudg.base.errors import InputError, UsageError
 from mudg.core.pictures import resize_bicubic
-from mudg.labels.depth import marigold
-from mudg.labels.depth.marigold import check_steps, ddim_scheduler, working_size
-from mudg.labels.inputs import PLAIN, DepthInput, DepthOptions, Prediction
+from mudg.labels.inputs import DepthInput, Prediction
 from mudg.networks import clip, folders
 from mudg.networks.folders import CPU, Compute
 
@@ -198,6 +196,20 @@ def _fill_tables(network: nn.Module, part: str) -> None:
         setattr(network.get_submodule(owner), short, torch.arange(table.shape[-1]).expand(table.shape).clone())
 
 
+def ddim_scheduler(settings: Mapping[str, Any], where: str) -> Any:
+    """The DDIM scheduler of diffusers with the settings of a folder.
+
+    Raises:
+        InputError: the settings are of another scheduler. ResourceError: diffusers is missing.
+    """
+    kind, prediction = settings.get("_class_name"), settings.get("prediction_type", "epsilon")
+    if kind != "DDIMScheduler" or prediction not in ("v_prediction", "epsilon", "sample"):
+        got, expected = f"{kind}, {prediction}", "DDIMScheduler, v_prediction, epsilon or sample"
+        raise InputError("the folder's noise schedule is of another kind", where=where, got=got, expected=expected)
+    scheduler_class = folders.member(folders.package("diffusers"), "DDIMScheduler")
+    return scheduler_class.from_config({name: value for name, value in settings.items() if not name.startswith("_")})
+
+
 # --- from the reference U-Net to the denoising U-Net ----------------------------------------------
 
 
@@ -303,6 +315,12 @@ def prepare(inputs: DepthInput, sampling: DepthLabSampling, cell: int, crop_px: 
     return Prepared(image, clip_crop(inputs.rgb, crop_px), nearest, linear, padded(~known[None]), size, low, high)
 
 
+def working_size(rgb: NDArray[np.uint8], longest_px: int) -> tuple[int, int]:
+    """Height and width of an image u8[H, W, 3] whose longest side gets ``longest_px`` pixels."""
+    height, width = rgb.shape[:2]
+    return max(1, height * longest_px // max(height, width)), max(1, width * longest_px // max(height, width))
+
+
 def known_depth(measured: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
     """Measured depth at another size, f32[h, w]: the nearest one in the part of the image that a pixel covers, NaN
     where there is none.
@@ -346,14 +364,17 @@ class DepthLab:
         self, parts: DepthLabParts, sampling: DepthLabSampling = PUBLISHED_SAMPLING, compute: Compute = CPU
     ) -> None:
         """Raises: UsageError: more steps than the noise schedule has."""
-        check_steps(parts.scheduler, sampling.steps)
+        most = int(parts.scheduler.config.num_train_timesteps)
+        if sampling.steps > most:
+            where, got = "--depth-steps", str(sampling.steps)
+            raise UsageError("too many denoising steps", where=where, expected=f"<= {most}", got=got)
         self._parts, self._sampling, self._compute = parts, sampling, compute
         self._cell = 2 ** (len(parts.vae.config.block_out_channels) - 1)
         share_features(parts.reference_unet, parts.denoising_unet)
 
     @classmethod
-    def load(cls, folder: str | Path, compute: Compute = CPU, options: DepthOptions = PLAIN) -> DepthLab:
-        """Read a folder that ``mudg convert`` wrote.
+    def load(cls, folder: str | Path, compute: Compute = CPU, steps: int = 0) -> DepthLab:
+        """Read a folder that ``mudg convert`` wrote; ``steps`` of denoising, 0 = as the folder says.
 
         Raises:
             InputError: not such a folder, or not of this version. IntegrityError: a file is missing or altered.
@@ -366,7 +387,7 @@ class DepthLab:
             got, remedy = f"{described.get('kind')}, {described.get('schema')}", "convert the published files again"
             raise InputError(what, where=str(file), expected=f"kind {KIND}, schema {SCHEMA}", got=got, remedy=remedy)
         sampling = records.parse_dataclass(DepthLabSampling, described.get("sampling"), f"{file}: sampling")
-        sampling = dataclasses.replace(sampling, steps=options.steps or sampling.steps)
+        sampling = dataclasses.replace(sampling, steps=steps or sampling.steps)
         return cls(read_parts(Path(folder), described, compute), sampling, compute)
 
     def __call__(self, inputs: DepthInput) -> Prediction:
@@ -515,9 +536,9 @@ def described(sources: Sources) -> tuple[dict[str, dict[str, Any]], dict[str, An
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         where = str(sources.encoder / "config.json")
         raise InputError("the image encoder has no description", where=where, got=str(error)[:300]) from error
-    file = sources.base / marigold.SCHEDULE_FILE
+    file = sources.base / "scheduler" / "scheduler_config.json"
     schedule = folders.read_settings(file)
-    marigold.ddim_scheduler(schedule, str(file))
+    ddim_scheduler(schedule, str(file))
     if schedule.get("rescale_betas_zero_snr"):
         what = "this is the noise schedule of a later Marigold"
         expected, remedy = "that of marigold-depth-v1-0, which DepthLab was made from", "take marigold-depth-v1-0"

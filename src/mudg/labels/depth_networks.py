@@ -4,8 +4,7 @@
 |---|---|---|
 | PromptDepthAnything | metric depth | image and a small map of depth from LiDAR |
 | Depth Anything, V1 and V2 | inverse depth up to scale and shift, or metric depth | image alone |
-| Marigold (``labels.depth.marigold``) | depth up to scale and shift | diffusion; LiDAR may steer it |
-| DepthLab (``labels.depth.depthlab``) | depth, nearly metric | diffusion; completes LiDAR |
+| DepthLab (``labels.depthlab``) | depth, nearly metric | diffusion; completes LiDAR |
 
 The result is aligned to the visible LiDAR returns with one robust scale and shift per frame
 (``core.depth.fit_affine``), the sky gets its fixed distance, and the confidence follows from the error of the aligned
@@ -30,9 +29,8 @@ from torch.nn import functional
 from mudg.base.errors import InputError, ResourceError
 from mudg.core.depth import MIN_POINTS, AffineFit, CompletionRules, DenseDepth, Space, fit_affine
 from mudg.core.pictures import resize_bicubic
-from mudg.labels.depth.depthlab import DepthLab
-from mudg.labels.depth.marigold import Marigold
-from mudg.labels.inputs import PLAIN, DepthInput, DepthNetwork, DepthOptions, Prediction
+from mudg.labels.depthlab import DepthLab
+from mudg.labels.inputs import DepthInput, DepthNetwork, Prediction
 from mudg.networks import folders
 from mudg.networks.folders import CPU, Compute
 
@@ -133,22 +131,19 @@ def _load_transformers(folder: Path, compute: Compute, *, with_lidar: bool) -> T
     network_class = folders.member(folders.package("transformers"), class_name)
     network: Any = folders.load_network(network_class, folder, compute)
     preparation = Preparation.read(folder, 756 if with_lidar else 518, int(network.config.patch_size))
-    space = "depth" if with_lidar or network.config.depth_estimation_type == "metric" else "disparity"
+    space: Space = "depth" if with_lidar or network.config.depth_estimation_type == "metric" else "disparity"
     return TransformersDepth(network, preparation, space, with_lidar=with_lidar, compute=compute)
 
 
 # --- folders --------------------------------------------------------------------------------------
 
-KINDS: Final[Mapping[str, Callable[[Path, Compute, DepthOptions], DepthNetwork]]] = {
+KINDS: Final[Mapping[str, Callable[[Path, Compute, int], DepthNetwork]]] = {
     "prompt_depth_anything": lambda folder, place, _: _load_transformers(folder, place, with_lidar=True),
     "depth_anything": lambda folder, place, _: _load_transformers(folder, place, with_lidar=False),
-    **dict.fromkeys(("MarigoldDepthPipeline", "MarigoldPipeline"), Marigold.load),
     "depthlab": DepthLab.load,
 }
-"""``model_type`` of a folder's ``config.json``, ``_class_name`` of its ``model_index.json``, or ``kind`` of the
-``model.json`` that ``mudg convert`` writes -> what reads the folder. The two of Marigold are one kind: early folders
-have the shorter name."""
-_DESCRIPTIONS: Final = (("config.json", "model_type"), ("model_index.json", "_class_name"), ("model.json", "kind"))
+"""``model_type`` of a folder's ``config.json``, or ``kind`` of the ``model.json`` that ``mudg convert`` writes -> what
+reads the folder, given a place to compute and the denoising steps."""
 
 
 def kind_of(folder: str | Path) -> str:
@@ -158,7 +153,7 @@ def kind_of(folder: str | Path) -> str:
         ResourceError: no such folder, or it has no description. InputError: another kind of network.
     """
     path = folders.find(folder)
-    for name, key in _DESCRIPTIONS:
+    for name, key in (("config.json", "model_type"), ("model.json", "kind")):
         if folder and (path / name).is_file():
             kind = str(folders.read_settings(path / name).get(key))
             if kind not in KINDS:
@@ -166,35 +161,30 @@ def kind_of(folder: str | Path) -> str:
                 raise InputError(what, where=str(path / name), expected=", ".join(KINDS), got=kind)
             return kind
     where = str(folder) or "--depth-network"
-    expected = "a folder with config.json (transformers), model_index.json (diffusers) or model.json (mudg convert)"
+    expected = "a folder with config.json (transformers) or model.json (mudg convert)"
     remedy = "give the folder of such a network as --depth-network, or leave the flag out"
     raise ResourceError("the depth network's weights are missing", where=where, expected=expected, remedy=remedy)
 
 
-def load_depth_network(folder: str | Path, compute: Compute = CPU, options: DepthOptions = PLAIN) -> DepthNetwork:
+def load_depth_network(folder: str | Path, compute: Compute = CPU, steps: int = 0) -> DepthNetwork:
     """A depth network of the table, read from its folder, or from the Hugging Face cache by its name
-    (``folders.find``).
+    (``folders.find``); ``steps``: of denoising, 0 = as the folder says.
 
     Raises:
         ResourceError: folder, package or device is missing. InputError: another kind of network, or not all of it.
     """
     path = folders.find(folder)
-    return KINDS[kind_of(path)](path, compute, options)
+    return KINDS[kind_of(path)](path, compute, steps)
 
 
 # --- alignment to LiDAR, for every network --------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Aligned:
-    """Dense depth and its confidence, or None where the fit to the LiDAR is not to be believed."""
-
-    dense: DenseDepth | None
-    fit: AffineFit
-
-
-def align_to_lidar(prediction: Prediction, inputs: DepthInput, rules: CompletionRules) -> Aligned:
-    """A network's depth brought to the frame's LiDAR: one scale and shift, the sky at ``rules.sky_m``, a confidence.
+def align_to_lidar(
+    prediction: Prediction, inputs: DepthInput, rules: CompletionRules
+) -> tuple[DenseDepth | None, AffineFit]:
+    """A network's depth brought to the frame's LiDAR: one scale and shift, the sky at ``rules.sky_m``, a confidence;
+    and the fit. None where the fit is not to be believed.
 
     Raises:
         InputError: prediction and image differ in size.
@@ -206,13 +196,13 @@ def align_to_lidar(prediction: Prediction, inputs: DepthInput, rules: Completion
     values, measured = prediction.values[known], inputs.measured[known]
     fit = fit_affine(torch.from_numpy(values), torch.from_numpy(measured), prediction.space)
     if not fit.used:
-        return Aligned(None, fit)
+        return None, fit
     depth = fit.depth(torch.from_numpy(prediction.values).double(), rules.near_m, rules.far_m).float().numpy()
     confidence = residual_confidence(
         depth, np.where(known, inputs.measured, np.float32(np.nan)), inputs.sky, rules.sky_m
     )
     depth[inputs.sky] = rules.sky_m
-    return Aligned(DenseDepth(depth, confidence), fit)
+    return DenseDepth(depth, confidence), fit
 
 
 def residual_confidence(

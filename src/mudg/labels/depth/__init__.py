@@ -1,1 +1,0 @@
-"""Depth networks that complete LiDAR depth."""
