@@ -231,7 +231,7 @@ def test_a_converted_folder_that_changed_or_lacks_a_package_is_refused(
         ({"sampling": {"steps": 50}}, "the field 'processing_px' is missing"),
         ({"parts": {**parts, "vae": {}}}, "not whole"),
         ({"parts": {**parts, "mapping_layer": {**parts["mapping_layer"], "config": {"a": 1}}}}, "as it is described"),
-        ({"parts": {**parts, "vae": {**parts["vae"], "config": wide}}}, "do not fit the configuration"),
+        ({"parts": {**parts, "vae": {**parts["vae"], "config": wide}}}, "not the network it should be"),
         ({"scheduler": {"_class_name": "LCMScheduler"}}, "LCMScheduler"),
     ):
         (folder / "model.json").write_text(json.dumps({**told, **other}))

@@ -253,7 +253,7 @@ def test_damaged_folders_end_in_words(tmp_path: Path) -> None:
         ("temperature", 0, r"temperature\n.*greater than 0"),
         ("focal_px", "x", "value is not a number"),
         ("depth", 3, "unknown field"),
-        ("widths", [8, 8, 8, 8, 16], "do not fit"),
+        ("widths", [8, 8, 8, 8, 16], "not the network it should be"),
     ):
         shutil.rmtree(tmp_path / "bad", ignore_errors=True)
         shutil.copytree(tmp_path / "good", tmp_path / "bad")

@@ -84,13 +84,6 @@ def read_shards(folder: Path, files: object, *, remedy: str = "make the model ag
     return tensors
 
 
-def check_fit(tensors: Mapping[str, Tensor], wanted: Mapping[str, Tensor], where: Path) -> None:
-    """InputError unless the tensors have the names and shapes of `wanted`, the state of the network they are for."""
-    wrong = sorted(set(wanted) ^ set(tensors)) or [n for n in wanted if wanted[n].shape != tensors[n].shape]
-    if wrong:
-        raise InputError("weights do not fit the configuration", where=str(where), got=", ".join(wrong[:6]))
-
-
 # checkpoint ---------------------------------------------------------------------------------------
 
 _PREFIX = "step_"

@@ -434,6 +434,11 @@ def refuse_bad_values(tensors: Mapping[str, Tensor], where: str) -> None:
             raise InputError("a tensor holds values that are not finite", where=f"{where}: {name}")
 
 
+def shapes_of(network: torch.nn.Module) -> dict[str, tuple[int, ...]]:
+    """Name -> shape of every tensor that a network needs."""
+    return {name: tuple(value.shape) for name, value in network.state_dict().items()}
+
+
 def match_exactly(state: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int]], where: str, network: str) -> None:
     """InputError where names of a checkpoint are missing, unknown, or have another shape than its network needs; the
     first ones of each kind are listed with the counts. ``network``: what to call it."""

@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from mudg.base import checkpoint, records, store
+from mudg.base import checkpoint, records, store, weights
 from mudg.base.errors import InputError
 from mudg.diffusion.model import MDM, MDMConfig
 from mudg.networks.codec import SHIPPED
@@ -104,7 +104,7 @@ def load(path: Path | str = "embedded") -> MDM:
     )
     with records.understood("a diffusion model", str(folder / MODEL_FILE)):
         with torch.device("meta"):  # takes no memory: its size may be anything
-            checkpoint.check_fit(state, MDM(config).state_dict(), folder)
+            weights.match_exactly(state, weights.shapes_of(MDM(config)), str(folder), "its configuration")
         model = MDM(config)
     model.load_state_dict(state)  # the numbers are converted as they are copied: no second set of them is in memory
     return model.eval()

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import checkpoint, palette, records, seeds, store
+from mudg.base import checkpoint, palette, records, seeds, store, weights
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Clip, Condition
 from mudg.core import noise
@@ -641,7 +641,7 @@ def load(folder: Path, device: torch.device | str = "cpu", dtype: torch.dtype | 
     with torch.device("meta"), records.understood("a published-type model", where):
         model = PublishedMDM(records.parse_dataclass(PublishedConfig, content.get("config"), f"{where}: config"))
     state = checkpoint.read_shards(Path(folder), content["files"], remedy="convert the checkpoint again")
-    checkpoint.check_fit(state, model.state_dict(), Path(folder))
+    weights.match_exactly(state, weights.shapes_of(model), str(folder), "its configuration")
     model.load_state_dict(state, assign=True)
     model.adopt_scale()
     table = model.scale

@@ -141,11 +141,6 @@ def blank_parts(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, nn.Module
     return made
 
 
-def shapes_of(network: nn.Module) -> dict[str, tuple[int, ...]]:
-    """Name -> shape of every tensor that a network needs."""
-    return {name: tuple(value.shape) for name, value in network.state_dict().items()}
-
-
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class DepthLabParts:
     """The networks, ready for use, and the noise schedule of diffusers (DDIM)."""
@@ -178,7 +173,7 @@ def read_parts(folder: Path, described: Mapping[str, Any], compute: Compute = CP
         made = blank_parts(configs)
     for name, network in made.items():
         state = checkpoint.read_shards(folder / name, files[name], remedy="convert the published files again")
-        checkpoint.check_fit(state, network.state_dict(), folder / name)
+        weights.match_exactly(state, weights.shapes_of(network), str(folder / name), "its configuration")
         network.load_state_dict({n: value.float() for n, value in state.items()}, assign=True)
         _fill_tables(network, name)
         network.to(device).eval().requires_grad_(False)
@@ -563,7 +558,7 @@ def read(sources: Sources, configs: Mapping[str, Mapping[str, Any]]) -> dict[str
     files = {part: sources.pickles / name for part, name in PICKLES.items()}
     files |= {"vae": sources.base / "vae", "image_encoder": sources.encoder_file()}
     for part, network in blank_parts(configs).items():
-        weights.match_exactly(found[part], shapes_of(network), str(files[part]), f"DepthLab's {part}")
+        weights.match_exactly(found[part], weights.shapes_of(network), str(files[part]), f"DepthLab's {part}")
         weights.refuse_bad_values(found[part], str(files[part]))
     return found
 

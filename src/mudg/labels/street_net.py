@@ -21,7 +21,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import checkpoint, records, store
+from mudg.base import checkpoint, records, store, weights
 from mudg.base.config import STRICT
 from mudg.base.errors import InputError, ResourceError
 from mudg.base.palette import CLASSES, ID
@@ -150,7 +150,7 @@ def load(folder: Path | str = EMBEDDED) -> StreetNet:
     with records.understood("a segmentation network", str(where)):
         net = StreetNet(records.parse_dataclass(StreetNetConfig, content.get("config"), f"{where}: config"))
     state = checkpoint.read_shards(where.parent, content.get("files"))
-    checkpoint.check_fit(state, net.state_dict(), where.parent)
+    weights.match_exactly(state, weights.shapes_of(net), str(where.parent), "its configuration")
     net.load_state_dict({name: value.float() for name, value in state.items()})
     return net.eval().to(memory_format=torch.channels_last)
 
