@@ -277,7 +277,6 @@ OF_LOGS = {
     "mcap": ("mcap", of_mcap),
     "ros2": ("rosbags", of_bag),
     "colmap": ("pycolmap", of_colmap),
-    "colmap-text": ("pycolmap", of_colmap),
     "ncore": ("ncore", of_ncore),
 }
 """Formats of a log: the package that reads them, and how."""

@@ -254,11 +254,10 @@ def model_of_cloud(cloud: SplatCloud, name: str) -> SceneModel:
 CAMERAS: Final[Mapping[str, Callable[[Scene, PointCloud | None], dict[str, bytes]]]] = {
     "nerfstudio": nerfstudio_files,
     "colmap": colmap_files,
-    "colmap-text": lambda scene, points: colmap_files(scene, points, text=True),
 }
 """Formats of cameras: files beside the pictures."""
 MOST_POINTS: Final = 500_000
-_CAMERA_FILES: Final = ("transforms.json", "points.ply", *below("sparse/0", ("*.bin", "*.txt")), "images/")
+_CAMERA_FILES: Final = ("transforms.json", "points.ply", *below("sparse/0", ("*.bin",)), "images/")
 FOLDERS: Final = {**dict.fromkeys(CAMERAS, (1, _CAMERA_FILES)), **LOG_FOLDERS}
 """Formats that are folders: version and files of each."""
 

@@ -39,11 +39,7 @@ def is_abandoned(out: Path) -> bool:
 
 def write_scene(config: IngestConfig, source: Path, kind: str, work: RunDir) -> dict[str, Any]:
     """Make the scene in its folder and draw its contact sheet; returns a summary. An import that fails in a new or
-    empty folder leaves nothing.
-
-    Raises:
-        InputError: the log is malformed or contradictory.
-    """
+    empty folder leaves nothing. Raises InputError: the log is malformed or contradictory."""
     if kind not in (CITY, _SCENE, config.format):
         log.info(f"ingest: {source} recognised as {kind}")
     try:
@@ -89,11 +85,8 @@ _SCENE = "scene"
 
 
 def kind_of(config: IngestConfig, source: Path) -> str:
-    """Which format ``source`` has: one of a log, ``city`` or ``scene``.
-
-    Raises:
-        UsageError: there is no such format. InputError: the log has none that is known.
-    """
+    """Which format ``source`` has: one of a log, ``city`` or ``scene``. Raises UsageError: there is no such format.
+    InputError: the log has none that is known."""
     if str(source) == CITY:
         return CITY
     if config.format != "auto":
@@ -138,12 +131,9 @@ def import_options(config: IngestConfig) -> ImportOptions:
 
 def source_digest(source: Path, kind: str, config: IngestConfig) -> str:
     """What identifies a log without reading all of it: names, sizes and modification times of the files that belong to
-    the chosen one; a scene's own digest.
-
-    Raises:
-        UsageError: several logs and none was chosen. InputError: none is there. ``kind``: format, or ``scene``.
-            ``config``: chooses the log, where a folder holds many; files it names count, too.
-    """
+    the chosen one; a scene's own digest. Raises UsageError: several logs and none was chosen. InputError: none is
+    there. ``kind``: format, or ``scene``. ``config``: chooses the log, where a folder holds many; files it names count,
+    too."""
     if kind == _SCENE:
         return store.digest(source)
     options = import_options(config)

@@ -52,11 +52,7 @@ class NCorePackage:
 
 
 def package() -> NCorePackage:
-    """The package, loaded when it is first asked for.
-
-    Raises:
-        ResourceError: it is not installed.
-    """
+    """The package, loaded when it is first asked for. Raises ResourceError: it is not installed."""
     try:
         data, files = importlib.import_module("ncore.data"), importlib.import_module("ncore.data.v4")
         sensors = importlib.import_module("ncore.sensors")

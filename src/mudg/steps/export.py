@@ -31,8 +31,8 @@ class Export(Result):
     )
     result = "exported"
     format: Annotated[str, Flag("FORMAT", "first")]
-    """Gaussians: ply, alpasim, spz, glb, usda, usdz, compressed-ply, sog, splat. Cameras: nerfstudio, colmap,
-    colmap-text. The log over time: mcap, ros2, rerun, ncore."""
+    """Gaussians: ply, alpasim, spz, glb, usda, usdz, compressed-ply, sog, splat. Cameras: nerfstudio, colmap. The
+    log over time: mcap, ros2, rerun, ncore."""
     source: Annotated[Path, RUN]
     """Gaussian scene written by fit, or folder of a finished mudg run; for cameras also a scene directory."""
     out: Annotated[Path, Flag("OUT")]

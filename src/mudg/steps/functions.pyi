@@ -296,7 +296,7 @@ def export(
     """Write a fitted scene for other programs: PLY, SPZ, glTF, USD, SOG; cameras for nerfstudio and COLMAP.
 
     Args:
-        format: Gaussians: ply, alpasim, spz, glb, usda, usdz, compressed-ply, sog, splat. Cameras: nerfstudio, colmap, colmap-text. The log over time: mcap, ros2, rerun, ncore.
+        format: Gaussians: ply, alpasim, spz, glb, usda, usdz, compressed-ply, sog, splat. Cameras: nerfstudio, colmap. The log over time: mcap, ros2, rerun, ncore.
         source: Gaussian scene written by fit, or folder of a finished mudg run; for cameras also a scene directory.
         out: File to write, with the suffix of the format; for cameras, ros2 and ncore, folder to write.
         scene: Scene directory that a Gaussian scene was fitted to. A run has its own.

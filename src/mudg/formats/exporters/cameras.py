@@ -1,4 +1,4 @@
-"""Cameras and images of a log as a COLMAP model, binary or text, with one rig of all cameras.
+"""Cameras and images of a log as a binary COLMAP model, with one rig of all cameras.
 
 Poses are camera from world, axes x right, y down, z forward, pixel centres at 0.5: those of this program. Images that
 the rig took at one time and whose poses agree with it are one frame; any other image is a frame by itself, so that
@@ -125,32 +125,12 @@ def rig_frames(scene: Scene, sensors: Mapping[str, Matrix]) -> list[RigFrame]:
     return found
 
 
-def colmap_files(scene: Scene, points: PointCloud | None = None, text: bool = False) -> dict[str, bytes]:
+def colmap_files(scene: Scene, points: PointCloud | None = None) -> dict[str, bytes]:
     """The files of the model; pictures stand at ``picture_names``, below the folder ``images``."""
     cameras = {name: index + 1 for index, name in enumerate(scene.cameras)}
     images = {frame.id: index + 1 for index, frame in enumerate(scene.frames)}
+    names = {id_: name.removeprefix("images/") for id_, name in picture_names(scene).items()}
     sensors = sensors_from_rig(scene)
-    frames = rig_frames(scene, sensors)
-    write = _text if text else _binary
-    files = write(scene, (cameras, images, sensors, frames), points)
-    return {f"{FOLDER}/{name}": content for name, content in files.items()}
-
-
-Numbered = tuple[Mapping[str, int], Mapping[str, int], Mapping[str, Matrix], list[RigFrame]]
-
-
-def _pose(matrix: Matrix) -> list[float]:
-    """Quaternion w x y z and translation."""
-    return [*geometry.quaternion_from_matrix(matrix).tolist(), *matrix[:3, 3].tolist()]
-
-
-def _name(names: Mapping[str, str], frame: Frame) -> str:
-    return names[frame.id].removeprefix("images/")
-
-
-def _binary(scene: Scene, numbered: Numbered, points: PointCloud | None) -> dict[str, bytes]:
-    cameras, images, sensors, frames = numbered
-    names = picture_names(scene)
     lens = [
         struct.pack("<IiQQ4d", cameras[c.name], PINHOLE, c.width, c.height, *c.intrinsics)
         for c in scene.cameras.values()
@@ -158,15 +138,16 @@ def _binary(scene: Scene, numbered: Numbered, points: PointCloud | None) -> dict
     taken = []
     for frame in scene.frames:
         pose = (*_pose(frame.view.cam_from_world), cameras[frame.view.camera.name])
-        taken.append(struct.pack("<I7dI", images[frame.id], *pose) + _name(names, frame).encode() + bytes(9))
-    others = list(sensors)[1:]
-    first = next(iter(sensors), None)
-    rig = b"" if first is None else struct.pack("<IIiI", 1, len(sensors), CAMERA, cameras[first])
-    rig += b"".join(struct.pack("<iIB7d", CAMERA, cameras[name], 1, *_pose(sensors[name])) for name in others)
+        taken.append(struct.pack("<I7dI", images[frame.id], *pose) + names[frame.id].encode() + bytes(9))
+    rig = b""
+    if sensors:
+        first, *others = sensors
+        rig = struct.pack("<IIiI", 1, len(sensors), CAMERA, cameras[first])
+        rig += b"".join(struct.pack("<iIB7d", CAMERA, cameras[name], 1, *_pose(sensors[name])) for name in others)
     moments = [
         struct.pack("<II7dI", index + 1, 1, *_pose(one.rig_from_world), len(one.frames))
         + b"".join(struct.pack("<iIQ", CAMERA, cameras[f.view.camera.name], images[f.id]) for f in one.frames)
-        for index, one in enumerate(frames)
+        for index, one in enumerate(rig_frames(scene, sensors))
     ]
     cloud = np.zeros(
         0 if points is None else len(points),
@@ -176,33 +157,10 @@ def _binary(scene: Scene, numbered: Numbered, points: PointCloud | None) -> dict
         cloud["id"], cloud["xyz"], cloud["rgb"] = np.arange(1, len(points) + 1), points.xyz, points.rgb
     parts = {"cameras.bin": lens, "images.bin": taken, "rigs.bin": [rig] if rig else [], "frames.bin": moments}
     files = {name: struct.pack("<Q", len(entries)) + b"".join(entries) for name, entries in parts.items()}
-    return files | {"points3D.bin": struct.pack("<Q", len(cloud)) + cloud.tobytes()}
+    files["points3D.bin"] = struct.pack("<Q", len(cloud)) + cloud.tobytes()
+    return {f"{FOLDER}/{name}": content for name, content in files.items()}
 
 
-def _text(scene: Scene, numbered: Numbered, points: PointCloud | None) -> dict[str, bytes]:
-    cameras, images, sensors, frames = numbered
-    names = picture_names(scene)
-
-    def words(*values: object) -> str:
-        return " ".join(f"{value:.17g}" if isinstance(value, float) else str(value) for value in values)
-
-    lens = [
-        words(cameras[c.name], "PINHOLE", c.width, c.height, *map(float, c.intrinsics)) for c in scene.cameras.values()
-    ]
-    taken = [
-        words(images[f.id], *_pose(f.view.cam_from_world), cameras[f.view.camera.name], _name(names, f)) + "\n"
-        for f in scene.frames
-    ]
-    rig: list[str] = []
-    if sensors:
-        first, *others = sensors
-        rest = [word for name in others for word in ("CAMERA", cameras[name], 1, *_pose(sensors[name]))]
-        rig.append(words(1, len(sensors), "CAMERA", cameras[first], *rest))
-    moments = []
-    for index, one in enumerate(frames):
-        seen = [word for f in one.frames for word in ("CAMERA", cameras[f.view.camera.name], images[f.id])]
-        moments.append(words(index + 1, 1, *_pose(one.rig_from_world), len(one.frames), *seen))
-    rows = [] if points is None else zip(points.xyz.astype(np.float64).tolist(), points.rgb.tolist())
-    cloud = [words(index + 1, *xyz, *rgb, 0) for index, (xyz, rgb) in enumerate(rows)]
-    parts = {"cameras.txt": lens, "images.txt": taken, "rigs.txt": rig, "frames.txt": moments, "points3D.txt": cloud}
-    return {name: ("\n".join(lines) + "\n" if lines else "").encode() for name, lines in parts.items()}
+def _pose(matrix: Matrix) -> list[float]:
+    """Quaternion w x y z and translation."""
+    return [*geometry.quaternion_from_matrix(matrix).tolist(), *matrix[:3, 3].tolist()]

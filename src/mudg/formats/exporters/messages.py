@@ -477,11 +477,8 @@ def ros_types() -> Any:
 
 
 class Ros2Messages(LogMessages):
-    """The messages of a log for ROS 2; of one moment, transforms first.
-
-    Raises:
-        InputError: an object's id or class holds a zero byte.
-    """
+    """The messages of a log for ROS 2; of one moment, transforms first. Raises InputError: an object's id or class
+    holds a zero byte."""
 
     profile, schema_encoding, message_encoding = "ros2", "ros2msg", "cdr"
 
@@ -556,12 +553,8 @@ class Ros2Messages(LogMessages):
             pose = self._scene.ego.pose_at(moment)
             if pose is not None:
                 yield self._tf("/tf", moment, MAP, {VEHICLE: pose})
-                yield LogMessage(
-                    "/ego/pose",
-                    "geometry_msgs/msg/PoseStamped",
-                    moment,
-                    lambda t=moment, p=pose: self._ros.PoseStamped(self._header(t, MAP), self._pose(p)),
-                )
+                ego = lambda t=moment, p=pose: self._ros.PoseStamped(self._header(t, MAP), self._pose(p))
+                yield LogMessage("/ego/pose", "geometry_msgs/msg/PoseStamped", moment, ego)
         for sensor, time_s, pose in self._log.sensor_poses():
             if sensor not in self._mounts:
                 yield self._tf("/tf", time_s, MAP, {self._frame(sensor): pose})
@@ -643,9 +636,8 @@ class Ros2Messages(LogMessages):
             yield LogMessage("/objects/detections", "vision_msgs/msg/Detection3DArray", time_s, boxes)
 
     def _markers(self, time_s: float) -> Any:
-        ros, header, numbers = self._ros, self._header(time_s, MAP), {}
-        for number, track in enumerate(self._scene.tracks):
-            numbers[track.id] = number
+        ros, header = self._ros, self._header(time_s, MAP)
+        numbers = {track.id: number for number, track in enumerate(self._scene.tracks)}
         picture = ros.CompressedImage(ros.Header(ros.Time(0, 0), ""), "", np.zeros(0, np.uint8))
         rest = {"action": 0, "lifetime": ros.Duration(0, round(BOX_LIFE_S * NANO)), "frame_locked": False}
         rest |= {"points": [], "colors": [], "texture_resource": "", "texture": picture, "uv_coordinates": []}
@@ -664,8 +656,7 @@ class Ros2Messages(LogMessages):
     def _detections(self, time_s: float) -> Any:
         ros, header, detections = self._ros, self._header(time_s, MAP), []
         for track, pose in self._log.boxes(time_s):
-            center = self._pose(pose)
-            size = ros.Vector3(*track.size_m.tolist())
+            center, size = self._pose(pose), ros.Vector3(*track.size_m.tolist())
             hypothesis = ros.ObjectHypothesis(track.label, 1.0)
             result = ros.ObjectHypothesisWithPose(hypothesis, ros.PoseWithCovariance(center, np.zeros(36)))
             detections.append(ros.Detection3D(header, [result], ros.BoundingBox3D(center, size), track.id))

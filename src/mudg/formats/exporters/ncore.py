@@ -54,12 +54,9 @@ _LONGEST_STEP_US: Final = 500_000
 
 
 def write_ncore(folder: Path, records: LogRecords) -> list[Path]:
-    """Write a log into a folder, in a hidden folder there until it is complete; returns the files.
-
-    Raises:
-        ResourceError: the package is not installed. InputError: two sweeps or pictures of one sensor begin or end at
-            one microsecond.
-    """
+    """Write a log into a folder, in a hidden folder there until it is complete; returns the files. Raises
+    ResourceError: the package is not installed. InputError: two sweeps or pictures of one sensor begin or end at one
+    microsecond."""
     made = _WrittenLog(records)
     name = re.sub(r"[^A-Za-z0-9_.-]", "_", records.scene.id).strip(".") or "log"
     with tempfile.TemporaryDirectory(prefix=".ncore.", suffix=".part", dir=folder) as work:

@@ -35,11 +35,7 @@ Matrix = NDArray[np.float64]
 
 
 def package() -> Any:
-    """The module ``rerun``.
-
-    Raises:
-        ResourceError: it is not installed.
-    """
+    """The module ``rerun``. Raises ResourceError: it is not installed."""
     try:
         return importlib.import_module("rerun")
     except ImportError as error:
@@ -188,10 +184,6 @@ class RerunWriter:
 
 
 def write_rerun(out: Path, log: LogRecords | None, splats: SplatScene | None, name: str) -> None:
-    """Write a log, Gaussians, or both as a recording.
-
-    Raises:
-        ResourceError: the package rerun-sdk is not installed.
-    """
+    """Write a log, Gaussians, or both as a recording. Raises ResourceError: the package rerun-sdk is not installed."""
     start_s = log.start_s if log is not None else 0.0 if splats is None else splats.span_s[0]
     RerunWriter(name, start_s).write(out, log, splats)

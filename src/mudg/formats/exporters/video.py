@@ -24,11 +24,8 @@ _CODECS = ("libx264", "h264", "mpeg4")
 
 
 def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float = 10.0) -> Path:
-    """Encode frames u8[H, W, 3] to ``path`` atomically; odd sizes are padded by one pixel of the edge.
-
-    Raises:
-        InputError: no frames, or frames of different sizes. ResourceError: no usable encoder, or the disk is full.
-    """
+    """Encode frames u8[H, W, 3] to ``path`` atomically; odd sizes are padded by one pixel of the edge. Raises
+    InputError: no frames, or frames of different sizes. ResourceError: no usable encoder, or the disk is full."""
     with store.atomic_path(Path(path)) as temporary:
         _encode(str(temporary), frames, fps, crf=20)
     return Path(path)

@@ -47,11 +47,8 @@ def _function(verb: str, name: str) -> Any:
 
 
 def import_log(name: str, source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import a log as one of ``known_formats``.
-
-    Raises:
-        UsageError: another package offers the format, and its code cannot be loaded. InputError: the log is malformed.
-    """
+    """Import a log as one of ``known_formats``. Raises UsageError: another package offers the format, and its code
+    cannot be loaded. InputError: the log is malformed."""
     read = _function("import", name) if name in FORMATS else load_plugin(name)
     with foreign_numbers(), named_once():
         return read(source, out, options)

@@ -360,12 +360,9 @@ def looks_like_custom(source: Path) -> bool:
 
 
 def import_custom(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import a log in the neutral layout into the scene directory ``out``.
-
-    Raises:
-        UsageError: an option that this format does not have, or a camera that the log does not have. InputError:
-            something is missing, malformed or contradictory; nothing is left at ``out``.
-    """
+    """Import a log in the neutral layout into the scene directory ``out``. Raises UsageError: an option that this
+    format does not have, or a camera that the log does not have. InputError: something is missing, malformed or
+    contradictory; nothing is left at ``out``."""
     common.refuse_options(options, "neutral-layout", "sequence", "poses", "boxes")
     log_read, notes = read_log(source), []
     content = _chosen(replace(log_read, ego=common.mended_path(log_read.ego, options, notes)), options)

@@ -104,11 +104,8 @@ class SceneContent(Generic[Item]):
 def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) -> Scene:
     """Write a scene at ``out``. Points at a sensor's own place are left out, and headings of boxes that flip by 180
     degrees turned back; the scene's notes count both. At most two items per worker are in memory, beside the few that
-    wait for the disk.
-
-    Raises:
-        InputError: an item is missing or damaged, or what is written contradicts itself. Nothing is left at ``out``.
-    """
+    wait for the disk. Raises InputError: an item is missing or damaged, or what is written contradicts itself. Nothing
+    is left at ``out``."""
     dataset = content.source.dataset
     types.foreign_name(content.name, f"{dataset}: name of the log")
     moments: list[tuple[int, str]] = []
@@ -234,12 +231,9 @@ class DriveLog:
 
 def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
     """Write the chosen frames of ``drive`` as a scene at ``out``. Boxes of moving objects are brought to the sweeps'
-    times, unless ``untwist`` is ``no``: then every sweep counts as one moment, and boxes stay as drawn.
-
-    Raises:
-        UsageError: no frame lies in the chosen range. InputError: a file is missing or damaged; poses, times and
-            units contradict each other. Nothing is left at ``out``.
-    """
+    times, unless ``untwist`` is ``no``: then every sweep counts as one moment, and boxes stay as drawn. Raises
+    UsageError: no frame lies in the chosen range. InputError: a file is missing or damaged; poses, times and units
+    contradict each other. Nothing is left at ``out``."""
     common.check_motion(drive.ego, drive.where)
     chosen = _outside_gaps(_without_missing(_choose_frames(drive, options), options), drive, options)
     records = sorted(chosen, key=lambda record: record.time_s)

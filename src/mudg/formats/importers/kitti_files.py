@@ -297,11 +297,8 @@ def read_timestamps(path: Path, numbers: Sequence[int], last: int) -> dict[int, 
     """Seconds by number: plain seconds, or ``2011-09-26 13:02:25.964389445`` (nanoseconds kept; seconds of the epoch).
 
     Line k is number k, and an empty line a number without a stamp. A file without empty lines that is too short for
-    that, but has just one line per recorded file, counts those instead.
-
-    Raises:
-        InputError: no times, or too few. ``numbers``: of the recorded files, increasing. ``last``: the highest number
-            that is needed.
+    that, but has just one line per recorded file, counts those instead. Raises InputError: no times, or too few.
+    ``numbers``: of the recorded files, increasing. ``last``: the highest number that is needed.
     """
     lines = read_lines(path)
     stamps = {number: _stamp(line, f"{path}: line {number + 1}") for number, line in lines.items()}

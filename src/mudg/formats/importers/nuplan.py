@@ -315,11 +315,8 @@ def _finite(value: Any, where: str) -> float:
 
 @contextmanager
 def open_log(path: Path) -> Iterator[NuplanLog]:
-    """Open a log database read-only and check its schema.
-
-    Raises:
-        InputError: missing, not SQLite, damaged, or another schema.
-    """
+    """Open a log database read-only and check its schema. Raises InputError: missing, not SQLite, damaged, or another
+    schema."""
     if not path.is_file():
         raise InputError("log database does not exist", where=str(path), expected="a .db file")
     connection = None
@@ -589,9 +586,8 @@ def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> Sc
             return
         for shot in what:
             time_s = taken_s(shot)
-            world_from_cam = (
-                common.pose_near(ego, time_s, where=str(shot.file)) @ plan.cameras[shot.channel].ego_from_cam
-            )
+            mount = plan.cameras[shot.channel].ego_from_cam
+            world_from_cam = common.pose_near(ego, time_s, where=str(shot.file)) @ mount
             yield SceneImage(CAMERAS[shot.channel], index, time_s, world_from_cam, shot.file, str(shot.file))
 
     moments = list(enumerate(plan.moments))
@@ -601,11 +597,8 @@ def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> Sc
             notes.append(f"{len(plan.moments) - len(moments)} moments without a vehicle pose were left out")
     items = [*enumerate(plan.clouds), *moments]
     source = Source("nuplan", LICENCE, None, (*notes, *track_notes))
-    return SceneContent(plan.name, source, fits, items, convert, _item_name, ego, tracks=lambda: (tracks, ()))
-
-
-def _item_name(item: tuple[int, NuplanCloud | Sequence[_Shot]]) -> str:
-    return f"cloud {item[0]}" if isinstance(item[1], NuplanCloud) else f"moment {item[0]}"
+    name = lambda item: f"{'cloud' if isinstance(item[1], NuplanCloud) else 'moment'} {item[0]}"
+    return SceneContent(plan.name, source, fits, items, convert, name, ego, tracks=lambda: (tracks, ()))
 
 
 def _read_tracks(
@@ -644,9 +637,7 @@ def _read_points(path: Path, places: Sequence[Matrix]) -> SweepPoints:
     cloud = read_cloud(path)
     intensity = cloud.fields.get("intensity", np.zeros(len(cloud.xyz)))
     returns = ~near_places(cloud.xyz, places)
-    xyz, grey = (
-        cloud.xyz[returns].astype(np.float32),
-        common.unit_intensity(intensity[returns], 255, f"{path}: intensity"),
-    )
+    xyz = cloud.xyz[returns].astype(np.float32)
+    grey = common.unit_intensity(intensity[returns], 255, f"{path}: intensity")
     no_returns = cloud.missing + int((~returns).sum())
     return SweepPoints(xyz, grey, np.zeros(len(xyz), np.float32), no_returns=no_returns)

@@ -74,12 +74,8 @@ def camera_from_intrinsics(name: str, size: tuple[int, int], intrinsics: Any, wh
 
 def read_scan(path: Path) -> SweepPoints:
     """A ``LIDAR_TOP`` file: float32 rows x, y, z, intensity (0..255), ring; LiDAR axes x right, y forward, z up.
-
     Returns of the recording vehicle are dropped, and beams without a return, which are counted; intensity becomes 0..1.
-
-    Raises:
-        InputError: cut off, not finite, or rings that no 32-beam sensor has.
-    """
+    Raises InputError: cut off, not finite, or rings that no 32-beam sensor has."""
     rows, returns = read_float_rows(path, 5, "sweep")
     rings = rows[returns, 4]
     if len(rings) and ((rings < 0) | (rings >= BEAMS) | (rings != np.round(rings))).any():

@@ -73,43 +73,38 @@ class GzipStream:
 
     def read(self, size: int, what: str) -> bytes:
         """The next ``size`` bytes; InputError if there are fewer or they are damaged."""
-        found = bytearray()
-        try:
-            while len(found) < size:
-                more = self._inflater.decompress(self._rest, min(size - len(found), 1 << 24))
-                self._rest = self._inflater.unconsumed_tail
-                if not more and (self._inflater.eof or not self._rest):
-                    break
-                found += more
-        except zlib.error as error:
-            raise InputError("the compressed content is damaged", where=self._where, got=str(error)) from error
+        found = self.rest(size)
         if len(found) < size:
             what, where = f"the file ends within {what}", self._where
             remedy = "it was cut off, or its header is damaged: get the file again"
             raise InputError(what, where=where, expected=f"{size} bytes", got=f"{len(found)} bytes", remedy=remedy)
-        return bytes(found)
+        return found
 
     def rest(self, most: int) -> bytes:
         """What is left, up to ``most`` bytes."""
         found = bytearray()
-        try:
-            while len(found) < most and (more := self._inflater.decompress(self._rest, most - len(found))):
-                self._rest = self._inflater.unconsumed_tail
-                found += more
-        except zlib.error as error:
-            raise InputError("the compressed content is damaged", where=self._where, got=str(error)) from error
+        while len(found) < most:
+            more = self._inflate(min(most - len(found), 1 << 24))
+            if not more and (self._inflater.eof or not self._rest):
+                break
+            found += more
         return bytes(found)
 
     def close(self) -> None:
         """InputError unless the content ends here, with the right checksum."""
-        try:
-            more = self._inflater.decompress(self._rest, 1)
-        except zlib.error as error:
-            raise InputError("the compressed content is damaged", where=self._where, got=str(error)) from error
+        more = self._inflate(1)
         if more or not self._inflater.eof:
             what = "goes on after its last value" if more else "ends before its checksum"
             what = f"the compressed content {what}"
             raise InputError(what, where=self._where, remedy="the header does not fit the content")
+
+    def _inflate(self, most: int) -> bytes:
+        try:
+            more = self._inflater.decompress(self._rest, most)
+        except zlib.error as error:
+            raise InputError("the compressed content is damaged", where=self._where, got=str(error)) from error
+        self._rest = self._inflater.unconsumed_tail
+        return more
 
 
 # -- zips ------------------------------------------------------------------------------------------

@@ -289,11 +289,8 @@ def unit(quats: NDArray[np.floating], where: str) -> Floats:
 
 def checked(cloud: SplatCloud, where: str) -> SplatCloud:
     """A cloud as it was read, rotations brought to length 1. Opacities of exactly 0 and 1 and sizes of 0, whose logits
-    and logarithms are infinite, become the nearest that can be worked with.
-
-    Raises:
-        InputError: values that are not finite, or places and sizes that nothing has.
-    """
+    and logarithms are infinite, become the nearest that can be worked with. Raises InputError: values that are not
+    finite, or places and sizes that nothing has."""
     if len(cloud) == 0:
         raise InputError("the file holds no Gaussians", where=where)
     logits = np.nan_to_num(cloud.logits, nan=np.nan, posinf=MOST_LOGIT, neginf=-MOST_LOGIT)
@@ -327,10 +324,7 @@ def spacing_m(places: NDArray[np.floating], kind: type[np.floating] = np.float32
 
 def doubtful_values(cloud: SplatCloud, where: str) -> list[str]:
     """Sentences on values that a format stores as logarithms and logits, and that look as if they had not been taken.
-
-    Raises:
-        InputError: neither sizes nor opacities can be what the format says.
-    """
+    Raises InputError: neither sizes nor opacities can be what the format says."""
     plain_opacity = bool((cloud.logits >= 0).all() and (cloud.logits <= 1).all() and (cloud.logits > 0).any())
     plain_size = bool((cloud.log_scales[:, :2] > 0).all())  # the third is that of flat Gaussians
     if plain_opacity and plain_size:

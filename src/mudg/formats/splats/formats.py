@@ -54,11 +54,7 @@ def splat_bytes(cloud: SplatCloud) -> bytes:
 
 
 def splat_from_bytes(content: bytes, where: str) -> SplatFile:
-    """The Gaussians of a .splat file.
-
-    Raises:
-        InputError: no such file, or a damaged one.
-    """
+    """The Gaussians of a .splat file. Raises InputError: no such file, or a damaged one."""
     if len(content) % _SPLAT_ROW.itemsize:
         what, got = "the length of a .splat file is a multiple of 32 bytes", f"{len(content)} bytes"
         raise InputError(what, where=where, got=got, remedy="it was cut off, or is another kind of file")
@@ -205,11 +201,8 @@ def file_from_world(name: str, choice: str) -> NDArray[np.float64]:
 
 
 def format_of(content: bytes, name: str) -> str:
-    """Which format a file is, by its first bytes, or by its name where it has no mark.
-
-    Raises:
-        InputError: none that is read.
-    """
+    """Which format a file is, by its first bytes, or by its name where it has no mark. Raises InputError: none that is
+    read."""
     suffix = PurePath(name).suffix.lower()
     if content[:3] == b"ply":
         return "compressed-ply" if ply.is_compressed(content) else "ply"

@@ -213,13 +213,8 @@ Array = NDArray[np.float64]
 
 def from_bytes(content: bytes, where: str) -> SplatFile:
     """The Gaussians of a GLB file, all meshes where the scene's nodes put them (without its animations), in the axes of
-    the file.
-
-    Fields that it does not know are passed over, unless the file says that they are required.
-
-    Raises:
-        InputError: no GLB file, one without Gaussians, or a damaged one.
-    """
+    the file. Fields that it does not know are passed over, unless the file says that they are required. Raises
+    InputError: no GLB file, one without Gaussians, or a damaged one."""
     file = _GlbFile(content, where)
     clouds, triangles = [], 0
     for matrix, mesh in file.placed():

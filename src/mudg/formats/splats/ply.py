@@ -77,11 +77,8 @@ def to_bytes(cloud: SplatCloud, classes: bool = False, marks: Sequence[str] = ()
 
 
 def from_bytes(content: bytes, where: str) -> SplatFile:
-    """The Gaussians of a PLY file; columns and elements that it does not know are passed over.
-
-    Raises:
-        InputError: another kind of PLY, or a damaged one.
-    """
+    """The Gaussians of a PLY file; columns and elements that it does not know are passed over. Raises InputError:
+    another kind of PLY, or a damaged one."""
     file = read_elements(content, where, ("vertex",))
     table = file.tables.get("vertex")
     if table is None:
@@ -201,11 +198,8 @@ class PlyFile:
 
 
 def read_elements(content: bytes, where: str, wanted: tuple[str, ...]) -> PlyFile:
-    """The wanted elements of a binary PLY as structured arrays that look into ``content``.
-
-    Raises:
-        InputError: no PLY, an ASCII one, a malformed header, wanted elements with lists, or content that is too short.
-    """
+    """The wanted elements of a binary PLY as structured arrays that look into ``content``. Raises InputError: no PLY,
+    an ASCII one, a malformed header, wanted elements with lists, or content that is too short."""
     elements, comments, place, order = _parsed_header(content, where)
     tables: dict[str, NDArray[Any]] = {}
     last = max((index for index, element in enumerate(elements) if element.name in wanted), default=-1)
@@ -453,11 +447,8 @@ def is_compressed(content: bytes) -> bool:
 
 
 def compressed_from_bytes(content: bytes, where: str) -> SplatFile:
-    """The Gaussians of a compressed PLY file; columns and elements that it does not know are passed over.
-
-    Raises:
-        InputError: another kind of PLY, or a damaged one.
-    """
+    """The Gaussians of a compressed PLY file; columns and elements that it does not know are passed over. Raises
+    InputError: another kind of PLY, or a damaged one."""
     file = read_elements(content, where, ("chunk", "vertex", "sh"))
     chunk, vertex = file.tables.get("chunk"), file.tables.get("vertex")
     if chunk is None or vertex is None or any(name not in (vertex.dtype.names or ()) for name in _PACKED):

@@ -202,11 +202,8 @@ def _webp(picture: Picture) -> bytes:
 
 
 def from_bytes(content: bytes, where: str) -> SplatFile:
-    """The Gaussians of a SOG file; fields that it does not know are passed over.
-
-    Raises:
-        InputError: no SOG file of version 2, or a damaged one.
-    """
+    """The Gaussians of a SOG file; fields that it does not know are passed over. Raises InputError: no SOG file of
+    version 2, or a damaged one."""
     archive = binary.BoundedZip(content, where)
     names = [name for name in archive.names if name.rpartition("/")[2] == "meta.json"]
     if not names:

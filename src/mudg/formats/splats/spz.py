@@ -50,11 +50,8 @@ def fractional_bits(means: NDArray[np.floating]) -> int:
 
 
 def to_bytes(cloud: SplatCloud, version: int = 3, antialias: bool = False) -> bytes:
-    """A cloud as an SPZ file of version 3, or 4; ``antialias``: it was fitted with an antialiased rasteriser.
-
-    Raises:
-        InputError: a place too far from the origin. ResourceError: version 4 without the package zstandard.
-    """
+    """A cloud as an SPZ file of version 3, or 4; ``antialias``: it was fitted with an antialiased rasteriser. Raises
+    InputError: a place too far from the origin. ResourceError: version 4 without the package zstandard."""
     bits = fractional_bits(cloud.means)
     if float(np.abs(cloud.means).max(initial=0)) * (1 << bits) > (1 << 23) - 1:
         raise InputError("a Gaussian lies too far from the origin for SPZ", expected="at most 8388 km")
@@ -95,12 +92,8 @@ class _Header:
 
 
 def from_bytes(content: bytes, where: str) -> SplatFile:
-    """The Gaussians of an SPZ file of version 1 to 4.
-
-    Raises:
-        InputError: no SPZ file, a damaged one, or of another version. ResourceError: version 4 without the package
-            zstandard.
-    """
+    """The Gaussians of an SPZ file of version 1 to 4. Raises InputError: no SPZ file, a damaged one, or of another
+    version. ResourceError: version 4 without the package zstandard."""
     if content[:4] == struct.pack("<I", MAGIC):
         return _from_streams(content, where)
     if content[:2] != b"\x1f\x8b":

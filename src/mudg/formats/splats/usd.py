@@ -77,11 +77,7 @@ def to_package(
     scene: SplatScene, time_s: float | None = None, log: Scene | None = None, more: Mapping[str, bytes] | None = None
 ) -> bytes:
     """A scene as a USDZ package: the text, the sky as a picture (zenith on top, as one looks at it), and ``more`` files
-    after these.
-
-    Raises:
-        InputError: more than 4 GiB, which a package cannot hold.
-    """
+    after these. Raises InputError: more than 4 GiB, which a package cannot hold."""
     files = {"scene.usda": to_text(scene, time_s, scene.sky is not None, log)}
     if scene.sky is not None:
         files[SKY_FILE] = png(scene.sky[:, ::-1])

@@ -69,10 +69,8 @@ def import_waymo(source: Path, out: Path, options: ImportOptions) -> Scene:
     ``options.sequence``: a log's name or a part of it."""
     common.refuse_options(options, "Waymo", "poses", "boxes")
     if options.untwist == "no":
-        what, expected = (
-            "Waymo scans cannot be left twisted",
-            "auto or yes: points carry the pose they were measured at",
-        )
+        what = "Waymo scans cannot be left twisted"
+        expected = "auto or yes: points carry the pose they were measured at"
         raise UsageError(what, where="--untwist", got="no", remedy="leave it out", expected=expected)
     waymo = open_log(source, options)
     frames, notes = _usable_frames(waymo, options)
@@ -108,12 +106,8 @@ def files_of_waymo(source: Path, options: ImportOptions) -> LogFiles:
 
 
 def open_log(source: Path, options: ImportOptions) -> WaymoLog:
-    """The log that ``source`` and ``options.sequence`` name, its facts read and checked.
-
-    Raises:
-        UsageError: there are several, and none or more than one was meant. InputError: there is none, or it is
-            damaged.
-    """
+    """The log that ``source`` and ``options.sequence`` name, its facts read and checked. Raises UsageError: there are
+    several, and none or more than one was meant. InputError: there is none, or it is damaged."""
     record, segment = _find(source, options)
     return TfrecordLog(record, options.frames) if record is not None else ParquetLog(source, segment, options.frames)
 
@@ -441,15 +435,10 @@ class ScanPoints:
 def points_of_scan(
     scan: records.LaserScan, laser: LaserCalibration, global_from_vehicle: Matrix, where: str
 ) -> ScanPoints:
-    """All points of a scan, first returns and then second ones.
-
-    Where pixels have poses of their own (top LiDAR), a point is carried from where the vehicle was when it was measured
-    to where the vehicle was at the frame's pose. The other LiDARs are recorded as if all was measured at the frame's
-    pose.
-
-    Raises:
-        InputError: shapes that contradict each other, or values that are not finite.
-    """
+    """All points of a scan, first returns and then second ones. Where pixels have poses of their own (top LiDAR), a
+    point is carried from where the vehicle was when it was measured to where the vehicle was at the frame's pose. The
+    other LiDARs are recorded as if all was measured at the frame's pose. Raises InputError: shapes that contradict each
+    other, or values that are not finite."""
     shape = scan.returns[0].shape[:2]
     if any(image.shape[:2] != shape for image in (*scan.returns, *scan.projections)) or (
         scan.poses is not None and scan.poses.shape[:2] != shape
@@ -628,11 +617,8 @@ def vehicle_from_cam(calibration: records.CameraCalibration) -> Matrix:
 
 
 def panoptic_ids(label: records.Panoptic, camera: Camera, where: str) -> NDArray[np.int32]:
-    """Values of a panoptic label, i32[H, W]: class * divisor + instance.
-
-    Raises:
-        InputError: no 16-bit PNG of the camera's size, or no divisor.
-    """
+    """Values of a panoptic label, i32[H, W]: class * divisor + instance. Raises InputError: no 16-bit PNG of the
+    camera's size, or no divisor."""
     if label.divisor < 1:
         what = "panoptic label has no divisor"
         raise InputError(what, where=where, expected="a positive number", got=str(label.divisor))
@@ -695,15 +681,11 @@ def projection_errors(
                     continue
                 calibration, pose = cameras[name]
                 cam_from_vehicle = invert(pose @ vehicle_from_cam(calibration)) @ global_from_vehicle
-                uv = _recorded_pixels(calibration, transform_points(cam_from_vehicle, xyz_vehicle[chosen][here]))
+                xyz_cam = transform_points(cam_from_vehicle, xyz_vehicle[chosen][here])
+                z = np.where(xyz_cam[:, 2:] > 0.1, xyz_cam[:, 2:], np.nan)
+                fx, fy, cx, cy, *coefficients = calibration.intrinsic
+                uv = brown_conrady(*coefficients)(xyz_cam[:, :2] / z) * [fx, fy] + [cx, cy]
+                uv = np.where(np.isfinite(uv), uv, np.inf)  # behind the camera
                 off = np.linalg.norm(uv - (half[here, 1:] + 0.5), axis=1)
                 errors[name] = np.concatenate([errors.get(name, np.zeros(0)), off])
     return errors
-
-
-def _recorded_pixels(calibration: records.CameraCalibration, xyz_cam: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixels f64[N, 2] of the recorded (distorted) image; infinite behind the camera."""
-    fx, fy, cx, cy, *coefficients = calibration.intrinsic
-    z = np.where(xyz_cam[:, 2:] > 0.1, xyz_cam[:, 2:], np.nan)
-    uv = brown_conrady(*coefficients)(xyz_cam[:, :2] / z) * [fx, fy] + [cx, cy]
-    return np.where(np.isfinite(uv), uv, np.inf)

@@ -102,11 +102,8 @@ class RecordPlace:
 
 
 def record_places(path: Path) -> Iterator[RecordPlace]:
-    """The records of a file in order; only headers are read, and their checksums compared.
-
-    Raises:
-        InputError: not a TFRecord file, cut off, a damaged header, or a length that no record has.
-    """
+    """The records of a file in order; only headers are read, and their checksums compared. Raises InputError: not a
+    TFRecord file, cut off, a damaged header, or a length that no record has."""
     try:
         with store.open_file(path) as file:
             size = file.seek(0, 2)
@@ -144,11 +141,8 @@ def _read_header(file: BinaryIO, path: Path, number: int, offset: int, size: int
 
 
 def read_record(file: BinaryIO, path: Path, place: RecordPlace) -> bytes:
-    """The payload of a record, its checksum compared.
-
-    Raises:
-        InputError: cut off since the headers were read, or damaged.
-    """
+    """The payload of a record, its checksum compared. Raises InputError: cut off since the headers were read, or
+    damaged."""
     where = _where(path, place.number, place.offset)
     file.seek(place.offset + _HEADER_BYTES)
     content = file.read(place.length + _FOOTER_BYTES)
@@ -178,11 +172,8 @@ def _cut_off(where: str, got: str) -> InputError:
 
 class TfrecordLog:
     """A TFRecord file. Opening it reads the wanted records once, compares all their checksums and keeps what is small.
-
-    Raises:
-        InputError: the file or a wanted record is damaged, or no Waymo frame. ``path``: the file. ``wanted``: record
-            numbers (first, end) to keep, or None.
-    """
+    Raises InputError: the file or a wanted record is damaged, or no Waymo frame. ``path``: the file. ``wanted``: record
+    numbers (first, end) to keep, or None."""
 
     form = "v1 TFRecord"
 
@@ -312,7 +303,8 @@ def _scan(item: dict[str, Any], where: str, projections: bool) -> LaserScan:
     poses = records.float_image(packed, 6, f"{where}: pixel poses") if packed else None
     found: list[NDArray[np.int64]] = []
     if projections and all(part.get("projections") for part in parts):
-        found = [records.int_image(part["projections"], 6, f"{where}: camera projections") for part in parts]
+        here = f"{where}: camera projections"
+        found = [records.unpack_matrix(part["projections"], records.MATRIX_INT, 6, here) for part in parts]
     return LaserScan(returns, poses, found)
 
 
@@ -543,11 +535,8 @@ def _lasers(table: ParquetTable) -> Iterator[tuple[str, records.LaserCalibration
 
 
 class ParquetTable:
-    """A Parquet file: whole columns of small values, or single large values row by row.
-
-    Raises:
-        InputError: not a Parquet file, damaged, or a column is missing. ResourceError: pyarrow is not installed.
-    """
+    """A Parquet file: whole columns of small values, or single large values row by row. Raises InputError: not a
+    Parquet file, damaged, or a column is missing. ResourceError: pyarrow is not installed."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -169,11 +169,8 @@ class WaymoLog(Protocol):
 
 
 def transform_of(values: Numbers, where: str) -> Matrix:
-    """A rigid 4x4 from its sixteen numbers, row by row.
-
-    Raises:
-        InputError: another count of numbers, or no rigid motion.
-    """
+    """A rigid 4x4 from its sixteen numbers, row by row. Raises InputError: another count of numbers, or no rigid
+    motion."""
     if len(values) != 16:
         raise InputError("transform is incomplete", where=where, expected="16 numbers", got=str(len(values)))
     return rigid_pose(np.asarray(values, np.float64).reshape(4, 4), where)
@@ -182,11 +179,8 @@ def transform_of(values: Numbers, where: str) -> Matrix:
 def camera_of(
     name: str, intrinsic: Sequence[float], extrinsic: Numbers, image: tuple[int, int, int], where: str
 ) -> CameraCalibration:
-    """A calibration from its numbers; ``image`` is width, height and the direction of the shutter.
-
-    Raises:
-        InputError: intrinsics that are not nine finite numbers, or no rigid extrinsics.
-    """
+    """A calibration from its numbers; ``image`` is width, height and the direction of the shutter. Raises InputError:
+    intrinsics that are not nine finite numbers, or no rigid extrinsics."""
     where, values = f"{where}: calibration of camera {name}", tuple(float(value) for value in intrinsic)
     if len(values) != 9 or not np.isfinite(values).all():
         raise InputError("intrinsics are incomplete", where=where, expected="9 finite numbers", got=str(values))
@@ -205,11 +199,8 @@ def laser_of(
 
 
 def box_of(box_id: str, number: int, values: Sequence[float], where: str) -> WaymoBox:
-    """A box from the number of its class and x, y, z, length, width, height, heading.
-
-    Raises:
-        InputError: numbers that are not finite, or a size that is not positive.
-    """
+    """A box from the number of its class and x, y, z, length, width, height, heading. Raises InputError: numbers that
+    are not finite, or a size that is not positive."""
     x, y, z, length, width, height, heading = (float(value) for value in values)
     if not np.isfinite(values).all() or min(length, width, height) <= 0:
         expected = "finite numbers, positive length, width and height"
@@ -220,11 +211,8 @@ def box_of(box_id: str, number: int, values: Sequence[float], where: str) -> Way
 
 def by_name(shots: Iterable[tuple[str, CameraShot]], timestamp_us: int, where: str) -> dict[str, CameraShot]:
     """The images of one frame by camera, their clock compared with the frame's: seconds and microseconds of one epoch.
-
-    Raises:
-        InputError: two images of one camera; times that are not finite, contradict each other, or are more than a
-            second off.
-    """
+    Raises InputError: two images of one camera; times that are not finite, contradict each other, or are more than a
+    second off."""
     found: dict[str, CameraShot] = {}
     for name, shot in shots:
         here = f"{where}: image of camera {name}"
@@ -256,11 +244,8 @@ def each_once(lasers: Sequence[str], where: str) -> tuple[str, ...]:
 
 
 def unpack_matrix(packed: bytes | memoryview, message: Message, channels: int, where: str) -> NDArray[Any]:
-    """A zlib-packed matrix message as an array [H, W, channels].
-
-    Raises:
-        InputError: damaged, too large, or of another shape.
-    """
+    """A zlib-packed matrix message as an array [H, W, channels]. Raises InputError: damaged, too large, or of another
+    shape."""
     unpacker = zlib.decompressobj()
     try:
         content = unpacker.decompress(packed, MAX_UNPACKED_BYTES)
@@ -286,11 +271,6 @@ def shaped(data: NDArray[Any], dims: Sequence[int] | NDArray[np.integer], channe
 def float_image(packed: bytes | memoryview, channels: int, where: str) -> NDArray[np.float32]:
     """A packed float matrix f32[H, W, channels]."""
     return unpack_matrix(packed, MATRIX_FLOAT, channels, where)
-
-
-def int_image(packed: bytes | memoryview, channels: int, where: str) -> NDArray[np.int64]:
-    """A packed integer matrix i64[H, W, channels]."""
-    return unpack_matrix(packed, MATRIX_INT, channels, where)
 
 
 # tracks -------------------------------------------------------------------------------------------
@@ -327,15 +307,10 @@ class TimedBoxes:
 
 
 def build_tracks(frames: Sequence[TimedBoxes]) -> tuple[list[Track], list[str]]:
-    """Tracks, and notes about what was done to them.
-
-    A track begins with the first image of its first frame and ends with the last image of its last one: some hundredths
-    of a second are added to either end with the object's velocity, or else images at the ends would lack the object.
-
-    Raises:
-        InputError: a box without an id, two boxes of one id in a frame, a class that changes, or length and width are
-            swapped.
-    """
+    """Tracks, and notes about what was done to them. A track begins with the first image of its first frame and ends
+    with the last image of its last one: some hundredths of a second are added to either end with the object's velocity,
+    or else images at the ends would lack the object. Raises InputError: a box without an id, two boxes of one id in a
+    frame, a class that changes, or length and width are swapped."""
     tracks = BoxTracks(frames[0].where if frames else "", {})
     labels: dict[str, str] = {}
     for frame in frames:
@@ -579,11 +554,8 @@ class _MessageReader:
 
 
 def unpack_varints(data: bytes | memoryview, where: str) -> NDArray[np.int64]:
-    """A row of varints, all at once: i64[n]; negative numbers take ten bytes each.
-
-    Raises:
-        InputError: the last number is cut off, or one is longer than ten bytes.
-    """
+    """A row of varints, all at once: i64[n]; negative numbers take ten bytes each. Raises InputError: the last number
+    is cut off, or one is longer than ten bytes."""
     codes = np.frombuffer(data, np.uint8)
     if len(codes) == 0:
         return np.zeros(0, np.int64)
