@@ -86,7 +86,7 @@ def run_step(words: Sequence[str], folder: Path, threads: int, stop: Stop, *, al
     return Ending(code, last_words(text, code) if code else "", text, time.monotonic() - began_s, processor_s)
 
 
-def _wait(process: subprocess.Popen[bytes], stop: Stop) -> tuple[int, float]:
+def _wait(process: subprocess.Popen[Any], stop: Stop) -> tuple[int, float]:
     """Exit code and processor seconds. A Ctrl-C that reaches this thread asks for a stop, too."""
     told, pause_s = False, 0.005
     while True:

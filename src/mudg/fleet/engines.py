@@ -151,6 +151,7 @@ def submit_to_slurm(job: Job, entries: Sequence[Entry], batch: BatchConfig) -> t
     submitit is not installed, there is no Slurm, or it refuses. UsageError: options that cannot be."""
     try:
         import submitit
+        from submitit.core.utils import FailedJobError
     except ImportError as error:
         what, remedy = "the package submitit is not installed", "pip install 'mudg[slurm]'"
         raise ResourceError(what, where="--engine slurm", remedy=remedy) from error
@@ -175,7 +176,7 @@ def submit_to_slurm(job: Job, entries: Sequence[Entry], batch: BatchConfig) -> t
         )
         with executor.batch():
             tasks = [executor.submit(SlurmTask(job, entries[index::count])) for index in range(count)]
-    except (RuntimeError, submitit.core.utils.FailedJobError, OSError) as error:
+    except (RuntimeError, FailedJobError, OSError) as error:
         what, remedy = "Slurm refused, or is not on this machine", "run this on a login node, or take another --engine"
         raise ResourceError(what, where="sbatch", got=str(error).strip()[:500], remedy=remedy) from error
     return str(tasks[0].job_id).partition("_")[0], folder

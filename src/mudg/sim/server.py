@@ -92,7 +92,9 @@ class Renderer:
         """The log's cameras and where they are mounted."""
         self._check_scene(request)
         made, scene = self.types.AvailableCamerasReturn(), self.session.scene
-        for name, camera in self.session.cameras.items() if scene is not None else ():
+        if scene is None:
+            return made
+        for name, camera in self.session.cameras.items():
             view = next(frame.view for frame in scene.frames if frame.view.camera.name == name)
             ego = self.session.ego_pose(view.time_s)
             if ego is None:
@@ -100,12 +102,8 @@ class Renderer:
             one = made.available_cameras.add(logical_id=name)
             one.rig_to_camera.CopyFrom(pose_of(geometry.invert(ego) @ view.world_from_cam))
             spec = one.intrinsics
-            spec.logical_id, spec.resolution_h, spec.resolution_w, spec.shutter_type = (
-                name,
-                camera.height,
-                camera.width,
-                5,
-            )
+            spec.logical_id, spec.shutter_type = name, 5
+            spec.resolution_h, spec.resolution_w = camera.height, camera.width
             lens = spec.opencv_pinhole_param
             lens.focal_length_x, lens.focal_length_y, lens.principal_point_x, lens.principal_point_y = camera.intrinsics
         return made

@@ -20,6 +20,7 @@ from mudg.base.records import ForeignRecord, Number, parse_record
 from mudg.base.run_folder import is_temporary, locked, refuse_overlap
 from mudg.base.versions import environment, version
 from mudg.diffusion.settings import SynthesizeConfig
+from mudg.fleet.status import duration_text
 from mudg.gaussians.settings import FitConfig
 from mudg.steps.engine import Output
 from mudg.steps.fit import Fit
@@ -33,6 +34,20 @@ WITHOUT_DIFFUSION = "street_gaussians"
 DIFFUSION = "mudg_r"
 WITH_DIFFUSION = "mudg_s"
 CONVERTED = "a folder written by mudg convert"
+DEMO_SECONDS = {
+    "fuse": 10,
+    "fit without diffusion": 78,
+    "synthesize": 95,
+    "fit with diffusion": 155,
+    "render without diffusion": 15,
+    "render with diffusion": 14,
+    "score": 90,
+    "viewer": 3,
+    "report": 18,
+}
+"""Seconds of the steps in one ``mudg demo`` on two CPU cores: only their shares count."""
+FORECAST_FROM = 0.1
+"""Share of the work that is done before a run says what is left: fusing alone tells nothing of the fits."""
 
 
 def fits_of(config: FitConfig, guided_share: float) -> tuple[FitConfig, FitConfig]:
@@ -327,9 +342,16 @@ class _Ledger:
         return self._steps.get(step, {}).get("state") == "complete"
 
     def _standing(self, name: str) -> str:
-        """A step, and which of how many it is."""
-        number = f", step {self.ahead.index(name) + 1} of {len(self.ahead)}" if name in self.ahead else ""
-        return name + number
+        """A step, which of how many it is, and about how long the rest takes, by what the finished steps took."""
+        if name not in self.ahead:
+            return name
+        standing = f"{name}, step {self.ahead.index(name) + 1} of {len(self.ahead)}"
+        spent, done = self.seconds(), [step for step in self.ahead if self.has_done(step)]
+        share = sum(DEMO_SECONDS[step] for step in done) / sum(DEMO_SECONDS.values())
+        if share < FORECAST_FROM:
+            return standing
+        left_s = sum(spent[step] for step in done) * (1 / share - 1)
+        return f"{standing}, about {duration_text(left_s)} left" if left_s >= 60 else standing
 
     def _show(self, state: str) -> None:
         """Write the page of the unfinished run, but not over a report."""
