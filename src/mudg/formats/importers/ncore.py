@@ -133,7 +133,10 @@ def foreign_reader(where: str) -> Iterator[None]:
 
 def check_store(path: Path) -> None:
     """Refuse a store that is cut off, that contradicts itself, or that would take more memory than its files can need.
-    Raises InputError: so it is; nothing of the size that was promised has been allocated."""
+
+    Raises:
+        InputError: so it is; nothing of the size that was promised has been allocated.
+    """
     members = _members_of_folder(path) if path.is_dir() else _members_of_tar(path)
     where = f"{path}: {METADATA}"
     if METADATA not in members:
@@ -346,9 +349,7 @@ def import_ncore(source: Path, out: Path, options: ImportOptions) -> Scene:
 def _recordings(source: Path) -> dict[str, list[Path]]:
     """Name of a recording -> its stores."""
     if source.suffix == ".json" and source.is_file():
-        with store.open_file(source) as handle:
-            listed = b'"component_stores"' in handle.read(_LOOKED_AT)
-        return {_name(source): _listed(source)} if listed else {}
+        return {_name(source): _listed(source)} if _is_list(source) else {}
     if _is_store(source):
         name = _name(source)
         return {name: [path for path in sorted(source.parent.iterdir()) if _is_store(path) and _name(path) == name]}
@@ -368,6 +369,11 @@ def _is_store(path: Path) -> bool:
     if MARK not in path.name:
         return False
     return (path.name.endswith(".zarr.itar") and path.is_file()) or (path.name.endswith(".zarr") and path.is_dir())
+
+
+def _is_list(path: Path) -> bool:
+    with store.open_file(path) as handle:
+        return b'"component_stores"' in handle.read(_LOOKED_AT)
 
 
 def _listed(path: Path) -> list[Path]:
@@ -445,29 +451,37 @@ def _opened(stores: tuple[Path, ...], where: str) -> Iterator[_OpenRecording]:
             }
             poses = _single(of["Poses"], "poses", where)
             fixed, moving = list(poses.get_static_poses()), list(poses.get_dynamic_poses())
-        every = [*((pair, pose[None]) for pair, pose in fixed), *((pair, keys[0]) for pair, keys in moving)]
-        for (source, target), found in every:  # the package would make rotations of what is none
-            keyed = np.asarray(found, np.float64)
-            if keyed.ndim != 3 or not all_rigid(keyed, common.POSE_TOLERANCE):
-                for index, pose in enumerate(keyed):
-                    common.rigid_pose(pose, f"{where}: pose of {source} in {target}: key {index}")
+        for (source, target), found in (
+            *((pair, pose[None]) for pair, pose in fixed),
+            *((pair, keys[0]) for pair, keys in moving),
+        ):
+            _refuse_bent(np.asarray(found, np.float64), f"{where}: pose of {source} in {target}")
         with foreign_reader(where):
             edge = package().transformations.PoseGraphInterpolator.Edge
             edges = [edge(source, target, pose, None) for (source, target), pose in fixed]
             edges += [edge(source, target, *keys) for (source, target), keys in moving]
-            times = [times.astype(np.int64) for _, (_, times) in moving]
-            knots = np.unique(np.concatenate([np.empty(0, np.int64), *times]))
+            knots = np.unique(
+                np.concatenate([times.astype(np.int64) for _, (_, times) in moving] or [np.empty(0, np.int64)])
+            )
             graph = package().transformations.PoseGraphInterpolator(edges)
         file = stores[0] if stores[0].is_file() else stores[0] / METADATA
         intrinsics = _single(of["Intrinsics"], "intrinsics", where)
-        masks, cuboids, sensors = (
+        masks, cuboids, cameras, lidars = (
             _perhaps(of["Masks"]),
             _perhaps(of["Cuboids"]),
-            (of["CameraSensor"], of["LidarSensor"]),
+            of["CameraSensor"],
+            of["LidarSensor"],
         )
-        yield _OpenRecording(reader, poses, intrinsics, masks, cuboids, *sensors, graph, knots, where, file)
+        yield _OpenRecording(reader, poses, intrinsics, masks, cuboids, cameras, lidars, graph, knots, where, file)
     finally:
         close(reader)
+
+
+def _refuse_bent(poses: Matrix, where: str) -> None:
+    """Refuse poses that are no rigid motions; the package would make rotations of them."""
+    if poses.ndim != 3 or not all_rigid(poses, common.POSE_TOLERANCE):
+        for index, pose in enumerate(poses):
+            common.rigid_pose(pose, f"{where}: key {index}")
 
 
 def _perhaps(found: Mapping[str, Any]) -> Any:
@@ -501,8 +515,7 @@ def _drive(recording: _OpenRecording, options: ImportOptions) -> DriveLog:
     ego = _ego(recording, zero_us, np.concatenate([found.reshape(-1) for found in (*spans.values(), *turns.values())]))
     images, sweeps = _outside_gaps(images, ego, options), _outside_gaps(sweeps, ego, options)
     tracks, track_notes = _tracks(recording, zero_us)
-    noted = recording.reader.generic_meta_data.get(ABOUT)  # by this program, when it wrote the recording
-    about = {key: text for key, text in noted.items() if isinstance(text, str)} if isinstance(noted, dict) else {}
+    about = _about(recording)
     notes += [*([] if sweeps else ["no LiDAR sweeps in the recording"]), *track_notes]
     source = Source(about.get("dataset", "ncore"), about.get("licence", UNKNOWN_LICENCE), None, tuple(notes))
     cameras, name = {name: one.recorded for name, one in optics.items()}, str(recording.reader.sequence_id)
@@ -520,6 +533,12 @@ def _scene_names(sensors: Iterable[str], taken: Collection[str] = ()) -> dict[st
             chosen = f"{plain}_{count}"
         names[sensor] = chosen
     return names
+
+
+def _about(recording: _OpenRecording) -> dict[str, str]:
+    """What this program noted when it wrote the recording."""
+    noted = recording.reader.generic_meta_data.get(ABOUT)
+    return {key: value for key, value in noted.items() if isinstance(value, str)} if isinstance(noted, dict) else {}
 
 
 def _spans(reader: Any, where: str) -> Times:
