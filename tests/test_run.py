@@ -183,21 +183,21 @@ def test_what_stopped_a_run_is_recorded_and_the_repeat_continues(
 
 
 @pytest.mark.parametrize(
-    ("fit_s", "words"), [(None, ""), (78.0, ", about 6.5 min left"), (7800.0, ", about 9.6 h left"), (0.5, "")]
+    ("fit_s", "words"), [(None, ""), (78.0, ", about 6.3 min left"), (7800.0, ", about 9.2 h left"), (0.5, "")]
 )
 def test_a_run_says_how_long_the_rest_takes(tmp_path: Path, fit_s: float | None, words: str) -> None:
     """From the first fit on, by what the steps took here; never of the few seconds of fusing."""
     spent = {"ingest": 14.0, "fuse": 10.0} | ({} if fit_s is None else {"fit without diffusion": fit_s})
     before = {"steps": {name: {"state": "complete", "seconds": seconds} for name, seconds in spent.items()}}
     ledger = pipeline._Ledger(tmp_path, {}, before)
-    ledger.ahead = list(pipeline.DEMO_SECONDS)
+    ledger.ahead = list(pipeline.PERCENT_OF_A_RUN)
     assert ledger._standing("synthesize") == f"synthesize, step 3 of 9{words}"
     assert ledger._standing("ingest") == "ingest"
 
 
 def test_the_shares_name_every_step_of_a_run(tmp_path: Path) -> None:
     steps = pipeline.steps_of(RunConfig(), tmp_path / "scene", tmp_path, overwrite=False)
-    assert list(pipeline.DEMO_SECONDS) == [*steps, "viewer", "report"]
+    assert list(pipeline.PERCENT_OF_A_RUN) == [*steps, "viewer", "report"]
 
 
 def test_the_page_of_a_run_shows_its_steps_while_it_goes_on(tmp_path: Path, verbs: dict[str, Any]) -> None:
