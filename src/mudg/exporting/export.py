@@ -2,7 +2,7 @@
 
 Gaussians:  OUT and OUT.json (format, moment, axes, what the file does not hold, sha256)
 cameras:    OUT/transforms.json ... (nerfstudio), OUT/sparse/0 (COLMAP), OUT/images
-messages:   OUT.mcap (Foxglove), OUT.rrd (rerun), OUT/metadata.yaml and OUT/log_0.mcap (ROS 2),
+messages:   OUT.mcap (ROS 2, Foxglove), OUT.rrd (rerun), OUT/metadata.yaml and OUT/log_0.mcap (a bag of ROS 2),
             OUT/NAME.ncore4.zarr.itar (NCore)
 """
 
@@ -50,7 +50,7 @@ from mudg.gaussians.storage import load_model, model_of_scene, save_model
 from mudg.scene.clouds import read_fused
 from mudg.scene.read import open_files, read_points, read_scene
 
-# a log over time: files of Foxglove and rerun, bags of ROS 2, recordings of NCore -----------------
+# a log over time: messages and bags of ROS 2, files of rerun, recordings of NCore ----------------
 
 SUFFIXES: Final = {"mcap": ".mcap", "rerun": ".rrd", "ros2": "", "ncore": ""}
 """Formats, and the suffix of their file; none: a folder."""
@@ -81,7 +81,7 @@ def write_log(name: str, records: messages.LogRecords | None, splats: SplatScene
     if name == "rerun":
         write_rerun(out, records, splats, records.scene.id if records is not None else "scene")
     elif records is not None:
-        messages.write_mcap(out, messages.FoxgloveMessages(records))
+        messages.write_mcap(out, messages.Ros2Messages(records))
     contents = [] if records is None else [_counts(records)]
     if splats is not None:
         contents.append(f"{_count(splats)} Gaussians")
