@@ -67,8 +67,7 @@ def scene_of(content: bytes) -> object:
 
 
 def matrices_of(content: bytes) -> object:
-    """A range image, and a list of numbers."""
-    records.unpack_varints(content, "input")
+    """A range image."""
     return records.float_image(content, 4, "input")
 
 

@@ -33,7 +33,7 @@ from scipy.spatial.transform import Rotation
 
 from mudg.base import log
 from mudg.base.errors import InputError, UsageError
-from mudg.base.geometry import CAM_FROM_EGO_AXES, invert, transform_points, yaw_matrix, yaw_of
+from mudg.base.geometry import CAM_FROM_EGO_AXES, transform_points, yaw_matrix, yaw_of
 from mudg.base.palette import ID, UNLABELLED
 from mudg.base.types import Camera, EgoPath, Scene, Shutter, Source, SweepPoints
 from mudg.formats.importers import common
@@ -45,9 +45,6 @@ from mudg.formats.importers.waymo.logs import REQUIRED, ParquetLog, TfrecordLog
 from mudg.formats.importers.waymo.records import CAMERAS, TOP, FrameRecord, LaserCalibration, Matrix, WaymoLog
 
 LICENCE: Final = "Waymo Dataset License Agreement for Non-Commercial Use (non-commercial; attribution)"
-DOUBTFUL_PROJECTION_PX: Final = 30.0
-"""Our projections of points differ from the recorded ones by a few pixels; a median above this gives a warning."""
-
 _SAME_POSE: Final = 1e-6
 _CLOCK_FRAMES: Final = 3
 _MOMENT_FRAMES: Final = 4
@@ -80,8 +77,6 @@ def import_waymo(source: Path, out: Path, options: ImportOptions) -> Scene:
     notes += [note] if note else []
     found, track_notes = records.build_tracks([plan.timed_boxes(frame, moment) for frame in frames])
     notes += track_notes
-    check = _check_projections(waymo, frames, cameras, plan)
-    notes += [check] if check else []
     numbers = {frame.number: index for index, frame in enumerate(frames)}
 
     items = ((frame, waymo.read(frame, cameras)) for frame in frames)
@@ -349,29 +344,6 @@ def _points(plan: _Plan, frame: FrameRecord, name: str, scan: records.LaserScan)
     return points_of_scan(scan, plan.waymo.lasers[name], frame.global_from_vehicle, f"{frame.where}: LiDAR {name}")
 
 
-def _check_projections(waymo: WaymoLog, frames: Sequence[FrameRecord], cameras: Sequence[str], plan: _Plan) -> str:
-    """Compare our projections of the first frame's points with those recorded; a note, empty if there are none."""
-    frame = frames[0]
-    if not frame.lasers:
-        return ""
-    shots = {name: (waymo.cameras[name], middle_of_exposure(frame.shots[name])[0]) for name in cameras}
-    errors: dict[str, list[NDArray[np.float64]]] = {}
-    for name, scan in waymo.read(frame, (), projections=True).scans.items():
-        found = projection_errors(
-            _points(plan, frame, name, scan), scan, waymo.lasers[name], frame.global_from_vehicle, shots
-        )
-        for camera, off in found.items():
-            errors.setdefault(camera, []).append(off)
-    medians = {camera: float(np.median(np.concatenate(off))) for camera, off in errors.items()}
-    if not medians:
-        return ""
-    texts = ", ".join(f"{camera} {median:.1f} px" for camera, median in medians.items())
-    if max(medians.values()) > DOUBTFUL_PROJECTION_PX:
-        doubt = f"points do not fall where the log says they do ({texts}, median)"
-        log.warn(f"waymo: {doubt}; are calibrations and poses of this log?")
-    return f"points fall where the log says they do, up to (median, first frame): {texts}"
-
-
 # --- sensors --------------------------------------------------------------------------------------
 #
 # A range image has a row per beam (the highest first) and a column per step of the turn. Column 0 looks backwards, the
@@ -417,7 +389,7 @@ carried object, other ground, other things."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanPoints:
-    """Points of one turn in the LiDAR's frame at the frame's pose, and where each came from in the range images."""
+    """Points of one turn in the LiDAR's frame at the frame's pose."""
 
     xyz: NDArray[np.float64]
     """f64[N, 3] metres."""
@@ -425,9 +397,6 @@ class ScanPoints:
     """f32[N] as recorded, from 0 on without a limit."""
     turn: NDArray[np.float64]
     """f64[N], part of the turn (0..1) after which the point was measured."""
-    pixel: NDArray[np.int64]
-    """i64[N], index into the flattened range image; ``image`` i64[N] says which return."""
-    image: NDArray[np.int64]
     without_pose: int
     """Points that were left out because no pose was recorded for their pixel."""
 
@@ -440,9 +409,8 @@ def points_of_scan(
     other LiDARs are recorded as if all was measured at the frame's pose. Raises InputError: shapes that contradict each
     other, or values that are not finite."""
     shape = scan.returns[0].shape[:2]
-    if any(image.shape[:2] != shape for image in (*scan.returns, *scan.projections)) or (
-        scan.poses is not None and scan.poses.shape[:2] != shape
-    ):
+    poses_of = [] if scan.poses is None else [scan.poses]
+    if any(image.shape[:2] != shape for image in (*scan.returns, *poses_of)):
         raise InputError("range images of one scan differ in size", where=where, expected=str(list(shape)))
     rows, columns = shape
     inclination = laser.beam_inclinations(rows, where)
@@ -467,11 +435,11 @@ def points_of_scan(
             poses = scan.poses.reshape(-1, 6)[pixel]
             known = np.isfinite(poses).all(1) & (poses != 0).any(1)
             without_pose += int((~known).sum())
-            pixel, values, column, xyz, poses = pixel[known], values[known], column[known], xyz[known], poses[known]
-            xyz = _carried(xyz, poses.astype(np.float64), laser.vehicle_from_lidar, global_from_vehicle)
-        parts.append((xyz, values[:, 1], turn[column], pixel, np.full(len(pixel), index)))
-    xyz, intensity, turns, pixels, images = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return ScanPoints(xyz, intensity, turns, pixels, images, without_pose)
+            values, column, poses = values[known], column[known], poses[known].astype(np.float64)
+            xyz = _carried(xyz[known], poses, laser.vehicle_from_lidar, global_from_vehicle)
+        parts.append((xyz, values[:, 1], turn[column]))
+    xyz, intensity, turns = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return ScanPoints(xyz, intensity, turns, without_pose)
 
 
 def heading_of(laser: LaserCalibration) -> float:
@@ -648,44 +616,3 @@ def panoptic_labels(ids: NDArray[np.int32], divisor: int) -> dict[str, NDArray[A
         "sky": classes == SKY_CLASS,
         "ego": classes == EGO_CLASS,
     }
-
-
-def projection_errors(
-    points: ScanPoints,
-    scan: records.LaserScan,
-    laser: LaserCalibration,
-    global_from_vehicle: Matrix,
-    cameras: Mapping[str, tuple[records.CameraCalibration, Matrix]],
-) -> dict[str, NDArray[np.float64]]:
-    """How far our projections of a scan lie from those recorded with it, in pixels of the recorded images.
-
-    The recorded ones follow the rolling shutter, ours hold for the middle column, so while the vehicle moves some
-    pixels are normal; wrong calibrations, poses or conversions show as hundreds.
-
-    Args:
-        points, scan, laser: a scan with projections, and its points.
-        global_from_vehicle: pose that the points are given for.
-        cameras: name -> calibration and the vehicle's pose in the global frame at the middle of the exposure.
-
-    Returns:
-        Camera name -> distances f64[n], for cameras with points.
-    """
-    xyz_vehicle = transform_points(laser.vehicle_from_lidar, points.xyz)
-    errors: dict[str, NDArray[np.float64]] = {}
-    for index, projections in enumerate(scan.projections):
-        chosen = points.image == index
-        recorded = projections.reshape(-1, 6)[points.pixel[chosen]]
-        for half in (recorded[:, :3], recorded[:, 3:]):
-            for number, name in records.CAMERAS.items():
-                if name not in cameras or not (here := half[:, 0] == number).any():
-                    continue
-                calibration, pose = cameras[name]
-                cam_from_vehicle = invert(pose @ vehicle_from_cam(calibration)) @ global_from_vehicle
-                xyz_cam = transform_points(cam_from_vehicle, xyz_vehicle[chosen][here])
-                z = np.where(xyz_cam[:, 2:] > 0.1, xyz_cam[:, 2:], np.nan)
-                fx, fy, cx, cy, *coefficients = calibration.intrinsic
-                uv = brown_conrady(*coefficients)(xyz_cam[:, :2] / z) * [fx, fy] + [cx, cy]
-                uv = np.where(np.isfinite(uv), uv, np.inf)  # behind the camera
-                off = np.linalg.norm(uv - (half[here, 1:] + 0.5), axis=1)
-                errors[name] = np.concatenate([errors.get(name, np.zeros(0)), off])
-    return errors

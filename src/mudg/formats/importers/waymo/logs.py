@@ -220,7 +220,7 @@ class TfrecordLog:
             if _camera(name, item, where) != self.cameras.get(name):
                 raise InputError("a camera's calibration changes within the log", where=f"{where}: camera {name}")
 
-    def read(self, frame: FrameRecord, cameras: Sequence[str], *, projections: bool = False) -> records.FrameContent:
+    def read(self, frame: FrameRecord, cameras: Sequence[str]) -> records.FrameContent:
         """The bulky parts of a frame; see ``WaymoLog``."""
         message = self._message(frame)
         images: dict[str, bytes] = {}
@@ -232,7 +232,7 @@ class TfrecordLog:
                 if label.get("png"):
                     panoptic[name] = records.Panoptic(label.get("divisor", 0), bytes(label["png"]))
         scans = {
-            name: _scan(item, f"{frame.where}: LiDAR {name}", projections)
+            name: _scan(item, f"{frame.where}: LiDAR {name}")
             for name, item in _named(message["lasers"], LASERS)
             if _has_ranges(item)
         }
@@ -296,16 +296,11 @@ def _frame_record(message: dict[str, Any], number: int, where: str) -> FrameReco
     return FrameRecord(number, timestamp_us, pose, shots, lasers, tuple(boxes), where)
 
 
-def _scan(item: dict[str, Any], where: str, projections: bool) -> LaserScan:
+def _scan(item: dict[str, Any], where: str) -> LaserScan:
     parts = [item[key] for key in ("return1", "return2") if item.get(key, {}).get("ranges")]
     returns = [records.float_image(part["ranges"], 4, where) for part in parts]
     packed = item["return1"].get("poses")
-    poses = records.float_image(packed, 6, f"{where}: pixel poses") if packed else None
-    found: list[NDArray[np.int64]] = []
-    if projections and all(part.get("projections") for part in parts):
-        here = f"{where}: camera projections"
-        found = [records.unpack_matrix(part["projections"], records.MATRIX_INT, 6, here) for part in parts]
-    return LaserScan(returns, poses, found)
+    return LaserScan(returns, records.float_image(packed, 6, f"{where}: pixel poses") if packed else None)
 
 
 # --- format 2: a folder per component (``camera_image``, ``lidar``, ...) with one Parquet file per log ----------------
@@ -356,7 +351,6 @@ OFFICIAL: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
         difficulty_level="detection tracking",
     ),
     "lidar_calibration": _component("LiDARCalibration", "extrinsic.transform", beam_inclination="min max values"),
-    "lidar_camera_projection": _component("LiDARCameraProjection", **_TWO_RETURNS),
     "lidar_pose": _component("LiDARPose", range_image_return1="values shape"),
     "stats": _component(
         "Stats", "time_of_day location weather", lidar_object_counts="types counts", camera_object_counts="types counts"
@@ -385,7 +379,7 @@ class ParquetLog:
         self.cameras: Mapping[str, records.CameraCalibration] = dict(_cameras(self._need("camera_calibration")))
         self._images, self._vehicle = self._need("camera_image"), self._need("vehicle_pose")
         self._lidar, self._poses = self._table("lidar"), self._table("lidar_pose")
-        self._labels, self._projections = self._table("camera_segmentation"), self._table("lidar_camera_projection")
+        self._labels = self._table("camera_segmentation")
         calibration = self._table("lidar_calibration") if self._lidar is None else self._need("lidar_calibration")
         self.lasers: Mapping[str, records.LaserCalibration] = {} if calibration is None else dict(_lasers(calibration))
         if self._lidar is not None and self._poses is None:
@@ -395,7 +389,7 @@ class ParquetLog:
         self.frames: Sequence[FrameRecord] = self._frames(wanted)
         self.conditions = self._conditions()
 
-    def read(self, frame: FrameRecord, cameras: Sequence[str], *, projections: bool = False) -> records.FrameContent:
+    def read(self, frame: FrameRecord, cameras: Sequence[str]) -> records.FrameContent:
         """The bulky parts of a frame; see ``WaymoLog``. Reading frames in the order of time is fastest."""
         time = frame.timestamp_us
         images = {
@@ -413,7 +407,7 @@ class ParquetLog:
         if self._lidar is not None:
             for name, row in self._lidar.rows(time, _LASER, LASERS):
                 if name in frame.lasers:
-                    scans[name] = self._scan(self._lidar, frame, name, row, projections)
+                    scans[name] = self._scan(self._lidar, frame, name, row)
         return records.FrameContent(images, panoptic, scans)
 
     def pixel_poses(self, frame: FrameRecord) -> NDArray[np.float32] | None:
@@ -424,21 +418,13 @@ class ParquetLog:
                     return self._poses.image(row, "[LiDARPoseComponent].range_image_return1", 6)
         return None
 
-    def _scan(self, lidar: ParquetTable, frame: FrameRecord, name: str, row: int, projections: bool) -> LaserScan:
+    def _scan(self, lidar: ParquetTable, frame: FrameRecord, name: str, row: int) -> LaserScan:
         found = [lidar.image(row, f"[LiDARComponent].range_image_return{n}", 4) for n in (1, 2)]
-        returns = [image for image in found if image is not None]
         poses = self.pixel_poses(frame) if name == records.TOP else None
         if name == records.TOP and poses is None:
             what = "frame has no pixel poses"
             raise InputError(what, where=f"{frame.where}: lidar_pose", expected="a row for the top LiDAR")
-        places: list[NDArray[np.int64]] = []
-        if projections and self._projections is not None:
-            for other, place in self._projections.rows(frame.timestamp_us, _LASER, LASERS):
-                if other == name:
-                    prefix = "[LiDARCameraProjectionComponent].range_image_return"
-                    images = (self._projections.image(place, f"{prefix}{n + 1}", 6) for n in range(len(returns)))
-                    places = [image.astype(np.int64) for image in images if image is not None]
-        return LaserScan(returns, poses, places if len(places) == len(returns) else ())
+        return LaserScan([image for image in found if image is not None], poses)
 
     # --- facts ------------------------------------------------------------------------------------
 

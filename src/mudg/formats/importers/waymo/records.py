@@ -125,8 +125,6 @@ class LaserScan:
     """Range images f32[H, W, 4]: range in metres (not above 0: none), intensity, elongation, no-label flag."""
     poses: NDArray[np.float32] | None = None
     """Of the top LiDAR's pixels, f32[H, W, 6]: roll, pitch, yaw, x, y, z of global from vehicle at their time."""
-    projections: Sequence[NDArray[np.int64]] = ()
-    """A return's i64[H, W, 6]: camera number, x, y of the first two images a point falls into; or empty."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,7 +154,7 @@ class WaymoLog(Protocol):
     frames: Sequence[FrameRecord]
     conditions: str
 
-    def read(self, frame: FrameRecord, cameras: Sequence[str], *, projections: bool = False) -> FrameContent:
+    def read(self, frame: FrameRecord, cameras: Sequence[str]) -> FrameContent:
         """The bulky parts of a frame, for the chosen cameras."""
         ...
 
@@ -243,8 +241,8 @@ def each_once(lasers: Sequence[str], where: str) -> tuple[str, ...]:
 # --- range images ---------------------------------------------------------------------------------
 
 
-def unpack_matrix(packed: bytes | memoryview, message: Message, channels: int, where: str) -> NDArray[Any]:
-    """A zlib-packed matrix message as an array [H, W, channels]. Raises InputError: damaged, too large, or of another
+def float_image(packed: bytes | memoryview, channels: int, where: str) -> NDArray[np.float32]:
+    """A zlib-packed matrix of floats as f32[H, W, channels]. Raises InputError: damaged, too large, or of another
     shape."""
     unpacker = zlib.decompressobj()
     try:
@@ -255,7 +253,7 @@ def unpack_matrix(packed: bytes | memoryview, message: Message, channels: int, w
         cut_off = not unpacker.unconsumed_tail
         what = "range image is cut off" if cut_off else "range image unpacks to more than any has"
         raise InputError(what, where=where, expected=f"at most {MAX_UNPACKED_BYTES} bytes", got=f"{len(content)} bytes")
-    values = parse_message(content, message, where)
+    values = parse_message(content, MATRIX_FLOAT, where)
     return shaped(values["data"], values.get("shape", {}).get("dims", ()), channels, where)
 
 
@@ -266,11 +264,6 @@ def shaped(data: NDArray[Any], dims: Sequence[int] | NDArray[np.integer], channe
         what, expected = "range image has the wrong shape", f"[rows, columns, {channels}], as many values as that"
         raise InputError(what, where=where, expected=expected, got=f"{list(shape)} with {len(data)} values")
     return data.reshape(shape)
-
-
-def float_image(packed: bytes | memoryview, channels: int, where: str) -> NDArray[np.float32]:
-    """A packed float matrix f32[H, W, channels]."""
-    return unpack_matrix(packed, MATRIX_FLOAT, channels, where)
 
 
 # tracks -------------------------------------------------------------------------------------------
@@ -519,6 +512,11 @@ class _MessageReader:
                 raise self.broken(start, "a number of more than ten bytes")
         raise self.broken(start, "it ends inside a number")
 
+    def varints(self) -> Iterator[int]:
+        """Numbers to the end."""
+        while self._place < len(self._view):
+            yield self._varint()
+
     def _value(self, wire: int) -> Any:
         if wire == _VARINT:
             return self._varint()
@@ -541,7 +539,8 @@ class _MessageReader:
                 raise self.broken(start, f"field {field.name} holds {len(raw)} bytes, no multiple of {size}")
             return np.frombuffer(raw, _DTYPE[field.kind])
         if field.kind == "ints" and packed:
-            return unpack_varints(raw, f"{self._where}: {self._message.name}.{field.name}")
+            numbers = _MessageReader(raw, self._message, self._where)
+            return np.array(list(numbers.varints()), np.uint64).view(np.int64)
         if field.kind in ("int", "ints"):
             value = raw - (1 << 64) if raw >= 1 << 63 else raw
             return np.array([value]) if field.kind == "ints" else value
@@ -551,25 +550,6 @@ class _MessageReader:
             except UnicodeDecodeError as error:
                 raise self.broken(start, f"field {field.name} is no text") from error
         return raw if field.kind == "bytes" else struct.unpack("<d" if field.kind == "double" else "<f", raw)[0]
-
-
-def unpack_varints(data: bytes | memoryview, where: str) -> NDArray[np.int64]:
-    """A row of varints, all at once: i64[n]; negative numbers take ten bytes each. Raises InputError: the last number
-    is cut off, or one is longer than ten bytes."""
-    codes = np.frombuffer(data, np.uint8)
-    if len(codes) == 0:
-        return np.zeros(0, np.int64)
-    last = np.flatnonzero(codes < 0x80)
-    if len(last) == 0 or last[-1] != len(codes) - 1:
-        raise InputError("packed numbers are cut off", where=where)
-    first = np.r_[0, last[:-1] + 1]
-    lengths = last - first + 1
-    if lengths.max() > 10:
-        raise InputError("a packed number has more than ten bytes", where=where)
-    if lengths.max() == 1:
-        return codes.astype(np.int64)
-    shift = (np.arange(len(codes)) - np.repeat(first, lengths)).astype(np.uint64) * np.uint64(7)
-    return np.add.reduceat((codes & np.uint8(0x7F)).astype(np.uint64) << shift, first).view(np.int64)
 
 
 # --- the messages of the data set -----------------------------------------------------------------
@@ -609,7 +589,7 @@ _CAMERA_IMAGE = _message(
     velocity=_message("Velocity", "v_x 1 float, v_y 2 float, v_z 3 float, w_x 4 double, w_y 5 double, w_z 6 double"),
     panoptic=_message("CameraSegmentationLabel", "divisor 1 int, png 2 bytes", "3 4 5"),
 )
-_RANGE_IMAGE = _message("RangeImage", "ranges 2 bytes, projections 3 bytes, poses 4 bytes", "1 5 6")
+_RANGE_IMAGE = _message("RangeImage", "ranges 2 bytes, poses 4 bytes", "1 3 5 6")
 _BOX = _message(
     "Box", "x 1 double, y 2 double, z 3 double, width 4 double, length 5 double, height 6 double, heading 7 double"
 )
@@ -624,6 +604,6 @@ FRAME: Final = _message(
     ),
     labels=_message("Label", "box 1 message, type 3 int, id 4 text", "2 5 6 7 8 9 10 11 12 13", box=_BOX),
 )
-_SHAPE = _message("MatrixShape", "dims 1 ints")
-MATRIX_FLOAT: Final = _message("MatrixFloat", "data 1 floats, shape 2 message", shape=_SHAPE)
-MATRIX_INT: Final = _message("MatrixInt32", "data 1 ints, shape 2 message", shape=_SHAPE)
+MATRIX_FLOAT: Final = _message(
+    "MatrixFloat", "data 1 floats, shape 2 message", shape=_message("MatrixShape", "dims 1 ints")
+)
