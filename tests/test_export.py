@@ -207,7 +207,7 @@ def test_nodes_edits_and_motion(fit: Path, tmp_path: Path) -> None:
         ({"animated": True}, "ply", "a.ply", "cannot hold motion"),
         ({"animated": True, "time_s": 1.0}, "glb", "a.glb", "one moment or the motion"),
         ({"time_s": 1.0}, "alpasim", "a.usdz", "holds all moments"),
-        ({"spz_version": 4}, "ply", "a.ply", "does not have this setting"),
+        ({"time_s": 1.0}, "colmap", "folder", "does not have this setting"),
         ({"nodes": ("car-7",)}, "ply", "a.ply", "no node 'car-7'"),
         ({"nodes": ("car-1",), "time_s": 99.0}, "sog", "a.sog", "nothing to export"),
         ({}, "colmap", "folder", "cameras belong to a scene"),

@@ -344,10 +344,9 @@ def _refuse_settings(config: ExportConfig, name: str) -> None:
         what = "a file of this format holds all moments"
         raise UsageError(what, where="--time-s", got=name, remedy="leave it out, or export ply")
     usual = ExportConfig()
-    set_here = [key for key in ("time_s", "nodes", "spz_version") if getattr(config, key) != getattr(usual, key)]
-    refused = set_here if name not in FORMATS else [key for key in set_here if key == "spz_version" and name != "spz"]
-    if refused:
-        flag = refused[0].replace("_", "-")
+    set_here = [key for key in ("time_s", "nodes") if getattr(config, key) != getattr(usual, key)]
+    if set_here and name not in FORMATS:
+        flag = set_here[0].replace("_", "-")
         raise UsageError("the format does not have this setting", where=f"--{flag}", got=name, remedy="leave it out")
 
 
@@ -379,14 +378,8 @@ def requested(config: ExportConfig, name: str, exported: Exported) -> WriteReque
         scene = replace(scene, sky=None)
     facts = {**scene.facts, "generator": f"mudg {version()}"}
     scene = replace(scene, file_from_world=file_from_world(name, config.axes), facts=facts)
-    ground, road = (_ground(exported), _road(exported)) if name == "alpasim" else (None, None)
-    return WriteRequest(scene, None if whole else moment, config.spz_version, exported.log, ground, road)
-
-
-def _road(exported: Exported) -> NDArray[np.floating] | None:
-    """Fused points of the road f[N, 3]; None where no point has a class."""
-    static = None if exported.parts.fused is None else read_fused(exported.parts.fused).static
-    return None if static is None or static.semantics is None else static.xyz[static.semantics == ID["road"]]
+    ground = _ground(exported) if name == "alpasim" else None
+    return WriteRequest(scene, None if whole else moment, exported.log, ground)
 
 
 def _ground(exported: Exported) -> HeightMap | None:

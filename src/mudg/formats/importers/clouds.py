@@ -278,19 +278,17 @@ def read_ply(content: bytes, where: str) -> dict[str, NDArray]:
 # --- BIN and NPZ ----------------------------------------------------------------------------------
 
 
-def read_float_rows(
-    path: Path, columns: int, what: str = "scan", axes: int = 3
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Rows of little-endian float32 without a header, as raw scans are kept: f32[N, columns], and which of them are
-    returns bool[N]. ``what``: what one file holds, for messages. ``axes``: the first so many columns are coordinates in
-    the sensor's frame. Raises InputError: missing, cut off, or values of a return that are not finite."""
+def read_float_rows(path: Path, columns: int, what: str = "scan") -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Rows of little-endian float32 without a header, as raw scans are kept: f32[N, columns], of which the first three
+    are coordinates in the sensor's frame, and which of them are returns bool[N]. ``what``: what one file holds, for
+    messages. Raises InputError: missing, cut off, or values of a return that are not finite."""
     content = store.read_bytes(path)
     if len(content) % (4 * columns):
         what, got = f"{what} is cut off", f"{len(content)} bytes"
         expected = f"a multiple of {4 * columns} bytes ({columns} float32 a row)"
         raise InputError(what, where=str(path), got=got, expected=expected, remedy="copy the file again")
     rows = np.frombuffer(content, "<f4").reshape(-1, columns).astype(np.float32)
-    returns = is_return(rows[:, :axes])
+    returns = is_return(rows[:, :3])
     bad = ~np.isfinite(rows[returns]).all(1)
     if bad.any():
         what, where = f"{what} holds values that are not finite", str(path)

@@ -49,22 +49,14 @@ def fractional_bits(means: NDArray[np.floating]) -> int:
     return bits
 
 
-def to_bytes(cloud: SplatCloud, version: int = 3, antialias: bool = False) -> bytes:
-    """A cloud as an SPZ file of version 3, or 4; ``antialias``: it was fitted with an antialiased rasteriser. Raises
-    InputError: a place too far from the origin. ResourceError: version 4 without the package zstandard."""
+def to_bytes(cloud: SplatCloud, antialias: bool = False) -> bytes:
+    """A cloud as an SPZ file of version 3; ``antialias``: it was fitted with an antialiased rasteriser. Raises
+    InputError: a place too far from the origin."""
     bits = fractional_bits(cloud.means)
     if float(np.abs(cloud.means).max(initial=0)) * (1 << bits) > (1 << 23) - 1:
         raise InputError("a Gaussian lies too far from the origin for SPZ", expected="at most 8388 km")
-    planes = _planes(cloud, bits)
-    if version == 3:
-        head = struct.pack(HEADER, MAGIC, 3, len(cloud), cloud.degree, bits, _ANTIALIAS * antialias, 0)
-        return binary.gzip_bytes(head + b"".join(planes))
-    packer = _zstandard("written").ZstdCompressor(level=12, write_content_size=True)
-    planes = [plane for plane in planes if plane]
-    streams = [packer.compress(plane) for plane in planes]
-    head = struct.pack("<IIIBBBBI12x", MAGIC, 4, len(cloud), cloud.degree, bits, int(antialias), len(streams), 32)
-    toc = b"".join(struct.pack("<QQ", len(stream), len(plane)) for stream, plane in zip(streams, planes))
-    return head + toc + b"".join(streams)
+    head = struct.pack(HEADER, MAGIC, 3, len(cloud), cloud.degree, bits, _ANTIALIAS * antialias, 0)
+    return binary.gzip_bytes(head + b"".join(_planes(cloud, bits)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +120,7 @@ def _from_streams(content: bytes, where: str) -> SplatFile:
         raise InputError(what, where=where, expected=f"{len(sizes)} streams", got=f"{streams} streams, table at {toc}")
     table = binary.numbers(content, toc, "<u8", 2 * streams, "the table of streams", where).reshape(-1, 2)
     extensions = _extensions(content[32:toc], where) if head.flags & _EXTENSIONS else {}
-    package, place, planes = _zstandard("read"), toc + 16 * streams, list[bytes]()
+    package, place, planes = _zstandard(), toc + 16 * streams, list[bytes]()
     for name, size, (packed, raw) in zip(_PLANES, sizes, table.tolist()):
         if raw != size:
             what = f"the {name} have another size than the header says"
@@ -183,13 +175,13 @@ def _file(planes: list[bytes], head: _Header, extensions: dict[int, bytes], wher
     return SplatFile(cloud, axes, f"extension {_AXES:#010x}", step, tuple(notes), tuple(warnings))
 
 
-def _zstandard(done: str) -> Any:
+def _zstandard() -> Any:
     """The optional package."""
     try:
         import zstandard
     except ImportError as error:
-        what = f"SPZ of version 4 is {done} with the package zstandard, which is not installed"
-        raise ResourceError(what, remedy="pip install zstandard, or use version 3 (--spz-version 3)") from error
+        what = "SPZ of version 4 is read with the package zstandard, which is not installed"
+        raise ResourceError(what, remedy="pip install zstandard, or write the file as version 3") from error
     return zstandard
 
 
