@@ -18,7 +18,7 @@ import toy_splats
 from refusals import refused
 
 from mudg.base.errors import InputError, MudgError
-from mudg.formats.splats import binary, formats, ply, sog, spz
+from mudg.formats.splats import binary, formats, gltf, ply, sog, spz
 from mudg.formats.splats.cloud import SplatCloud
 
 READ = [name for name, one in formats.FORMATS.items() if one.read]
@@ -61,7 +61,7 @@ def test_every_length_short_of_the_whole_is_refused(name: str, nth: int) -> None
 @pytest.mark.parametrize("name", READ)
 def test_every_flipped_byte_is_read_or_refused_in_words(name: str, nth: int) -> None:
     content = content_of(name, 0)
-    places = range(0, min(len(content), 700), 3 if name == "sog" else 1)[::nth]
+    places = range(0, min(len(content), 700), 3 if name in ("sog", "glb") else 1)[::nth]
     refused = 0
     for place in places:
         for flip in (0x01, 0x80, 0xFF):
@@ -138,6 +138,14 @@ def altered_sog(change: Callable[[dict[str, Any]], None], files: dict[str, bytes
     return binary.stored_zip({**kept, "meta.json": json.dumps(meta).encode(), **(files or {})})
 
 
+def altered_glb(change: Callable[[dict[str, Any]], Any]) -> bytes:
+    content = content_of("glb")
+    size = int.from_bytes(content[12:16], "little")
+    document = json.loads(content[20 : 20 + size])
+    change(document)
+    return gltf.glb(document, content[28 + size :])
+
+
 class within:
     """Fails if the block takes more memory than this (Python's and numpy's)."""
 
@@ -177,27 +185,62 @@ def test_more_gaussians_than_a_file_can_hold_are_refused_before_anything_is_infl
         read(binary.gzip_bytes(raw) if name == "spz" else altered_sog(lambda meta: meta.update(count=20_000_000)), name)
 
 
-# -- headers of SOG --------------------------------------------------------------------------------
+# -- headers of SOG and glTF -----------------------------------------------------------------------
+
+
+def primitive(document: dict[str, Any]) -> dict[str, Any]:
+    return document["meshes"][0]["primitives"][0]
+
+
+def without(document: dict[str, Any], name: str) -> None:
+    del primitive(document)["attributes"][f"KHR_gaussian_splatting:{name}"]
+
+
+def rotation(document: dict[str, Any], **values: Any) -> None:
+    document["accessors"][primitive(document)["attributes"]["KHR_gaussian_splatting:ROTATION"]].update(values)
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("name", "change", "said"),
     [
-        (lambda meta: meta.update(count=70_000), "impossible size"),
-        (lambda meta: meta.update(count=0), "count"),
-        (lambda meta: meta.update(version=1), "version"),
-        (lambda meta: meta["means"].update(mins=[0, 0]), "mins"),
-        (lambda meta: meta["means"].update(maxs=[0, 0, 1e9]), "bad.file"),
-        (lambda meta: meta["scales"].update(codebook=[0.0] * 255), "codebook"),
-        (lambda meta: meta["scales"].update(codebook=[1e9] * 256), "too far"),
-        (lambda meta: meta["sh0"].update(files=["../../etc/passwd"]), "missing"),
-        (lambda meta: meta["shN"].update(count=65536), "impossible size"),
-        (lambda meta: meta["shN"].update(bands=3), "impossible size"),
-        (lambda meta: meta["quats"].update(files=["sh0.webp"]), "names no component"),
+        ("sog", lambda meta: meta.update(count=70_000), "impossible size"),
+        ("sog", lambda meta: meta.update(count=0), "count"),
+        ("sog", lambda meta: meta.update(version=1), "version"),
+        ("sog", lambda meta: meta["means"].update(mins=[0, 0]), "mins"),
+        ("sog", lambda meta: meta["means"].update(maxs=[0, 0, 1e9]), "bad.file"),
+        ("sog", lambda meta: meta["scales"].update(codebook=[0.0] * 255), "codebook"),
+        ("sog", lambda meta: meta["scales"].update(codebook=[1e9] * 256), "too far"),
+        ("sog", lambda meta: meta["sh0"].update(files=["../../etc/passwd"]), "missing"),
+        ("sog", lambda meta: meta["shN"].update(count=65536), "impossible size"),
+        ("sog", lambda meta: meta["shN"].update(bands=3), "impossible size"),
+        ("sog", lambda meta: meta["quats"].update(files=["sh0.webp"]), "names no component"),
+        ("glb", lambda d: d.update(meshes=3), "no list"),
+        ("glb", lambda d: d["nodes"][0].update(mesh=7), "names nothing"),
+        ("glb", lambda d: d["nodes"][0].update(mesh=-1), "names nothing"),
+        ("glb", lambda d: d["nodes"][0].update(children=[0]), "no tree"),
+        ("glb", lambda d: d["nodes"][0].update(rotation=[0, 0, 0, 0]), "no quaternion"),
+        ("glb", lambda d: d["nodes"][0].update(scale=[1, 2, 1]), "unevenly"),
+        ("glb", lambda d: d["nodes"][0].update(scale=[-1, 1, 1]), "unevenly"),
+        ("glb", lambda d: d["nodes"][0].update(translation=["a", 0, 0]), "no list of 3"),
+        ("glb", lambda d: d["nodes"][0].update(translation=[10**400, 0, 0]), "beyond what a number can be"),
+        ("glb", lambda d: d["scenes"][0].update(nodes=[0] * 100), "no tree"),
+        ("glb", lambda d: rotation(d, count=10**9), "not possible"),
+        ("glb", lambda d: rotation(d, count=4), "beyond|differ"),
+        ("glb", lambda d: rotation(d, count=2), "differ"),
+        ("glb", lambda d: rotation(d, type="VEC3"), "wrong type"),
+        ("glb", lambda d: rotation(d, componentType=5125), "wrong type"),
+        ("glb", lambda d: rotation(d, byteOffset=-4), "no size"),
+        ("glb", lambda d: rotation(d, byteOffset=10**9), "beyond"),
+        ("glb", lambda d: d["bufferViews"][0].update(byteOffset=10**9), "beyond"),
+        ("glb", lambda d: d["bufferViews"][0].update(byteStride=4), "beyond"),
+        ("glb", lambda d: primitive(d).pop("extensions"), "no Gaussians"),
+        ("glb", lambda d: without(d, "SH_DEGREE_0_COEF_0"), "degree out"),
+        ("glb", lambda d: without(d, "SH_DEGREE_1_COEF_2"), "missing"),
+        ("glb", lambda d: d.update(nodes=d["nodes"] * 400, scenes=[{"nodes": list(range(400))}]), "too often"),
     ],
 )
-def test_headers_that_cannot_be_are_refused(change: Callable[[dict[str, Any]], Any], said: str) -> None:
-    refused(said, read, altered_sog(change), "sog")
+def test_headers_that_cannot_be_are_refused(name: str, change: Callable[[dict[str, Any]], Any], said: str) -> None:
+    refused(said, read, (altered_sog if name == "sog" else altered_glb)(change), name)
 
 
 # --- frames of zstandard, in SPZ of version 4 -------------------------------------------------------
