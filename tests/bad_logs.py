@@ -130,13 +130,10 @@ def written(kind: str, folder: Path) -> Files | write_waymo.Log:
 
 @functools.cache
 def waymo(folder: Path) -> write_waymo.Log:
-    """The city as a Waymo log, without recorded projections, which take most of the time to write."""
+    """The city as a Waymo log."""
     truth = city(folder / "truth")
     beams = sensors.lidar_elevations(roundtrip.SMALL)
-    log = write_waymo.log_of(truth, read_scene(folder / "truth").tracks, beams=beams, columns=240)
-    for frame in log.frames:
-        frame["lasers"][0]["projections"] = None
-    return log
+    return write_waymo.log_of(truth, read_scene(folder / "truth").tracks, beams=beams, columns=240)
 
 
 def write_waymo_log(log: write_waymo.Log, kind: str, folder: Path) -> Path:

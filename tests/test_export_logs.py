@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from test_edit import toy
@@ -83,6 +84,22 @@ def test_a_bag_holds_the_log(exported: tuple[Scene, Path]) -> None:
     assert (size.x, size.y, size.z) == (4.0, 2.0, 1.6) and box.bbox.center.position.x == pytest.approx(9.8)
     cube, name = bag["/objects/markers"][1][1].markers
     assert (cube.type, name.type, name.text) == (1, 9, "car-1 (car)") and cube.scale.x == 4.0
+
+
+def test_one_file_holds_the_messages_of_the_bag(
+    exported: tuple[Scene, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, folder = exported
+    assert app.main(["export", "mcap", str(folder / "scene"), "--out", str(tmp_path / "a.mcap")]) == 0
+    assert (tmp_path / "a.mcap").read_bytes() == (folder / "out" / "log_0.mcap").read_bytes()
+    monkeypatch.setattr(ros2, "CHUNK_BYTES", 20_000)
+    write_mcap(tmp_path / "b.mcap", ros2.Ros2Messages(log_of(scene)))
+    with (tmp_path / "b.mcap").open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        times = [message.log_time for _, _, message in reader.iter_messages(log_time_order=False)]
+        summary = reader.get_summary()
+    assert summary is not None and summary.statistics is not None and len(summary.chunk_indexes) > 2
+    assert summary.statistics.message_count == len(times) and times == sorted(times)
 
 
 def test_points_of_the_world_fall_on_their_pixels_through_frames_and_calibration(exported: tuple[Scene, Path]) -> None:

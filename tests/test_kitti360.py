@@ -168,34 +168,6 @@ def test_scans_are_untwisted_clockwise(truth: Scene, source: Path, tmp_path: Pat
     assert errors["no"].max() > 0.2
 
 
-def test_sick_lines_become_one_sweep_a_frame(truth: Scene, source: Path, tmp_path: Path) -> None:
-    folder = source / "data_3d_raw" / made.DRIVE / "sick_points"
-    (folder / "data").mkdir(parents=True)
-    first = truth.ego.pose_at(0.0)
-    mount = invert(first) @ truth.sweeps[0].world_from_lidar @ made.VELO_FROM_SICK
-    times = [0.0, 0.025, 0.05, 0.1, 0.125]
-    pairs = np.array([[3.0, 1.5], [4.0, -0.5], [0, 0]])
-    for number, _ in enumerate(times):
-        pairs.astype("<f4").tofile(folder / "data" / f"{number:010d}.bin")
-    (folder / "timestamps.txt").write_text("\n".join(made.stamp(time) for time in times) + "\n")
-    scene = ingest(source, tmp_path / "out")
-    lines = [sweep for sweep in scene.sweeps if sweep.sensor == "sick"]
-    assert [sweep.id for sweep in lines] == ["sick/000000", "sick/000001"]
-    points = read_points(scene, lines[1])
-    assert np.allclose(np.unique(points.dt_s), [-0.05, 0.0, 0.025], atol=1e-6)
-    in_plane = np.array([[0, -3.0, 1.5], [0, -4.0, -0.5]])
-    velo = next(s for s in scene.sweeps if s.sensor == "velodyne")
-    world_from_truth = velo.world_from_lidar @ invert(truth.sweeps[0].world_from_lidar)
-    for time_s in (0.1, 0.125):
-        ego = truth.ego.pose_at(time_s)
-        expected = transform_points(world_from_truth @ ego @ mount, in_plane)
-        mine = np.abs(points.dt_s - (time_s - 0.1)) < 1e-6
-        found = transform_points(lines[1].world_from_lidar, points.xyz[mine].astype(np.float64))
-        assert np.abs(found - expected).max() < 0.01  # between frames the vehicle is interpolated
-    (folder / "timestamps.txt").unlink()
-    assert any("SICK lines were left out" in note for note in ingest(source, tmp_path / "none").source.notes)
-
-
 def write_fisheye(source: Path) -> None:
     """Two lenses whose pixels show the direction of their ray: red = x, green = y, blue = z, -1..1 as 0..254."""
     side, xi, gamma, k1, k2 = 140, 2.2, 133.6, 0.016, 1.65

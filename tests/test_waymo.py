@@ -46,27 +46,21 @@ def city(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scene, tuple[Track, 
 
 
 @pytest.fixture
-def log(tmp_path_factory: pytest.TempPathFactory) -> made.Log:
+def drive(tmp_path_factory: pytest.TempPathFactory) -> made.Log:
     return waymo_logs.whole(tmp_path_factory)
-
-
-@pytest.fixture
-def bare(tmp_path_factory: pytest.TempPathFactory) -> made.Log:
-    return waymo_logs.bare(tmp_path_factory)
 
 
 @pytest.mark.parametrize("form, workers", [("v1", 1), ("v2", 2)])
 def test_round_trip(
-    form: str, workers: int, city: tuple[Scene, tuple[Track, ...]], log: made.Log, tmp_path: Path
+    form: str, workers: int, city: tuple[Scene, tuple[Track, ...]], drive: made.Log, tmp_path: Path
 ) -> None:
     truth, own = city
-    scene = ingest(write(log, form, tmp_path / "log"), tmp_path / "scene", workers=workers)
+    scene = ingest(write(drive, form, tmp_path / "log"), tmp_path / "scene", workers=workers)
     roundtrip.assert_same_log(scene, truth, labels=made.LABELS, cloud_m=2e-4, dt_s=1e-6, box_pose=0.03, intensity=1e-4)
     assert scene.ego.world_from_ego[0] == pytest.approx(np.eye(4), abs=1e-12)
     assert scene.frames[0].view.camera.readout_s == pytest.approx(made.READOUT_S, abs=1e-6)
     assert scene.frames[0].view.camera.shutter == "left_to_right"
-    assert any("points fall where the log says" in note and "front 0." in note for note in scene.source.notes)
-    assert any(form in note and "Day, sunny, location_sf" in note for note in scene.source.notes)
+    assert any(form in note for note in scene.source.notes)
     assert {scene.split[f"front/00000{n}"] for n in (0, 1, 2, 3)} == {"train"}
     assert scene.split["front_left/000004"] == "test"
     assert scene.frames[0].view.time_s == pytest.approx(0.05, abs=1e-6)  # the clock begins with the LiDAR's turn
@@ -78,7 +72,7 @@ def test_round_trip(
         if track.id in standing:
             found = scene.track(track.id).world_from_object
             assert np.abs(found - invert(at_first) @ track.world_from_object).max() < 1e-6
-        for frame, pose in zip(log.frames, track.world_from_object, strict=True):
+        for frame, pose in zip(drive.frames, track.world_from_object, strict=True):
             (box,) = (box for box in frame["boxes"] if box["id"] == track.id)
             shown = transform_points(invert(made.GLOBAL_FROM_WORLD) @ frame["pose"], box["centre"][None])[0]
             uncarried_m = max(uncarried_m, float(np.linalg.norm(shown - pose[:3, 3])))
@@ -90,16 +84,14 @@ def test_the_moment_of_the_boxes_is_found(
     hold: str, words: str, city: tuple[Scene, tuple[Track, ...]], tmp_path: Path
 ) -> None:
     log = made.log_of(*city, beams=rig.lidar_elevations(roundtrip.SMALL), columns=COLUMNS, boxes_hold=hold)
-    for frame in log.frames:
-        frame["lasers"][0]["projections"] = None
     scene = ingest(write(log, "v1", tmp_path / "log"), tmp_path / "scene")
     assert any(note.startswith(f"boxes hold {words} (") for note in scene.source.notes)
     roundtrip.assert_same_log(scene, city[0], labels=made.LABELS, box_pose=0.04, cloud_m=2e-4)
 
 
-def test_both_formats_and_any_number_of_workers_give_the_same_scene(bare: made.Log, tmp_path: Path) -> None:
-    one = ingest(write(bare, "v1", tmp_path / "one"), tmp_path / "a", workers=3)
-    two = ingest(write(bare, "v2", tmp_path / "two"), tmp_path / "b", workers=1)
+def test_both_formats_and_any_number_of_workers_give_the_same_scene(drive: made.Log, tmp_path: Path) -> None:
+    one = ingest(write(drive, "v1", tmp_path / "one"), tmp_path / "a", workers=3)
+    two = ingest(write(drive, "v2", tmp_path / "two"), tmp_path / "b", workers=1)
     for name in ("tracks.json", "lidar/lidar_top/000002.safetensors", "images/front_left/000003.png"):
         assert (Path(one.root) / name).read_bytes() == (Path(two.root) / name).read_bytes()
     for a, b in zip(one.frames, two.frames, strict=True):
@@ -125,10 +117,10 @@ def test_chosen_frames_and_cameras_far_from_the_origin(
     refused("no such camera", ingest, source, tmp_path / "c", cameras=("rear",), raises=UsageError)
 
 
-def test_images_are_rectified_and_other_lidars_read(bare: made.Log, tmp_path: Path) -> None:
+def test_images_are_rectified_and_other_lidars_read(drive: made.Log, tmp_path: Path) -> None:
     lens = [60.0, 60.0, 47.0, 33.0, 0.05, -0.3, 0.002, -0.001, 0.0]
-    width, height = bare.cameras[0]["width"], bare.cameras[0]["height"]
-    bare.cameras[0]["intrinsic"] = lens
+    width, height = drive.cameras[0]["width"], drive.cameras[0]["height"]
+    drive.cameras[0]["intrinsic"] = lens
     point = np.array([0.25, -0.2, 1.0])  # in the camera, z forward
     x, y = point[:2]
     r2 = x * x + y * y
@@ -141,12 +133,12 @@ def test_images_are_rectified_and_other_lidars_read(bare: made.Log, tmp_path: Pa
     Image.fromarray(np.repeat(blob.round().astype(np.uint8)[..., None], 3, 2)).save(buffer, "PNG")
     image = np.full((4, 30, 4), -1, np.float32)
     image[1, 7, :2] = 12.0, 0.5
-    for frame in bare.frames:
+    for frame in drive.frames:
         frame["images"][0]["image"] = buffer.getvalue()
         frame["lasers"].append({"number": 3, "returns": [image], "poses": None})
     side = {"number": 3, "inclinations": (), "min": -1.0, "max": 0.2}
-    bare.lasers.append(side | {"extrinsic": yaw_matrix(1.5, (3.2, 1.0, 0.9))})
-    scene = ingest(write(bare, "v1", tmp_path / "log"), tmp_path / "scene")
+    drive.lasers.append(side | {"extrinsic": yaw_matrix(1.5, (3.2, 1.0, 0.9))})
+    scene = ingest(write(drive, "v1", tmp_path / "log"), tmp_path / "scene")
     camera = scene.cameras["front"]
     assert camera.distortion == tuple(lens[4:])
     pixels = read_image(scene, scene.frames_of("front")[0])[..., 0].astype(float)
@@ -165,15 +157,15 @@ def test_images_are_rectified_and_other_lidars_read(bare: made.Log, tmp_path: Pa
 
 
 @pytest.mark.parametrize("form", ["v1", "v2"])
-def test_panoptic_labels(form: str, bare: made.Log, tmp_path: Path) -> None:
-    width, height = bare.cameras[0]["width"], bare.cameras[0]["height"]
+def test_panoptic_labels(form: str, drive: made.Log, tmp_path: Path) -> None:
+    width, height = drive.cameras[0]["width"], drive.cameras[0]["height"]
     ids = np.zeros((height, width), int)
     ids[:10] = 25 * made.DIVISOR
     ids[10:20] = 10 * made.DIVISOR + 4
     ids[20:30, ::2] = 1 * made.DIVISOR
     ids[30:] = 22 * made.DIVISOR
-    bare.frames[1]["images"][0]["panoptic"] = made.panoptic_png(ids)
-    scene = ingest(write(bare, form, tmp_path / "log"), tmp_path / "scene", workers=2)
+    drive.frames[1]["images"][0]["panoptic"] = made.panoptic_png(ids)
+    scene = ingest(write(drive, form, tmp_path / "log"), tmp_path / "scene", workers=2)
     labelled = [frame.id for frame in scene.frames if frame.labels]
     assert labelled == ["front/000001"]
     frame = scene.frames_of("front")[1]
@@ -287,16 +279,6 @@ def test_crc32c_folded_equals_byte_by_byte(length: int) -> None:
     assert tfrecord.crc32c(data) == made.crc32c_bitwise(data)
 
 
-def test_varints_at_once_equal_varints_one_by_one() -> None:
-    values = np.concatenate(
-        [np.random.default_rng().integers(-(2**40), 2**40, 200), [0, -1, 127, 128, 2**62, -(2**63)], np.arange(300)]
-    )
-    data = b"".join(made.varint(int(value)) for value in values)
-    assert (records.unpack_varints(data, "x") == values).all()
-    refused("cut off", records.unpack_varints, data + b"\x80", "x")
-    refused("ten bytes", records.unpack_varints, b"\x80" * 10 + b"\x01", "x")
-
-
 INNER = records.Message("Inner", {1: records.Field("values", "doubles"), 3: records.Field("counts", "ints")})
 OUTER = records.Message(
     "Outer",
@@ -339,7 +321,7 @@ def test_broken_messages_are_named(data: bytes, word: str) -> None:
 
 @given(st.binary(max_size=200))
 def test_no_bytes_raise_anything_but_an_input_error(data: bytes) -> None:
-    for message in (records.FRAME, records.CONTEXT, records.MATRIX_INT):
+    for message in (records.FRAME, records.CONTEXT, records.MATRIX_FLOAT):
         try:
             records.parse_message(data, message, "x")
         except InputError:
@@ -386,23 +368,6 @@ def test_points_without_a_pose_are_left_out_and_counted() -> None:
     laser = LaserCalibration("top", (), -0.2, 0.1, np.eye(4))
     points = sensors.points_of_scan(LaserScan([image, image], poses), laser, np.eye(4), "x")
     assert (points.without_pose, len(points.xyz)) == (10, 22)
-
-
-@pytest.mark.parametrize("start, duration", [(0.0, 0.1), (-0.004, 0.098), (0.1, -0.1)])
-def test_the_turn_is_measured_from_pixel_poses(start: float, duration: float) -> None:
-    def place(time: np.ndarray) -> np.ndarray:
-        return np.stack([100 + 12 * time, 0.3 * time, np.full_like(time, 4.0)], -1)
-
-    poses = np.zeros((4, 100, 6), np.float32)
-    poses[..., 3:] = place(start + (np.arange(100) + 0.5) / 100 * duration)
-    poses[2:, 40:] = 0
-    times = np.arange(-0.1, 0.25, 0.0125)
-    found = sensors.measure_turn(poses, 5.0, times + 5.0, place(times))
-    assert found is not None
-    assert np.abs(np.array(found) - [start, duration]).max() < 1e-5
-    assert sensors.measure_turn(poses, 5.0, times + 5.0, place(times * 1e-3)) is None
-    nominal = sensors.TurnClock()
-    assert (sensors.median_clock([found]) == nominal) == (start == 0.0)
 
 
 def test_a_view_is_that_of_the_middle_of_the_exposure() -> None:
@@ -506,46 +471,46 @@ BOTH: dict[str, tuple[Callable[[made.Log], object], str]] = {
 
 @pytest.mark.parametrize("form", ["v1", "v2"])
 @pytest.mark.parametrize("case", BOTH)
-def test_what_makes_no_sense_is_refused(case: str, form: str, bare: made.Log, tmp_path: Path) -> None:
+def test_what_makes_no_sense_is_refused(case: str, form: str, drive: made.Log, tmp_path: Path) -> None:
     spoil, words = BOTH[case]
-    spoil(bare)
-    log = write(bare, form, tmp_path / "log")
+    spoil(drive)
+    log = write(drive, form, tmp_path / "log")
     assert str(tmp_path) in refused(words, ingest, log, tmp_path / "scene").where
     assert list(tmp_path.iterdir()) == [tmp_path / "log"]
 
 
-def test_frames_out_of_order_are_refused_in_one_file_and_sorted_in_tables(bare: made.Log, tmp_path: Path) -> None:
-    bare.frames[1], bare.frames[2] = bare.frames[2], bare.frames[1]
-    refused("timestamps do not increase", ingest, write(bare, "v1", tmp_path / "one"), tmp_path / "a")
-    scene = ingest(write(bare, "v2", tmp_path / "two"), tmp_path / "b")
+def test_frames_out_of_order_are_refused_in_one_file_and_sorted_in_tables(drive: made.Log, tmp_path: Path) -> None:
+    drive.frames[1], drive.frames[2] = drive.frames[2], drive.frames[1]
+    refused("timestamps do not increase", ingest, write(drive, "v1", tmp_path / "one"), tmp_path / "a")
+    scene = ingest(write(drive, "v2", tmp_path / "two"), tmp_path / "b")
     assert [sweep.time_s for sweep in scene.sweeps] == pytest.approx(0.05 + np.arange(5) * 0.1, abs=1e-6)
-    bare.frames[3]["timestamp_us"] = bare.frames[2]["timestamp_us"]
-    refused("a frame twice", ingest, write(bare, "v2", tmp_path / "three"), tmp_path / "c")
+    drive.frames[3]["timestamp_us"] = drive.frames[2]["timestamp_us"]
+    refused("a frame twice", ingest, write(drive, "v2", tmp_path / "three"), tmp_path / "c")
 
 
 @pytest.mark.parametrize("form", ["v1", "v2"])
-def test_incomplete_frames_are_left_out_when_asked(form: str, bare: made.Log, tmp_path: Path) -> None:
-    lacks_an_image(bare)
-    bare.frames[4]["lasers"] = []
-    scene = ingest(write(bare, form, tmp_path / "log"), tmp_path / "scene", skip_missing=True)
+def test_incomplete_frames_are_left_out_when_asked(form: str, drive: made.Log, tmp_path: Path) -> None:
+    lacks_an_image(drive)
+    drive.frames[4]["lasers"] = []
+    scene = ingest(write(drive, form, tmp_path / "log"), tmp_path / "scene", skip_missing=True)
     assert len(scene.sweeps) == 3
     assert any("frames 2, 4 lack" in note for note in scene.source.notes)
-    only = ingest(write(bare, form, tmp_path / "log"), tmp_path / "other", cameras=("front",), frames=(0, 4))
+    only = ingest(write(drive, form, tmp_path / "log"), tmp_path / "other", cameras=("front",), frames=(0, 4))
     assert len(only.frames) == 4  # the missing image is of a camera that was not asked for
 
 
 @pytest.mark.parametrize("form", ["v1", "v2"])
 def test_empty_scans_unknown_sensors_and_classes_are_taken_as_they_are(
-    form: str, bare: made.Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    form: str, drive: made.Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for image in bare.frames[1]["lasers"][0]["returns"]:
+    for image in drive.frames[1]["lasers"][0]["returns"]:
         image[..., 0] = -1
-    bare.frames[0]["boxes"][0]["id"] = "_odd"
-    bare.frames[0]["boxes"][0]["type"] = 9
-    odd = dict(bare.frames[0]["images"][0], number=7)
-    bare.frames[0]["images"].append(odd)
-    bare.frames[0]["lasers"].append({"number": 8, "returns": bare.frames[0]["lasers"][0]["returns"], "poses": None})
-    scene = ingest(write(bare, form, tmp_path / "log"), tmp_path / "scene")
+    drive.frames[0]["boxes"][0]["id"] = "_odd"
+    drive.frames[0]["boxes"][0]["type"] = 9
+    odd = dict(drive.frames[0]["images"][0], number=7)
+    drive.frames[0]["images"].append(odd)
+    drive.frames[0]["lasers"].append({"number": 8, "returns": drive.frames[0]["lasers"][0]["returns"], "poses": None})
+    scene = ingest(write(drive, form, tmp_path / "log"), tmp_path / "scene")
     assert len(read_points(scene, scene.sweeps[1]).xyz) == 0
     assert "has no points" in capsys.readouterr().err
     assert scene.track("t_odd").label == "unknown"
@@ -553,8 +518,8 @@ def test_empty_scans_unknown_sensors_and_classes_are_taken_as_they_are(
     assert len(scene.sweeps) == 5
 
 
-def test_damaged_files_are_named_with_record_and_byte(bare: made.Log, tmp_path: Path) -> None:
-    path = write(bare, "v1", tmp_path / "log")
+def test_damaged_files_are_named_with_record_and_byte(drive: made.Log, tmp_path: Path) -> None:
+    path = write(drive, "v1", tmp_path / "log")
     content = path.read_bytes()
     third = list(tfrecord.record_places(path))[2].offset
 
@@ -576,7 +541,7 @@ def test_damaged_files_are_named_with_record_and_byte(bare: made.Log, tmp_path: 
     assert len(ingest(path, tmp_path / "scene", frames=(0, 2)).sweeps) == 2  # what is not asked for need not be whole
 
 
-def test_files_of_another_kind_are_refused(bare: made.Log, tmp_path: Path) -> None:
+def test_files_of_another_kind_are_refused(drive: made.Log, tmp_path: Path) -> None:
     path = tmp_path / "a.tfrecord"
     for content, word in (
         (b"<html>not here</html>", "not a TFRecord"),
@@ -587,9 +552,9 @@ def test_files_of_another_kind_are_refused(bare: made.Log, tmp_path: Path) -> No
     ):
         path.write_bytes(content)
         refused(word, ingest, path, tmp_path / "scene")
-    path.write_bytes(b"".join(made.record(made.frame_message(bare, bare.frames[n])) for n in (0, 1)))
-    bare.name = "another"
-    path.write_bytes(path.read_bytes() + made.record(made.frame_message(bare, bare.frames[2])))
+    path.write_bytes(b"".join(made.record(made.frame_message(drive, drive.frames[n])) for n in (0, 1)))
+    drive.name = "another"
+    path.write_bytes(path.read_bytes() + made.record(made.frame_message(drive, drive.frames[2])))
     refused("mixes two logs", ingest, path, tmp_path / "scene")
     refused("no frames", ingest, path, tmp_path / "scene", frames=(7, 9))
 
@@ -608,20 +573,20 @@ def test_range_images_are_unpacked_within_bounds(monkeypatch: pytest.MonkeyPatch
     refused("wrong shape", float_image, zlib.compress(lying), 4, "x")
 
 
-def test_tables_that_are_missing_or_damaged(bare: made.Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    root = write(bare, "v2", tmp_path / "log")
-    table = root / "lidar" / f"{bare.name}.parquet"
+def test_tables_that_are_missing_or_damaged(drive: made.Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = write(drive, "v2", tmp_path / "log")
+    table = root / "lidar" / f"{drive.name}.parquet"
     whole = table.read_bytes()
     table.write_bytes(whole[: len(whole) // 2])
     refused("table cannot be read", ingest, root, tmp_path / "scene")
-    (root / "lidar_box" / f"{bare.name}.parquet").rename(table)
+    (root / "lidar_box" / f"{drive.name}.parquet").rename(table)
     refused("lacks columns", ingest, root, tmp_path / "scene")
     table.write_bytes(whole)
-    pose = root / "lidar_pose" / f"{bare.name}.parquet"
+    pose = root / "lidar_pose" / f"{drive.name}.parquet"
     pose.rename(root / "away")
     refused("pixel poses are missing", ingest, root, tmp_path / "scene")
     (root / "away").rename(pose)
-    (root / "camera_calibration" / f"{bare.name}.parquet").unlink()
+    (root / "camera_calibration" / f"{drive.name}.parquet").unlink()
     refused("a component of the log is missing", ingest, root, tmp_path / "scene")
     pyarrow = pytest.importorskip("pyarrow")
     holes = pyarrow.table({"a": [1, None, 3]})
@@ -631,11 +596,11 @@ def test_tables_that_are_missing_or_damaged(bare: made.Log, tmp_path: Path, monk
     assert "mudg[data]" in refused("pyarrow", ParquetTable, pose, raises=ResourceError).remedy
 
 
-def test_one_log_of_a_folder_is_chosen_by_name(bare: made.Log, tmp_path: Path) -> None:
+def test_one_log_of_a_folder_is_chosen_by_name(drive: made.Log, tmp_path: Path) -> None:
     folder = tmp_path / "logs"
     names = [f"segment-{n}_with_camera_labels" for n in ("111_2", "222_3")]
     for name in names:
-        made.write_tfrecord(bare, folder / f"{name}.tfrecord")
+        made.write_tfrecord(drive, folder / f"{name}.tfrecord")
     caught = refused("several logs", ingest, folder, tmp_path / "scene", raises=UsageError)
     assert all(name in caught.expected for name in names)
     refused("there is no such log", ingest, folder, tmp_path / "scene", sequence="333", raises=UsageError)

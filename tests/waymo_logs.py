@@ -46,14 +46,6 @@ def whole(factory: pytest.TempPathFactory) -> made.Log:
     return copy.deepcopy(_written(factory.getbasetemp() / "waymo city"))
 
 
-def bare(factory: pytest.TempPathFactory) -> made.Log:
-    """The same without recorded projections, which take most of the time to write."""
-    log = whole(factory)
-    for frame in log.frames:
-        frame["lasers"][0]["projections"] = None
-    return log
-
-
 @functools.cache
 def _city(folder: Path) -> tuple[Scene, tuple[Track, ...]]:
     truth = roundtrip.small_log(folder)

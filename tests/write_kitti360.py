@@ -25,7 +25,6 @@ RECT_FROM_CAMERA = {
     name: np.block([[Rotation.from_rotvec(turn).as_matrix(), np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
     for name, turn in (("image_00", (0.01, -0.02, 0.004)), ("image_01", (-0.006, 0.01, 0.02)))
 }
-VELO_FROM_SICK = yaw_matrix(1.2, (-0.5, 0.1, -0.3))
 
 
 def numbers(matrix: NDArray[np.floating]) -> str:
@@ -96,7 +95,6 @@ def _calibration(truth: Scene, folder: Path, imu_from_rect: dict[str, Matrix], i
     )
     velo_from_camera = invert(imu_from_velo) @ imu_from_camera["image_00"]
     (folder / "calib_cam_to_velo.txt").write_text(numbers(velo_from_camera[:3]) + "\n")
-    (folder / "calib_sick_to_velo.txt").write_text(numbers(VELO_FROM_SICK[:3]) + "\n")
 
 
 def matrix_xml(name: str, matrix: NDArray[np.floating]) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mudg.base.geometry import CAM_FROM_EGO_AXES, invert, project, transform_points, yaw_matrix, yaw_of
+from mudg.base.geometry import CAM_FROM_EGO_AXES, invert, transform_points, yaw_matrix, yaw_of
 from mudg.base.types import Scene, Track
 from mudg.scene.read import open_files, read_points
 
@@ -114,15 +114,7 @@ def _scan(
     poses = np.zeros((len(beams), columns, 6), np.float32)
     for c, pose in enumerate(vehicle):
         poses[:, c] = _roll_pitch_yaw(global_from_world @ pose)
-    projections = np.zeros((2, len(beams), columns, 6), np.int64)
-    for name in truth.cameras:
-        camera = truth.frames_of(name)[index].view
-        uv, z = project(camera, world)
-        inside = (z > 0.1) & (uv >= 0).all(1) & (uv < [camera.camera.width, camera.camera.height]).all(1)
-        free = inside & (projections[second, row, column, 0] == 0)
-        values = np.c_[np.full(free.sum(), CAMERA_NUMBERS[name]), np.floor(uv[free])].astype(np.int64)
-        projections[second[free], row[free], column[free], :3] = values
-    return {"number": 1, "returns": list(returns), "poses": poses, "projections": list(projections)}
+    return {"number": 1, "returns": list(returns), "poses": poses}
 
 
 def _roll_pitch_yaw(pose: Matrix) -> list[float]:
@@ -225,12 +217,6 @@ def matrix_float(array: NDArray[np.float32]) -> bytes:
     return zlib.compress(text(1, array.astype("<f4").tobytes()) + text(2, shape), 1)
 
 
-def matrix_int(array: NDArray[np.integer]) -> bytes:
-    """A packed and compressed MatrixInt32."""
-    shape = b"".join(number(1, n) for n in array.shape)
-    return zlib.compress(text(1, b"".join(varint(int(v)) for v in array.ravel())) + text(2, shape), 1)
-
-
 def context_message(log: Log) -> bytes:
     """The Context message."""
     out = text(1, log.name.encode())
@@ -240,7 +226,7 @@ def context_message(log: Log) -> bytes:
     for laser in log.lasers:
         beams = doubles(2, laser["inclinations"]) + double(3, laser["min"]) + double(4, laser["max"])
         out += text(3, number(1, laser["number"]) + beams + transform(5, laser["extrinsic"]))
-    return out + text(4, text(2, b"Day") + text(3, b"location_sf") + text(4, b"sunny"))
+    return out
 
 
 def frame_message(log: Log, frame: dict[str, Any]) -> bytes:
@@ -259,8 +245,6 @@ def frame_message(log: Log, frame: dict[str, Any]) -> bytes:
         message = number(1, laser["number"])
         for index, image in enumerate(laser["returns"]):
             part = text(2, matrix_float(image))
-            if laser.get("projections"):
-                part += text(3, matrix_int(laser["projections"][index]))
             if index == 0 and laser.get("poses") is not None:
                 part += text(4, matrix_float(laser["poses"]))
             message += text(2 + index, part)
@@ -351,12 +335,8 @@ def write_parquet(log: Log, root: Path) -> Path:
     save("lidar", "LiDAR", ((keys, flat(1, one) | flat(2, two)) for keys, (one, two) in returns))
     with_poses = ((keys, flat(1, one["poses"])) for keys, one in lasers if one.get("poses") is not None)
     save("lidar_pose", "LiDARPose", with_poses)
-    projected = ((keys, one["projections"]) for keys, one in lasers if one.get("projections"))
-    save("lidar_camera_projection", "LiDARCameraProjection", ((k, flat(1, p[0]) | flat(2, p[1])) for k, p in projected))
     names = " ".join((*(f"box.{part}.{axis}" for part in ("center", "size") for axis in "xyz"), "box.heading type"))
     boxes = ((key(f, laser_object_id=b["id"]), b) for f in log.frames for b in f["boxes"])
     boxes = ((keys, [*map(float, (*b["centre"], *b["size"], b["heading"])), b["type"]]) for keys, b in boxes)
     save("lidar_box", "LiDARBox", ((keys, named(names, *values)) for keys, values in boxes))
-    conditions = named("time_of_day location weather", "Day", "location_sf", "sunny")
-    save("stats", "Stats", [(key(log.frames[0]), conditions)])
     return root

@@ -2,7 +2,7 @@
 
 Gaussians:  OUT and OUT.json (format, moment, axes, what the file does not hold, sha256)
 cameras:    OUT/transforms.json ... (nerfstudio), OUT/sparse/0 (COLMAP), OUT/images
-messages:   OUT.mcap (Foxglove), OUT.rrd (rerun), OUT/metadata.yaml and OUT/log_0.mcap (ROS 2),
+messages:   OUT.mcap (ROS 2, Foxglove), OUT.rrd (rerun), OUT/metadata.yaml and OUT/log_0.mcap (a bag of ROS 2),
             OUT/NAME.ncore4.zarr.itar (NCore)
 """
 
@@ -50,7 +50,7 @@ from mudg.gaussians.storage import load_model, model_of_scene, save_model
 from mudg.scene.clouds import read_fused
 from mudg.scene.read import open_files, read_points, read_scene
 
-# a log over time: files of Foxglove and rerun, bags of ROS 2, recordings of NCore -----------------
+# a log over time: messages and bags of ROS 2, files of rerun, recordings of NCore ----------------
 
 SUFFIXES: Final = {"mcap": ".mcap", "rerun": ".rrd", "ros2": "", "ncore": ""}
 """Formats, and the suffix of their file; none: a folder."""
@@ -81,7 +81,7 @@ def write_log(name: str, records: messages.LogRecords | None, splats: SplatScene
     if name == "rerun":
         write_rerun(out, records, splats, records.scene.id if records is not None else "scene")
     elif records is not None:
-        messages.write_mcap(out, messages.FoxgloveMessages(records))
+        messages.write_mcap(out, messages.Ros2Messages(records))
     contents = [] if records is None else [_counts(records)]
     if splats is not None:
         contents.append(f"{_count(splats)} Gaussians")
@@ -344,10 +344,9 @@ def _refuse_settings(config: ExportConfig, name: str) -> None:
         what = "a file of this format holds all moments"
         raise UsageError(what, where="--time-s", got=name, remedy="leave it out, or export ply")
     usual = ExportConfig()
-    set_here = [key for key in ("time_s", "nodes", "spz_version") if getattr(config, key) != getattr(usual, key)]
-    refused = set_here if name not in FORMATS else [key for key in set_here if key == "spz_version" and name != "spz"]
-    if refused:
-        flag = refused[0].replace("_", "-")
+    set_here = [key for key in ("time_s", "nodes") if getattr(config, key) != getattr(usual, key)]
+    if set_here and name not in FORMATS:
+        flag = set_here[0].replace("_", "-")
         raise UsageError("the format does not have this setting", where=f"--{flag}", got=name, remedy="leave it out")
 
 
@@ -379,14 +378,8 @@ def requested(config: ExportConfig, name: str, exported: Exported) -> WriteReque
         scene = replace(scene, sky=None)
     facts = {**scene.facts, "generator": f"mudg {version()}"}
     scene = replace(scene, file_from_world=file_from_world(name, config.axes), facts=facts)
-    ground, road = (_ground(exported), _road(exported)) if name == "alpasim" else (None, None)
-    return WriteRequest(scene, None if whole else moment, config.spz_version, exported.log, ground, road)
-
-
-def _road(exported: Exported) -> NDArray[np.floating] | None:
-    """Fused points of the road f[N, 3]; None where no point has a class."""
-    static = None if exported.parts.fused is None else read_fused(exported.parts.fused).static
-    return None if static is None or static.semantics is None else static.xyz[static.semantics == ID["road"]]
+    ground = _ground(exported) if name == "alpasim" else None
+    return WriteRequest(scene, None if whole else moment, exported.log, ground)
 
 
 def _ground(exported: Exported) -> HeightMap | None:

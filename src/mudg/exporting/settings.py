@@ -23,8 +23,6 @@ class ExportConfig:
     sky: Literal["keep", "none", "sphere"] = "keep"
     """keep: a panorama, in formats that hold one. none: no sky. sphere: 6000 flat Gaussians 300 m away, in every
     format."""
-    spz_version: Literal[3, 4] = 3
-    """Version of spz. 4 needs the package zstandard."""
 
 
 @settings

@@ -1,17 +1,15 @@
-"""A driving log as records over time: what every format of messages is made of, and MCAP files of such messages.
+"""A driving log as records over time, and as messages of ROS 2 in an MCAP file or a bag.
 
 Times count from the first record. Pictures and sweeps are read when they are written, one at a time.
 """
 
 from __future__ import annotations
 
-import base64
-import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from types import SimpleNamespace
-from typing import Any, ClassVar, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import yaml
@@ -120,36 +118,6 @@ class LogMessage(NamedTuple):
     value: Callable[[], Any]
 
 
-class LogMessages:
-    """The messages of a log in order of time, and how they stand in an MCAP file (names of its specification)."""
-
-    profile: ClassVar[str] = ""
-    schema_encoding: ClassVar[str]
-    message_encoding: ClassVar[str]
-
-    def __init__(self, records: LogRecords) -> None:
-        self._log, self._scene = records, records.scene
-
-    def __iter__(self) -> Iterator[LogMessage]:
-        raise NotImplementedError
-
-    def nanoseconds(self, time_s: float) -> int:
-        """The stamp of a message."""
-        return self._log.nanoseconds(time_s)
-
-    def schema(self, name: str) -> str:
-        """The text of a schema."""
-        raise NotImplementedError
-
-    def content(self, message: LogMessage) -> bytes:
-        """The bytes of a message."""
-        raise NotImplementedError
-
-    def channel_metadata(self, topic: str) -> dict[str, str]:
-        """What the channel of a topic carries."""
-        return {}
-
-
 def mcap_writer() -> Any:
     """The module ``mcap.writer``; ResourceError if the packages of messages are not installed."""
     try:
@@ -176,7 +144,7 @@ class McapStream(list[bytes]):
         return self.size
 
 
-def write_mcap(path: Path, messages: LogMessages) -> tuple[dict[str, tuple[str, int]], tuple[int, int]]:
+def write_mcap(path: Path, messages: Ros2Messages) -> tuple[dict[str, tuple[str, int]], tuple[int, int]]:
     """Write an MCAP file, completely or not at all; no more than one chunk is in memory.
 
     Returns:
@@ -187,15 +155,14 @@ def write_mcap(path: Path, messages: LogMessages) -> tuple[dict[str, tuple[str, 
     writer = package.Writer(stream, CHUNK_BYTES, package.CompressionType.NONE)
 
     def blocks() -> Iterator[bytes]:
-        writer.start(messages.profile, f"mudg {version()}")
+        writer.start("ros2", f"mudg {version()}")
         for message in messages:
-            topic, name, stamp = message.topic, message.schema, messages.nanoseconds(message.time_s)
+            topic, name, stamp = message.topic, message.schema, messages.stamp(message.time_s)
             if name not in schemas:
-                text = messages.schema(name).encode()
-                schemas[name] = writer.register_schema(name, messages.schema_encoding, text)
+                schemas[name] = writer.register_schema(name, "ros2msg", messages.schema(name).encode())
             if topic not in channels:
-                about = messages.channel_metadata(topic)
-                channels[topic] = writer.register_channel(topic, messages.message_encoding, schemas[name], about)
+                about = {"offered_qos_profiles": _qos(topic)}
+                channels[topic] = writer.register_channel(topic, "cdr", schemas[name], about)
             number = topics.get(topic, (name, 0))[1]
             writer.add_message(channels[topic], stamp, messages.content(message), stamp, number)
             stamps[:] = [stamps[0] if topics else stamp, stamp]
@@ -209,178 +176,10 @@ def write_mcap(path: Path, messages: LogMessages) -> tuple[dict[str, tuple[str, 
     return topics, (stamps[0], stamps[-1])
 
 
-# foxglove ------------------------------------------------------------------------------------------
-#
-# A driving log as messages that Foxglove shows: JSON with the names of Foxglove's schemas; pictures and points are
-# base64 inside.
-#
-#     /tf  /ego  /objects  /camera/NAME/image  /camera/NAME/calibration  /lidar/NAME  /points (fused, once)
-
-
-_NUMBER, _INTEGER, _FLAG, _TEXT = ({"type": name} for name in ("number", "integer", "boolean", "string"))
-_BYTES: Final = {"type": "string", "contentEncoding": "base64"}
-_TIME: Final = {"type": "object", "title": "time", "properties": {"sec": _INTEGER, "nsec": _INTEGER}}
-
-
-def _record(**properties: Any) -> dict[str, Any]:
-    return {"type": "object", "properties": properties}
-
-
-def _list(items: Mapping[str, Any]) -> dict[str, Any]:
-    return {"type": "array", "items": dict(items)}
-
-
-_VECTOR, _TURN, _COLOR = (_record(**dict.fromkeys(names, _NUMBER)) for names in ("xyz", "xyzw", "rgba"))
-_POSE: Final = _record(position=_VECTOR, orientation=_TURN)
-_STAMPED: Final = {"timestamp": _TIME, "frame_id": _TEXT}
-_CUBE: Final = _record(pose=_POSE, size=_VECTOR, color=_COLOR)
-_LABEL: Final = _record(pose=_POSE, billboard=_FLAG, font_size=_NUMBER, scale_invariant=_FLAG, color=_COLOR, text=_TEXT)
-_TRANSFORM: Final = _record(
-    timestamp=_TIME, parent_frame_id=_TEXT, child_frame_id=_TEXT, translation=_VECTOR, rotation=_TURN
-)
-_PARTS: Final = {"metadata": _list(_record(key=_TEXT, value=_TEXT)), "cubes": _list(_CUBE), "texts": _list(_LABEL)}
-_ENTITY: Final = _record(**_STAMPED, id=_TEXT, lifetime=_TIME, frame_locked=_FLAG, **_PARTS)
-_FIELDS: Final = _list(_record(name=_TEXT, offset=_INTEGER, type=_INTEGER))
-_LENS: Final = {"distortion_model": _TEXT, **dict.fromkeys("DKRP", _list(_NUMBER))}
-SCHEMAS: Final[Mapping[str, dict[str, Any]]] = {
-    "foxglove.FrameTransforms": _record(transforms=_list(_TRANSFORM)),
-    "foxglove.PoseInFrame": _record(**_STAMPED, pose=_POSE),
-    "foxglove.CompressedImage": _record(**_STAMPED, data=_BYTES, format=_TEXT),
-    "foxglove.CameraCalibration": _record(**_STAMPED, width=_INTEGER, height=_INTEGER, **_LENS),
-    "foxglove.PointCloud": _record(**_STAMPED, pose=_POSE, point_stride=_INTEGER, fields=_FIELDS, data=_BYTES),
-    "foxglove.SceneUpdate": _record(deletions=_list(_record(timestamp=_TIME, id=_TEXT)), entities=_list(_ENTITY)),
-}
-
-
-class FoxgloveMessages(LogMessages):
-    """The messages of a log for Foxglove."""
-
-    schema_encoding, message_encoding = "jsonschema", "json"
-
-    def __iter__(self) -> Iterator[LogMessage]:
-        messages = [*self._of_cameras(), *self._of_sweeps(), *self._of_objects()]
-        if self._log.fused is not None:
-            messages.append(LogMessage("/points", "foxglove.PointCloud", self._log.start_s, self._fused_points))
-        return iter(sorted(messages, key=lambda message: (message.time_s, message.topic)))
-
-    def schema(self, name: str) -> str:
-        """The text of a schema."""
-        return json.dumps({"title": name, **SCHEMAS[name]})
-
-    def content(self, message: LogMessage) -> bytes:
-        """The bytes of a message."""
-        return json.dumps(message.value(), separators=(",", ":"), allow_nan=False).encode()
-
-    def _stamp(self, time_s: float) -> dict[str, int]:
-        nanoseconds = self.nanoseconds(time_s)
-        return {"sec": nanoseconds // NANO, "nsec": nanoseconds % NANO}
-
-    def _stamped(self, time_s: float, frame: str) -> dict[str, Any]:
-        return {"timestamp": self._stamp(time_s), "frame_id": frame}
-
-    def _of_cameras(self) -> Iterator[LogMessage]:
-        for frame in self._scene.frames:
-            view, time_s, topic = frame.view, frame.view.time_s, f"/camera/{frame.view.camera.name}"
-            yield self._tf(time_s, topic[1:], view.world_from_cam)
-            calibration, image = (lambda v=view: self._calibration(v)), (lambda f=frame: self._image(f))
-            yield LogMessage(f"{topic}/calibration", "foxglove.CameraCalibration", time_s, calibration)
-            yield LogMessage(f"{topic}/image", "foxglove.CompressedImage", time_s, image)
-
-    def _of_sweeps(self) -> Iterator[LogMessage]:
-        for sweep in self._scene.sweeps:
-            yield self._tf(sweep.time_s, f"lidar/{sweep.sensor}", sweep.world_from_lidar)
-            points = lambda s=sweep: self._sweep(s)
-            yield LogMessage(f"/lidar/{sweep.sensor}", "foxglove.PointCloud", sweep.time_s, points)
-
-    def _of_objects(self) -> Iterator[LogMessage]:
-        for moment in self._log.moments():
-            yield LogMessage("/objects", "foxglove.SceneUpdate", moment, lambda t=moment: self._boxes(t))
-            pose = self._scene.ego.pose_at(moment)
-            if pose is not None:
-                ego = {**self._stamped(moment, "world"), "pose": _pose(pose)}
-                yield LogMessage("/ego", "foxglove.PoseInFrame", moment, lambda value=ego: value)
-                yield self._tf(moment, "ego", pose)
-
-    def _tf(self, time_s: float, frame: str, pose: Matrix) -> LogMessage:
-        """The pose of a frame in the world."""
-        place, frames = _pose(pose), {"parent_frame_id": "world", "child_frame_id": frame}
-        value = {"timestamp": self._stamp(time_s), **frames}
-        value |= {"translation": place["position"], "rotation": place["orientation"]}
-        return LogMessage("/tf", "foxglove.FrameTransforms", time_s, lambda: {"transforms": [value]})
-
-    def _calibration(self, view: View) -> dict[str, Any]:
-        camera, k = view.camera, view.camera.matrix
-        return {
-            **self._stamped(view.time_s, f"camera/{camera.name}"),
-            "width": camera.width,
-            "height": camera.height,
-            "distortion_model": "",
-            "D": [],
-            "K": k.reshape(-1).tolist(),
-            "R": np.eye(3).reshape(-1).tolist(),
-            "P": np.column_stack([k, np.zeros(3)]).reshape(-1).tolist(),
-        }
-
-    def _image(self, frame: Frame) -> dict[str, Any]:
-        picture = {"format": picture_format(frame), "data": _base64(self._log.picture(frame))}
-        return {**self._stamped(frame.view.time_s, f"camera/{frame.view.camera.name}"), **picture}
-
-    def _sweep(self, sweep: Sweep) -> dict[str, Any]:
-        points = self._log.points(sweep)
-        rows = np.zeros(len(points.xyz), [("xyz", "<f4", 3), ("intensity", "<f4")])
-        rows["xyz"], rows["intensity"] = points.xyz, points.intensity
-        return self._cloud(sweep.time_s, f"lidar/{sweep.sensor}", rows, [("intensity", 12, 7)])
-
-    def _fused_points(self) -> dict[str, Any]:
-        cloud = self._log.fused
-        count = 0 if cloud is None else len(cloud)
-        rows = np.zeros(count, [("xyz", "<f4", 3), ("rgba", "u1", 4)])
-        if cloud is not None:
-            rows["xyz"], rows["rgba"] = cloud.xyz, np.column_stack([cloud.rgb, np.full(count, 255)])
-        channels = [(name, 12 + index, 1) for index, name in enumerate(("red", "green", "blue", "alpha"))]
-        return self._cloud(self._log.start_s, "world", rows, channels)
-
-    def _cloud(self, time_s: float, frame: str, rows: NDArray[Any], more: list[tuple[str, int, int]]) -> dict[str, Any]:
-        fields = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), *more]
-        return {
-            **self._stamped(time_s, frame),
-            "pose": _pose(np.eye(4)),
-            "point_stride": rows.dtype.itemsize,
-            "fields": [{"name": name, "offset": offset, "type": kind} for name, offset, kind in fields],
-            "data": _base64(rows.tobytes()),
-        }
-
-    def _boxes(self, time_s: float) -> dict[str, Any]:
-        entities = []
-        for track, pose in self._log.boxes(time_s):
-            color = dict(zip("rgba", (*box_color(track.label), 0.4)))
-            cube = {"pose": _pose(pose), "size": _vector(track.size_m), "color": color}
-            label = {"pose": _pose(above(pose, track)), "billboard": True, "font_size": 0.5, "scale_invariant": False}
-            label |= {"color": dict.fromkeys("rgba", 1.0), "text": f"{track.id} ({track.label})"}
-            entity = {**self._stamped(time_s, "world"), "id": track.id, "frame_locked": False}
-            entity |= {"lifetime": {"sec": 0, "nsec": round(BOX_LIFE_S * NANO)}}
-            entity |= {"metadata": [{"key": "class", "value": track.label}], "cubes": [cube], "texts": [label]}
-            entities.append(entity)
-        return {"deletions": [], "entities": entities}
-
-
-def _vector(values: NDArray[np.floating]) -> dict[str, float]:
-    return {"x": float(values[0]), "y": float(values[1]), "z": float(values[2])}
-
-
-def _pose(matrix: NDArray[np.float64]) -> dict[str, Any]:
-    w, x, y, z = geometry.quaternion_from_matrix(matrix).tolist()
-    return {"position": _vector(matrix[:3, 3]), "orientation": {"x": x, "y": y, "z": z, "w": w}}
-
-
-def _base64(content: bytes) -> str:
-    return base64.b64encode(content).decode("ascii")
-
-
 # ros2 ----------------------------------------------------------------------------------------------
 #
-# A driving log as a bag of ROS 2 (rosbag2 with MCAP storage), written without ROS: the package rosbags gives types and
-# bytes of messages. Its own writer begins with bags of version 8, which Humble does not read.
+# Written without ROS: the package rosbags gives types and bytes of messages. Its own writer begins with bags of version
+# 8, which Humble does not read.
 #
 #     /tf  /tf_static  /ego/path (once)  /ego/pose  /camera/NAME/image/compressed  /camera/NAME/camera_info
 #     /lidar/NAME/points
@@ -476,15 +275,12 @@ def ros_types() -> Any:
     return types
 
 
-class Ros2Messages(LogMessages):
-    """The messages of a log for ROS 2; of one moment, transforms first. Raises InputError: an object's id or class
-    holds a zero byte."""
-
-    profile, schema_encoding, message_encoding = "ros2", "ros2msg", "cdr"
+class Ros2Messages:
+    """The messages of a log in order of time; of one moment, transforms first. Raises InputError: an object's id or
+    class holds a zero byte."""
 
     def __init__(self, records: LogRecords) -> None:
-        super().__init__(records)
-        self._types = ros_types()
+        self._log, self._scene, self._types = records, records.scene, ros_types()
         packages = {"builtin_interfaces", "std_msgs", "geometry_msgs", "sensor_msgs", "nav_msgs", "tf2_msgs"}
         packages |= {"visualization_msgs", "vision_msgs"}
         classes = {
@@ -503,9 +299,9 @@ class Ros2Messages(LogMessages):
         messages = [*self._once(), *self._transforms(), *self._of_sensors(), *self._of_objects()]
         return iter(sorted(messages, key=lambda one: (one.time_s, not one.topic.startswith("/tf"), one.topic)))
 
-    def nanoseconds(self, time_s: float) -> int:
-        """The stamp of a message."""
-        return super().nanoseconds(time_s) + START_S * NANO
+    def stamp(self, time_s: float) -> int:
+        """The stamp of a message in nanoseconds."""
+        return self._log.nanoseconds(time_s) + START_S * NANO
 
     def schema(self, name: str) -> str:
         """The text of a schema."""
@@ -515,12 +311,8 @@ class Ros2Messages(LogMessages):
         """The bytes of a message."""
         return bytes(self._types.serialize_cdr(message.value(), message.schema, little_endian=True))
 
-    def channel_metadata(self, topic: str) -> dict[str, str]:
-        """Quality of service."""
-        return {"offered_qos_profiles": _qos(topic)}
-
     def _header(self, time_s: float, frame: str) -> Any:
-        return self._ros.Header(self._ros.Time(*divmod(self.nanoseconds(time_s), NANO)), frame)
+        return self._ros.Header(self._ros.Time(*divmod(self.stamp(time_s), NANO)), frame)
 
     def _frame(self, sensor: str) -> str:
         return f"{sensor.partition('/')[0]}_{self._names[sensor]}" + "_optical" * sensor.startswith("camera/")

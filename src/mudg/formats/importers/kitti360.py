@@ -1,9 +1,9 @@
 """KITTI-360 importer: one drive of the data set's folder.
 
 ========================== =========================================================================================
-``calibration/``           cameras, velodyne, SICK (``calib``)
+``calibration/``           cameras, velodyne (``calib``)
 ``data_2d_raw/<drive>/``   ``image_00|01/data_rect`` (rectified stereo), ``image_02|03/data_rgb`` (fisheyes)
-``data_3d_raw/<drive>/``   ``velodyne_points/data``, ``sick_points/data``, each with ``timestamps.txt``
+``data_3d_raw/<drive>/``   ``velodyne_points/data`` with ``timestamps.txt``
 ``data_poses/<drive>/``    ``poses.txt`` (vehicle) or ``cam0_to_world.txt`` (rectified camera 0), for part of the frames
 ``data_3d_bboxes/``        ``train_full/<drive>.xml``, else ``train/<drive>.xml`` (``boxes``)
 ``data_2d_semantics/``     ``train/<drive>/image_00|01/semantic`` and ``confidence``, where there are any
@@ -17,8 +17,7 @@ missing where the vehicle hardly moves; they are interpolated there. Frames befo
 left out.
 
 Scans are distorted by the vehicle's motion; they are untwisted here. The sensor turns clockwise seen from above in 0.1
-s and looks forward at the frame's moment (as the data set's tools have it). Lines of the SICK scanners, about four a
-frame, become one sweep per frame.
+s and looks forward at the frame's moment (as the data set's tools have it).
 
 Fisheye cameras are taken when they are asked for (``--cameras side_left side_right``): rectified to a pinhole camera
 that looks along the lens' axis and is 90 degrees wide and high, with the lens' own resolution in its centre.
@@ -41,11 +40,10 @@ from PIL import Image, UnidentifiedImageError
 
 from mudg.base import log, store
 from mudg.base.errors import InputError
-from mudg.base.geometry import from_rotation_translation, invert, transform_points
+from mudg.base.geometry import from_rotation_translation, invert
 from mudg.base.palette import UNLABELLED
-from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
+from mudg.base.types import Camera, EgoPath, Scene, Source, Track
 from mudg.formats.importers import common
-from mudg.formats.importers.clouds import read_float_rows
 from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
 from mudg.formats.importers.drive_log import BoxTracks, SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.formats.importers.images import ImageFit, brown_conrady, fit_images, image_notes, image_size
@@ -61,7 +59,6 @@ from mudg.formats.importers.kitti_files import (
     rotation_entry,
     table_entry,
 )
-from mudg.formats.unknown_fields import note_unknown
 from mudg.scene.motion import GAP_M
 
 # boxes --------------------------------------------------------------------------------------------
@@ -80,11 +77,6 @@ LABEL_OF: Final = name_table(
     vehicle: unknown vehicle"""
 )
 """Classes that become tracks -> the labels of this package. Buildings, poles, vegetation and ground are no tracks."""
-_OFFICIAL: Final = frozenset(
-    """index label category semanticId semanticId_orig instanceId timestamp start_frame end_frame dynamic dynamicSeq
-    dynamicIdx dynamicIndex level_min level_max color transform vertices faces""".split()
-)
-"""Fields of the data set's objects, read or not."""
 VEHICLES: Final = frozenset(("car", "truck", "bus", "caravan", "trailer", "train", "motorcycle", "bicycle"))
 MAX_FILE_BYTES: Final = 8 * 1024**3
 _CHUNK: Final = 1 << 20
@@ -117,7 +109,6 @@ def read_boxes(path: Path, left_out: Counter[str]) -> Iterator[Kitti360Box]:
         where = f"{path}: object {number} ({item.tag})"
         if item.find("transform") is None:
             continue
-        note_unknown(path.name, [field.tag for field in item], _OFFICIAL)
         if item.find("semanticId") is not None:
             label = LABEL_OF_ID.get(_integer(item, "semanticId", where), "")
         else:  # words are told apart by capital letters only
@@ -245,22 +236,16 @@ IMU_FROM_EGO: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 FISHEYES: Final = ("image_02", "image_03")
 FISHEYE_VIEW_DEG: Final = 90.0
 _FISHEYE_VALUES: Final = ("image_width", "image_height", "xi", "k1", "k2", "p1", "p2", "gamma1", "gamma2", "u0", "v0")
-_FISHEYE: Final = frozenset(_FISHEYE_VALUES).union(
-    "model_type camera_name mirror_parameters distortion_parameters projection_parameters".split()
-)
-"""Entries of the data set's fisheye calibrations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kitti360Calibration:
     """What is fixed on the vehicle; poses are f64[4, 4]. ``ego_from_camera``: by ``image_00`` .. ``image_03``,
-    perspective cameras as rectified. ``velo_from_sick``: None if the file is not there. ``imu_from_rect0``: the data
-    set's vehicle frame from rectified camera 0."""
+    perspective cameras as rectified. ``imu_from_rect0``: the data set's vehicle frame from rectified camera 0."""
 
     folder: Path
     ego_from_camera: dict[str, Matrix]
     ego_from_velo: Matrix
-    velo_from_sick: Matrix | None
     imu_from_rect0: Matrix
 
     def fit(self, camera: str, name: str, size: tuple[int, int], options: ImportOptions) -> ImageFit:
@@ -297,9 +282,7 @@ class Kitti360Calibration:
 
 def read_calibration(folder: Path) -> Kitti360Calibration:
     """Read ``calibration/``. Raises InputError: a file or entry is missing, or a matrix is not a rigid motion."""
-    path, perspective, sick = (
-        folder / f"{name}.txt" for name in ("calib_cam_to_pose", "perspective", "calib_sick_to_velo")
-    )
+    path, perspective = folder / "calib_cam_to_pose.txt", folder / "perspective.txt"
     table = read_number_table(path)
     imu_from_camera = {n: pose_entry(table, (n,), path) for n in CAMERAS if n == "image_00" or n in table}
     imu_from_velo = imu_from_camera["image_00"] @ invert(_rigid_file(folder / "calib_cam_to_velo.txt"))
@@ -308,8 +291,7 @@ def read_calibration(folder: Path) -> Kitti360Calibration:
         imu_from_camera[name] @= invert(rotation_entry(numbers, (f"R_rect_{name[-2:]}",), perspective))
     ego_from_imu = invert(IMU_FROM_EGO)
     ego_from_camera = {name: ego_from_imu @ pose for name, pose in imu_from_camera.items()}
-    velo_from_sick, rect0 = _rigid_file(sick) if sick.is_file() else None, imu_from_camera["image_00"]
-    return Kitti360Calibration(folder, ego_from_camera, ego_from_imu @ imu_from_velo, velo_from_sick, rect0)
+    return Kitti360Calibration(folder, ego_from_camera, ego_from_imu @ imu_from_velo, imu_from_camera["image_00"])
 
 
 def _rigid_file(path: Path) -> Matrix:
@@ -331,7 +313,6 @@ def _read_fisheye(path: Path) -> dict[str, float]:
     if model is None or model[1] != "MEI":
         what = "fisheye calibration is of another camera model"
         raise InputError(what, where=str(path), expected="model_type: MEI", got=model[1] if model else "no model_type")
-    note_unknown(path.name, re.findall(r"^\s*(\w+)\s*:", text, re.MULTILINE), _FISHEYE)
     found: dict[str, float] = {}
     for key, value in re.findall(r"^\s*(\w+)\s*:\s*([-+.\deE]+)\s*$", text, re.MULTILINE):
         try:
@@ -354,9 +335,7 @@ Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY-NC-SA 3.0 (KITTI-360: Liao, Xie, Geiger; attribution, non-commercial, share-alike)"
 CAMERAS: Final = {"image_00": "front", "image_01": "front_stereo", "image_02": "side_left", "image_03": "side_right"}
 USUAL: Final = ("image_00", "image_01")
-SICK: Final = "sick"
 FRAME_PERIOD_S: Final = 0.1
-_SICK_REACH_S: Final = 0.055
 _TRAIN_IDS: Final = dict(zip((7, 8, 11, 12, 13, 17, *range(19, 29), 31, 32, 33), range(19), strict=True))
 _TRAIN_IDS.update({34: 2, 35: 4, 37: 5})
 """The data set's class ids -> Cityscapes train ids (garage = building, gate = fence, small pole = pole); others
@@ -440,7 +419,6 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
         notes.append("scans untwisted: clockwise turn of 0.1 s, forward at the frame's moment")
     notes += image_notes(fits)
     notes.append(f"source frames {frames[0]} to {frames[-1]} are frames 0 to {len(frames) - 1} here")
-    sick_files, sick_s = _sick_lines(raw_folder / "sick_points", calibration, notes)
     boxes = options.boxes or common.first_file(*_box_files(root, drive))
     tracks = _read_tracks(boxes, dict(zip(frames, scene_s, strict=True)), world_from_source, notes)
 
@@ -461,9 +439,6 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
                 dt_s = (-azimuth / (2 * np.pi) * FRAME_PERIOD_S).astype(np.float32)
                 points = replace(points, xyz=common.deskew(points.xyz, dt_s, world_from_velo, time_s), dt_s=dt_s)
             yield SceneSweep(SENSOR, index, time_s, world_from_velo(time_s), points, str(scans[number]))
-        if calibration.velo_from_sick is not None:
-            mount = calibration.ego_from_velo @ calibration.velo_from_sick
-            yield from _sick_sweeps(sick_files, sick_s - start_s, ego, mount, index, time_s)
 
     origin = Source("kitti360", LICENCE, None, tuple(notes))
     path = EgoPath(scene_s, np.stack([common.pose_near(ego, float(time_s)) for time_s in scene_s]))
@@ -533,49 +508,6 @@ def _has_pose(ego: EgoPath, time_s: float) -> bool:
         return False
     moved = ego.world_from_ego[after, :3, 3] - ego.world_from_ego[after - 1, :3, 3]
     return bool(np.linalg.norm(moved) < GAP_M)
-
-
-# --- SICK lines -----------------------------------------------------------------------------------
-
-
-def _sick_lines(
-    folder: Path, calibration: Kitti360Calibration, notes: list[str]
-) -> tuple[Mapping[int, Path], NDArray[np.float64]]:
-    """Line scans beside the frames and their times by number; none where it is not known when or where they were
-    measured."""
-    files, stamps = common.numbered_files(folder / "data", (".bin",)), folder / "timestamps.txt"
-    if files and calibration.velo_from_sick is not None and stamps.is_file():
-        return files, _stamps(stamps, files, max(files))
-    if files:
-        notes.append("SICK lines were left out: calib_sick_to_velo.txt or their timestamps.txt is missing")
-    return {}, np.zeros(0)
-
-
-def _sick_sweeps(
-    files: Mapping[int, Path],
-    times_s: NDArray[np.float64],
-    ego: EgoPath,
-    ego_from_sick: Matrix,
-    index: int,
-    time_s: float,
-) -> Iterable[SceneSweep]:
-    """The lines within half a frame of frame ``index`` as one sweep, brought to that moment; none without lines."""
-    pose = common.pose_near(ego, time_s) @ ego_from_sick
-    parts, delays, no_returns = [], [], 0
-    for number in np.flatnonzero(np.abs(times_s - time_s) < _SICK_REACH_S).tolist():
-        late = float(times_s[number] - time_s)
-        if number not in files or not -FRAME_PERIOD_S / 2 <= late < FRAME_PERIOD_S / 2:  # nearer to another frame
-            continue
-        # pairs in the scanner's plane, as the data set's reader has them
-        pairs, returns = read_float_rows(files[number], 2, "SICK line", axes=2)
-        no_returns, pairs = no_returns + int((~returns).sum()), pairs[returns]
-        line = np.stack([np.zeros(len(pairs), np.float32), -pairs[:, 0], pairs[:, 1]], 1)
-        parts.append(transform_points(invert(pose) @ common.pose_near(ego, time_s + late) @ ego_from_sick, line))
-        delays.append(np.full(len(line), late, np.float32))
-    xyz = np.concatenate(parts or [np.zeros((0, 3), np.float32)])
-    if len(xyz):
-        points = SweepPoints(xyz, np.zeros(len(xyz), np.float32), np.concatenate(delays), no_returns=no_returns)
-        yield SceneSweep(SICK, index, time_s, pose, points)
 
 
 # --- labels and boxes -----------------------------------------------------------------------------

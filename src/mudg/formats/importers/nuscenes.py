@@ -22,15 +22,13 @@ of all, are dropped.
 
 from __future__ import annotations
 
-import functools
 import itertools
-import json
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +40,6 @@ from mudg.formats.importers import common, drive_log
 from mudg.formats.importers.clouds import read_float_rows
 from mudg.formats.importers.common import ImportOptions, LogFiles, name_table, unit_intensity
 from mudg.formats.importers.drive_log import BoxTracks, DriveLog, ImageRecord, SweepRecord
-from mudg.formats.unknown_fields import note_unknown
 
 # nuScenes sensors: cameras from their intrinsics, and ``LIDAR_TOP`` files with the time of every point ----------------
 LICENCE: Final = "CC BY-NC-SA 4.0 and the nuScenes terms of use (Motional; attribution, non-commercial, share-alike)"
@@ -107,76 +104,25 @@ def point_times(xyz: NDArray[np.float32], rings: NDArray[np.float32]) -> NDArray
 
 # tables -------------------------------------------------------------------------------------------
 #
-# JSON arrays of flat records, read one record at a time. The tables of the full release are large (``sample_data.json``
-# and ``ego_pose.json`` hold 2.6 million records each). What an import needs of them is one scene, so records are found
-# by the value of one field while the file passes through a buffer of a few megabytes; only matching records become
-# Python objects.
+# JSON arrays of flat records. Two tables of the full release are large (``sample_data.json`` and ``ego_pose.json`` hold
+# 2.6 million records each). What an import needs of them is one scene, so their records are found by the value of one
+# field while the file passes through a buffer of a few megabytes; only matching records become Python objects.
 _BUFFER_BYTES: Final = 1 << 22
 _MAX_RECORD_BYTES: Final = 1 << 20
-_FLAT_RECORD: Final = rb'\{(?:[^{}"]++|"(?:[^"\\]++|\\.)*+")*+\}'
+_FLAT: Final = re.compile(rb'\{(?:[^{}"]++|"(?:[^"\\]++|\\.)*+")*+\}', re.DOTALL)
 """An object whose fields are not objects; braces may stand in its texts."""
-_RECORD: Final = functools.reduce(
-    lambda inner, _: _FLAT_RECORD.replace(rb")*+\}", b"|" + inner + rb")*+\}"), range(3), _FLAT_RECORD
-)
-"""An object with objects in it, three deep: the data set has none, but programs add fields of their own."""
-_FLAT: Final = re.compile(_FLAT_RECORD, re.DOTALL)
-_ENTRY: Final = re.compile(rb"\s*+(,?)\s*+(" + _RECORD + rb"|\])", re.DOTALL)
 _TOKEN: Final = re.compile(r"[A-Za-z0-9_\-]{1,128}")
-
-OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
-    "attribute.json": frozenset({"token", "name", "description"}),
-    "calibrated_sensor.json": frozenset({"token", "sensor_token", "translation", "rotation", "camera_intrinsic"}),
-    "category.json": frozenset({"token", "name", "description", "index"}),
-    "ego_pose.json": frozenset({"token", "timestamp", "translation", "rotation"}),
-    "instance.json": frozenset(
-        {"token", "category_token", "nbr_annotations", "first_annotation_token", "last_annotation_token"}
-    ),
-    "sample.json": frozenset({"token", "timestamp", "scene_token", "next", "prev"}),
-    "sample_annotation.json": frozenset(
-        (
-            "token sample_token instance_token attribute_tokens visibility_token translation size rotation "
-            "num_lidar_pts num_radar_pts next prev"
-        ).split()
-    ),
-    "sample_data.json": frozenset(
-        (
-            "token sample_token ego_pose_token calibrated_sensor_token filename fileformat width height "
-            "timestamp is_key_frame next prev"
-        ).split()
-    ),
-    "scene.json": frozenset(
-        {"token", "name", "description", "log_token", "nbr_samples", "first_sample_token", "last_sample_token"}
-    ),
-    "sensor.json": frozenset({"token", "channel", "modality"}),
-}
-"""Tables that are read -> their fields. Source: the release's published schema; ``index`` came with
-nuScenes-lidarseg."""
 
 Row = dict[str, Any]
 
 
-def iter_records(path: Path, *, buffer_bytes: int = _BUFFER_BYTES) -> Iterator[Row]:
-    """Every record of a table, in file order. The file is read in pieces; one record is an object at a time. Raises
-    InputError: not a JSON array of flat objects, a record over 1 MiB, or the file is cut off."""
-    with _open(path) as file:
-        buffer, offset, first = _start_of_array(file, path, buffer_bytes), 0, True
-        position = buffer.index(b"[") + 1
-        while True:
-            entry = _ENTRY.match(buffer, position)
-            if entry is None:
-                piece, rest = file.read(buffer_bytes), buffer[position:]
-                if not piece and rest.lstrip()[:1] in (b"", b",", b"{"):
-                    raise _cut_off(path)
-                if not piece or len(rest) > _MAX_RECORD_BYTES:
-                    raise _no_records(path, offset + position, rest)
-                buffer, offset, position = rest + piece, offset + position, 0
-                continue
-            if entry[2] == b"]" and not entry[1]:
-                return
-            if entry[2] == b"]" or first == bool(entry[1]):
-                raise _no_records(path, offset + position, entry[0])
-            yield _parse(entry[2], path, offset + entry.start(2))
-            first, position = False, entry.end()
+def read_table(path: Path) -> list[Row]:
+    """All records of a table. Raises InputError: missing, no JSON, or not an array of objects."""
+    _refuse_missing(path)
+    rows = store.read_json(path)
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise InputError("table is not an array of records", where=str(path), expected="[ {...}, ... ]")
+    return rows
 
 
 def find_records(
@@ -185,17 +131,16 @@ def find_records(
     """Records whose text ``field`` is one of ``values``, in file order.
 
     Records that do not match are not parsed: the field is looked for in the bytes, and the record around a hit is cut
-    out and parsed strictly. Where that fails (braces inside texts) every record is parsed instead. The file's first and
-    last character are checked, so that a cut-off table is noticed. ``values`` are tokens: texts without escapes. Raises
-    InputError: no JSON array, a matching record that is malformed, or the file is cut off."""
+    out and parsed strictly. Where that fails (objects in records) the whole table is parsed instead. The file's first
+    and last character are checked, so that a cut-off table is noticed. ``values`` are tokens: texts without escapes.
+    Raises InputError: no JSON array, a matching record that is malformed, or the file is cut off."""
     found = 0
     try:
         for record in _search(path, field, values, buffer_bytes):
             found += 1
             yield record
     except _Unclear:
-        matching = (r for r in iter_records(path, buffer_bytes=buffer_bytes) if r.get(field) in values)
-        yield from itertools.islice(matching, found, None)
+        yield from itertools.islice((row for row in read_table(path) if row.get(field) in values), found, None)
 
 
 class _Unclear(Exception):
@@ -205,8 +150,12 @@ class _Unclear(Exception):
 def _search(path: Path, field: str, values: Collection[str], buffer_bytes: int) -> Iterator[Row]:
     wanted = {value.encode() for value in values}
     hit = re.compile(rb'"' + re.escape(field.encode()) + rb'"\s*:\s*"([^"\\]*)"')
-    with _open(path) as file:
-        buffer, offset, piece = _start_of_array(file, path, buffer_bytes), 0, b" "
+    _refuse_missing(path)
+    with store.open_file(path) as file:
+        buffer, offset, piece = file.read(buffer_bytes), 0, b" "
+        if buffer.lstrip()[:1] != b"[":
+            what, got = "table does not start as a JSON array", repr(buffer[:20]) if buffer else "an empty file"
+            raise InputError(what, where=str(path), expected="[ {...}, ... ]", got=got, remedy="copy the table again")
         while piece:
             piece = file.read(buffer_bytes)
             buffer += piece
@@ -217,52 +166,21 @@ def _search(path: Path, field: str, values: Collection[str], buffer_bytes: int) 
                     record = _FLAT.match(buffer, max(0, buffer.rfind(b"{", 0, match.start())))
                     if record is None or record.end() <= match.start():
                         raise _Unclear
-                    yield _parse(record[0], path, offset + record.start())
+                    yield store.parse_json(record[0], f"{path}: byte {offset + record.start()}")
             if not piece and not buffer.rstrip().endswith(b"]"):
-                raise _cut_off(path)
+                expected, remedy = "a JSON array closed by ]", "copy the table again"
+                raise InputError("table is cut off", where=str(path), expected=expected, remedy=remedy)
             if len(buffer) - end > _MAX_RECORD_BYTES + buffer_bytes:
-                raise _no_records(path, offset + end, buffer[end:])
+                what, expected = "table is not an array of records", "flat records {...} of less than 1 MiB"
+                where, got = f"{path}: byte {offset + end}", repr(buffer[end : end + 20])
+                raise InputError(what, where=where, got=got, expected=expected)
             buffer, offset = buffer[end:], offset + end
 
 
-def _parse(content: bytes, path: Path, byte: int) -> Row:
-    try:
-        record = json.loads(content, parse_constant=_no_constant)
-    except (ValueError, RecursionError) as error:
-        raise InputError("table record is not valid JSON", where=f"{path}: byte {byte}", got=str(error)) from error
-    if path.name in OFFICIAL:
-        note_unknown(path.name, record, OFFICIAL[path.name])
-    return record
-
-
-def _no_constant(name: str) -> Any:
-    raise ValueError(f"{name} is not JSON")
-
-
-def _open(path: Path) -> BinaryIO:
+def _refuse_missing(path: Path) -> None:
     if not path.exists():
         what = "table is missing"
         raise InputError(what, where=str(path), remedy="unpack the release's metadata archive, which holds all tables")
-    return store.open_file(path)
-
-
-def _start_of_array(file: BinaryIO, path: Path, buffer_bytes: int) -> bytes:
-    """The first piece of the file, to its opening bracket at least."""
-    start = file.read(buffer_bytes)
-    if start.lstrip()[:1] != b"[":
-        what, got = "table does not start as a JSON array", repr(start[:20]) if start else "an empty file"
-        raise InputError(what, where=str(path), expected="[ {...}, ... ]", got=got, remedy="copy the table again")
-    return start
-
-
-def _cut_off(path: Path) -> InputError:
-    expected = "a JSON array closed by ]"
-    return InputError("table is cut off", where=str(path), expected=expected, remedy="copy the table again")
-
-
-def _no_records(path: Path, place: int, got: bytes) -> InputError:
-    what, expected = "table is not an array of records", "flat records {...} of less than 1 MiB between commas"
-    return InputError(what, where=f"{path}: byte {place}", got=repr(got[:20]), expected=expected)
 
 
 # --- rows -----------------------------------------------------------------------------------------
@@ -304,7 +222,7 @@ def _bad_field(row: Row, key: str, where: str, expected: str) -> InputError:
 class TokenTable:
     """Records of one table by their token; asking for one that is not there names who refers to it."""
 
-    def __init__(self, path: Path, records: Iterator[Row]) -> None:
+    def __init__(self, path: Path, records: Iterable[Row]) -> None:
         self.where = str(path)
         self.rows: dict[str, Row] = {}
         for row in records:
@@ -389,7 +307,7 @@ def files_of_nuscenes(source: Path, _options: ImportOptions) -> LogFiles:
 def _all_of(folder: Path, name: str) -> TokenTable:
     """A small table, complete."""
     path = folder / f"{name}.json"
-    return TokenTable(path, iter_records(path))
+    return TokenTable(path, read_table(path))
 
 
 def _those(folder: Path, name: str, field: str, values: set[str]) -> TokenTable:
@@ -444,7 +362,7 @@ def _choose_scene(source: Path, options: ImportOptions) -> tuple[Path, Row]:
     wanted_release, _, wanted = options.sequence.rpartition("/")
     releases, scenes = _releases(source), dict[str, tuple[Path, Row]]()
     for folder in releases:
-        for row in iter_records(folder / "scene.json"):
+        for row in read_table(folder / "scene.json"):
             name = text(row, "name", str(folder / "scene.json"))
             if wanted in (name, row.get("token")) and wanted_release in ("", folder.name):
                 return folder, row

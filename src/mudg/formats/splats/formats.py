@@ -84,17 +84,14 @@ class WriteRequest:
     """What is to be written.
 
     Args:
-        scene: with the axes of the file. time_s: the moment, or None = all of the motion. spz_version: 3 or 4. log:
-            whose cameras are listed, where a format can. ground, road: height and surface f[N, 3], where a format needs
-            them.
+        scene: with the axes of the file. time_s: the moment, or None = all of the motion. log: whose cameras are
+            listed, where a format can. ground: where a format needs it.
     """
 
     scene: SplatScene
     time_s: float | None
-    spz_version: int = 3
     log: Scene | None = None
     ground: HeightMap | None = None
-    road: NDArray[np.floating] | None = None
 
     @property
     def cloud(self) -> SplatCloud:
@@ -150,21 +147,13 @@ FORMATS: Final[Mapping[str, SplatFormat]] = {
     "ply": _format(
         ".ply", "RDF", "harmonics classes antialias", lambda r: ply.to_bytes(r.cloud, True, r.marks), ply.from_bytes
     ),
-    "spz": _format(
-        ".spz",
-        "RUB",
-        "harmonics antialias",
-        lambda r: spz.to_bytes(r.cloud, r.spz_version, r.antialias),
-        spz.from_bytes,
-    ),
+    "spz": _format(".spz", "RUB", "harmonics antialias", lambda r: spz.to_bytes(r.cloud, r.antialias), spz.from_bytes),
     "glb": _format(
         ".glb", "FUR", "harmonics motion antialias", lambda r: gltf.to_bytes(r.scene, r.time_s), gltf.from_bytes
     ),
     "usda": _format(".usda .usd", axes.WORLD, _MOVING, lambda r: usd.to_text(r.scene, r.time_s, log=r.log)),
     "usdz": _format(".usdz", axes.WORLD, f"{_MOVING} sky", lambda r: usd.to_package(r.scene, r.time_s, r.log)),
-    "alpasim": _format(
-        ".usdz", axes.WORLD, f"{_MOVING} sky", lambda r: usd.to_alpasim(r.scene, r.log, r.ground, r.road)
-    ),
+    "alpasim": _format(".usdz", axes.WORLD, f"{_MOVING} sky", lambda r: usd.to_alpasim(r.scene, r.log, r.ground)),
     "compressed-ply": _format(
         ".compressed.ply .ply",
         "RDF",

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, Final
 
@@ -33,7 +33,7 @@ from mudg.formats.splats.cloud import (
     spacing_m,
     unit,
 )
-from mudg.formats.unknown_fields import listed, sentence
+from mudg.formats.unknown_fields import listed
 
 EXTENSION: Final = "KHR_gaussian_splatting"
 PREFIX: Final = EXTENSION + ":"
@@ -189,21 +189,6 @@ _READ: Final = (EXTENSION, "KHR_mesh_quantization", "KHR_node_visibility", "KHR_
 """Extensions without which a file can be read, or that are read."""
 _LINEAR: Final = {"srgb_rec709_display": False, "lin_rec709_display": True, "BT.709-sRGB": False, "BT.709-linear": True}
 """Colour spaces and whether they are linear; the last two are names of the drafts."""
-_KIND: Final = ("kernel", "colorSpace", "projection", "sortingMethod", "extensions", "extras")
-_STANDARD: Final[Mapping[str, frozenset[str]]] = {
-    owner: frozenset(f"{fields} extensions extras".split())
-    for owner, fields in {
-        "": "accessors animations asset buffers bufferViews cameras extensionsRequired extensionsUsed images materials "
-        "meshes nodes samplers scene scenes skins textures",
-        "nodes.": "camera children matrix mesh name rotation scale skin translation weights",
-        "primitives.": "attributes indices material mode targets",
-        "accessors.": "bufferView byteOffset componentType count max min name normalized sparse type",
-    }.items()
-}
-"""Objects of glTF 2.0 -> their fields, read or not; ``extras`` belong to users."""
-_ATTRIBUTE: Final = re.compile(
-    r"POSITION|NORMAL|TANGENT|(TEXCOORD|COLOR|JOINTS|WEIGHTS)_\d+|" + re.escape(PREFIX) + r".*", re.DOTALL
-)
 _ROUNDING: Final = 1e-3
 _MOST_JSON: Final = 64 << 20
 _DEPTH: Final = 32
@@ -231,14 +216,11 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
         file.warn(f"{triangles} meshes without Gaussians were passed over")
     if file.entries(file.document, "animations"):
         file.warn("its animations are not read: everything is where the nodes put it at rest")
-    notes: tuple[str, ...] = ()
-    if file.passed:
-        notes = (sentence(sorted(file.passed), "the document"),)
     axes = "RDF" if file.of_old_transform(2) else ""
     if axes:
         file.warn(f"{file.generator} wrote {in_words(axes)}, where glTF has y up: read so; --axes viewer reads as glTF")
     cloud = replace(joined(clouds), antialias=file.antialias)
-    return SplatFile(cloud, axes, f"its program {file.generator}", file.step_m, notes, tuple(file.warnings))
+    return SplatFile(cloud, axes, f"its program {file.generator}", file.step_m, warnings=tuple(file.warnings))
 
 
 def _moved(cloud: SplatCloud, matrix: Array, where: str) -> SplatCloud:
@@ -283,7 +265,6 @@ class _GlbFile:
         self.document: dict[str, Any] = document
         self.binary = memoryview(b"")
         self.total, self.step_m = 0, 0.0
-        self.passed: set[str] = set()
         self.warnings = dict[str, None]()  # each once, in order
         asset = document.get("asset")
         asset = asset if isinstance(asset, dict) else {}
@@ -291,7 +272,6 @@ class _GlbFile:
         extras = asset.get("extras")
         drawing = extras.get("drawing") if isinstance(extras, dict) else None
         self.antialias = isinstance(drawing, dict) and drawing.get("antialias") is True
-        self._note("", document)
         self._check_extensions()
         place = 20 + length
         if place < len(content):
@@ -303,23 +283,14 @@ class _GlbFile:
         """Say something of the file once."""
         self.warnings[sentence] = None
 
-    def _note(self, within: str, owner: dict[str, Any]) -> None:
-        """Note the fields of an object of the document that glTF does not have."""
-        self.passed.update(f"{within}{name}" for name in owner if name not in _STANDARD[within])
-
     def _check_extensions(self) -> None:
-        """Refuse a file that cannot be read without extensions that are not known here; list those that it can be read
-        without."""
-        for name in ("extensionsRequired", "extensionsUsed"):
-            stated = self.document.get(name, [])
-            if not isinstance(stated, list) or any(not isinstance(one, str) for one in stated):
-                raise InputError(f"{name} is no list of names", where=f"{self.where}: JSON", got=repr(stated)[:60])
-            unknown = [one for one in stated if one not in _READ]
-            if unknown and name == "extensionsRequired":
-                what, where = "the GLB file needs an extension that is not read", f"{self.where}: JSON"
-                remedy = "write the file without it, or as SPZ"
-                raise InputError(what, where=where, got=listed(unknown), expected=", ".join(_READ), remedy=remedy)
-            self.passed.update(unknown)
+        """Refuse a file that cannot be read without extensions that are not known here."""
+        stated, where = self.document.get("extensionsRequired", []), f"{self.where}: JSON"
+        if not isinstance(stated, list) or any(not isinstance(one, str) for one in stated):
+            raise InputError("extensionsRequired is no list of names", where=where, got=repr(stated)[:60])
+        if unknown := [one for one in stated if one not in _READ]:
+            what, remedy = "the GLB file needs an extension that is not read", "write the file without it, or as SPZ"
+            raise InputError(what, where=where, got=listed(unknown), expected=", ".join(_READ), remedy=remedy)
 
     def of_old_transform(self, before: int) -> bool:
         """Whether splat-transform of a major version below this one wrote the file."""
@@ -380,7 +351,6 @@ class _GlbFile:
                 what = "the nodes of the GLB file are no tree"
                 raise InputError(what, where=f"{self.where}: JSON", got=f"node {index} twice")
             seen.add(index)
-            self._note("nodes.", node)
             matrix = matrix @ self._matrix(node)
             extensions = node.get("extensions")
             extensions = extensions if isinstance(extensions, dict) else {}
@@ -430,16 +400,12 @@ class _GlbFile:
             what, where = "the colour space of the Gaussians is not known", f"{self.where}: {EXTENSION}: colorSpace"
             remedy = "convert the colours to sRGB"
             raise InputError(what, where=where, expected=", ".join(_LINEAR), got=repr(space)[:60], remedy=remedy)
-        self._note("primitives.", primitive)
-        self.passed.update(f"attributes.{name}" for name in attributes if not _ATTRIBUTE.fullmatch(name))
         inner = kind.get("extensions")
         compressed = [name for name in inner if "compression" in name] if isinstance(inner, dict) else []
         if compressed:
             what, where = "the Gaussians of the GLB file are compressed", f"{self.where}: {EXTENSION}"
             got, expected = listed(compressed), "attributes without compression"
             raise InputError(what, where=where, got=got, expected=expected, remedy="write it without, or as SPZ")
-        self.passed.update(f"{EXTENSION}.{name}" for name in kind if name not in _KIND)
-        self.passed.update(f"{EXTENSION}.extensions.{name}" for name in (inner if isinstance(inner, dict) else ()))
         for name, usual in (("projection", "perspective"), ("sortingMethod", "cameraDistance")):
             if kind.get(name, usual) != usual:
                 self.warn(f"{name} {kind[name]!r:.40} is not drawn: {usual} instead")
@@ -500,7 +466,6 @@ class _GlbFile:
             what = "an attribute of the Gaussians is missing"
             raise InputError(what, where=self.where, expected=name, got=", ".join(attributes)[:160])
         accessor = self.entry("accessors", attributes[name])
-        self._note("accessors.", accessor)
         component = accessor.get("componentType")
         if component not in _KINDS or _WIDTHS.get(str(accessor.get("type"))) != width or "sparse" in accessor:
             what, got = "an attribute of the Gaussians has the wrong type", f"{accessor.get('type')} of {component}"

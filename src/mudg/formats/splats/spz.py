@@ -15,6 +15,7 @@ harmonics (value - 128) / 128, coefficient by coefficient. Rotation of versions 
 from __future__ import annotations
 
 import struct
+import zlib
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -49,22 +50,14 @@ def fractional_bits(means: NDArray[np.floating]) -> int:
     return bits
 
 
-def to_bytes(cloud: SplatCloud, version: int = 3, antialias: bool = False) -> bytes:
-    """A cloud as an SPZ file of version 3, or 4; ``antialias``: it was fitted with an antialiased rasteriser. Raises
-    InputError: a place too far from the origin. ResourceError: version 4 without the package zstandard."""
+def to_bytes(cloud: SplatCloud, antialias: bool = False) -> bytes:
+    """A cloud as an SPZ file of version 3; ``antialias``: it was fitted with an antialiased rasteriser. Raises
+    InputError: a place too far from the origin."""
     bits = fractional_bits(cloud.means)
     if float(np.abs(cloud.means).max(initial=0)) * (1 << bits) > (1 << 23) - 1:
         raise InputError("a Gaussian lies too far from the origin for SPZ", expected="at most 8388 km")
-    planes = _planes(cloud, bits)
-    if version == 3:
-        head = struct.pack(HEADER, MAGIC, 3, len(cloud), cloud.degree, bits, _ANTIALIAS * antialias, 0)
-        return binary.gzip_bytes(head + b"".join(planes))
-    packer = _zstandard("written").ZstdCompressor(level=12, write_content_size=True)
-    planes = [plane for plane in planes if plane]
-    streams = [packer.compress(plane) for plane in planes]
-    head = struct.pack("<IIIBBBBI12x", MAGIC, 4, len(cloud), cloud.degree, bits, int(antialias), len(streams), 32)
-    toc = b"".join(struct.pack("<QQ", len(stream), len(plane)) for stream, plane in zip(streams, planes))
-    return head + toc + b"".join(streams)
+    head = struct.pack(HEADER, MAGIC, 3, len(cloud), cloud.degree, bits, _ANTIALIAS * antialias, 0)
+    return binary.gzip_bytes(head + b"".join(_planes(cloud, bits)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,19 +92,24 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     if content[:2] != b"\x1f\x8b":
         what = "not an SPZ file"
         raise InputError(what, where=where, expected="a gzip file, or one that begins with NGSP", got=repr(content[:4]))
-    stream = binary.GzipStream(content, where)
-    magic, *fields, _ = struct.unpack(HEADER, stream.read(struct.calcsize(HEADER), "the header"))
+    size = struct.calcsize(HEADER)
+    with binary.inflating(where):
+        start = zlib.decompressobj(31).decompress(content, size)
+    magic, *fields, _ = binary.unpacked(HEADER, start, 0, "the header", where)
     if magic != MAGIC:
         raise InputError("not an SPZ file", where=where, expected="NGSP in the compressed content", got=f"{magic:#x}")
     head = _Header(*fields)
     if head.version not in (1, 2, 3):
         raise InputError("this version of SPZ is not read", where=where, expected="1 to 4", got=str(head.version))
     binary.refuse_bomb(head.count, content, where)
-    planes = [stream.read(size, f"the {name}") for name, size in zip(_PLANES, head.sizes(where))]
-    more = stream.rest(_MOST_EXTENSIONS) if head.flags & _EXTENSIONS else b""
-    if head.flags <= _ANTIALIAS | _EXTENSIONS:  # programs with further flags may have further planes
-        stream.close()
-    return _file(planes, head, _extensions(more, where) if head.flags & _EXTENSIONS else {}, where)
+    sizes = head.sizes(where)
+    # programs with further flags may have further planes
+    further = _MOST_EXTENSIONS if head.flags & ~_ANTIALIAS else 0
+    inflated, place, planes = binary.gunzip(content, size + sum(sizes) + further, where), size, list[bytes]()
+    for name, length in zip(_PLANES, sizes):
+        planes.append(bytes(binary.part(inflated, place, length, f"the {name}", where)))
+        place += length
+    return _file(planes, head, _extensions(inflated[place:], where) if head.flags & _EXTENSIONS else {}, where)
 
 
 def _from_streams(content: bytes, where: str) -> SplatFile:
@@ -128,7 +126,7 @@ def _from_streams(content: bytes, where: str) -> SplatFile:
         raise InputError(what, where=where, expected=f"{len(sizes)} streams", got=f"{streams} streams, table at {toc}")
     table = binary.numbers(content, toc, "<u8", 2 * streams, "the table of streams", where).reshape(-1, 2)
     extensions = _extensions(content[32:toc], where) if head.flags & _EXTENSIONS else {}
-    package, place, planes = _zstandard("read"), toc + 16 * streams, list[bytes]()
+    package, place, planes = _zstandard(), toc + 16 * streams, list[bytes]()
     for name, size, (packed, raw) in zip(_PLANES, sizes, table.tolist()):
         if raw != size:
             what = f"the {name} have another size than the header says"
@@ -183,13 +181,13 @@ def _file(planes: list[bytes], head: _Header, extensions: dict[int, bytes], wher
     return SplatFile(cloud, axes, f"extension {_AXES:#010x}", step, tuple(notes), tuple(warnings))
 
 
-def _zstandard(done: str) -> Any:
+def _zstandard() -> Any:
     """The optional package."""
     try:
         import zstandard
     except ImportError as error:
-        what = f"SPZ of version 4 is {done} with the package zstandard, which is not installed"
-        raise ResourceError(what, remedy="pip install zstandard, or use version 3 (--spz-version 3)") from error
+        what = "SPZ of version 4 is read with the package zstandard, which is not installed"
+        raise ResourceError(what, remedy="pip install zstandard, or write the file as version 3") from error
     return zstandard
 
 

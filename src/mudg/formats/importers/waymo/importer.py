@@ -33,7 +33,7 @@ from scipy.spatial.transform import Rotation
 
 from mudg.base import log
 from mudg.base.errors import InputError, UsageError
-from mudg.base.geometry import CAM_FROM_EGO_AXES, invert, transform_points, yaw_matrix, yaw_of
+from mudg.base.geometry import CAM_FROM_EGO_AXES, transform_points, yaw_matrix, yaw_of
 from mudg.base.palette import ID, UNLABELLED
 from mudg.base.types import Camera, EgoPath, Scene, Shutter, Source, SweepPoints
 from mudg.formats.importers import common
@@ -41,15 +41,11 @@ from mudg.formats.importers.common import ImportOptions, LogFiles
 from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.formats.importers.images import ImageFit, Lens, brown_conrady, fit_images
 from mudg.formats.importers.waymo import records
-from mudg.formats.importers.waymo.logs import REQUIRED, ParquetLog, TfrecordLog
-from mudg.formats.importers.waymo.records import CAMERAS, TOP, FrameRecord, LaserCalibration, Matrix, WaymoLog
+from mudg.formats.importers.waymo.logs import REQUIRED, ParquetLog, TfrecordLog, WaymoLog
+from mudg.formats.importers.waymo.records import CAMERAS, TOP, FrameRecord, LaserCalibration, Matrix
 
 LICENCE: Final = "Waymo Dataset License Agreement for Non-Commercial Use (non-commercial; attribution)"
-DOUBTFUL_PROJECTION_PX: Final = 30.0
-"""Our projections of points differ from the recorded ones by a few pixels; a median above this gives a warning."""
-
 _SAME_POSE: Final = 1e-6
-_CLOCK_FRAMES: Final = 3
 _MOMENT_FRAMES: Final = 4
 _SUFFIX: Final = ".tfrecord"
 
@@ -80,8 +76,6 @@ def import_waymo(source: Path, out: Path, options: ImportOptions) -> Scene:
     notes += [note] if note else []
     found, track_notes = records.build_tracks([plan.timed_boxes(frame, moment) for frame in frames])
     notes += track_notes
-    check = _check_projections(waymo, frames, cameras, plan)
-    notes += [check] if check else []
     numbers = {frame.number: index for index, frame in enumerate(frames)}
 
     items = ((frame, waymo.read(frame, cameras)) for frame in frames)
@@ -163,7 +157,7 @@ def _usable_frames(waymo: WaymoLog, options: ImportOptions) -> tuple[list[FrameR
     if not complete:
         what = "no frame is complete"
         raise InputError(what, where=waymo.frames[0].where, got=f"the first has no {', '.join(missing[0][1])}")
-    notes = [f"Waymo Open Dataset, {waymo.form}" + (f"; {waymo.conditions}" if waymo.conditions else "")]
+    notes = [f"Waymo Open Dataset, {waymo.form}"]
     if missing:
         some = ", ".join(str(frame.number) for frame, _ in missing[:8])
         notes.append(f"frames {some} lack images or scans and were left out")
@@ -184,7 +178,6 @@ class _Plan:
     world_from_global: Matrix
     start_us: int
     """Zero of the scene's clock, microseconds of the epoch."""
-    turn: TurnClock
     middle_s: Mapping[int, float]
     """Frame number -> seconds after the frame's timestamp to which the frame's pose belongs."""
     fits: Mapping[str, ImageFit]
@@ -199,7 +192,7 @@ class _Plan:
 
     def dt_s(self, frame: FrameRecord, turn: NDArray[np.float64]) -> NDArray[np.float64]:
         """Seconds after ``pose_s`` at parts of the top LiDAR's turn (0..1)."""
-        return self.turn.after_timestamp_s(turn) - self.middle_s[frame.number]
+        return turn * TURN_S - self.middle_s[frame.number]
 
     def taken(self, frame: FrameRecord, camera: str) -> tuple[Matrix, float]:
         """Where an image was taken (world from camera, f64[4, 4]), and when in the scene's clock."""
@@ -225,7 +218,7 @@ class _Plan:
         if TOP not in frame.lasers or not frame.boxes:
             return np.full(len(frame.boxes), self.middle_s[frame.number])
         centres = np.array([box.centre for box in frame.boxes])
-        return self.turn.after_timestamp_s(turn_of_direction(centres, self.waymo.lasers[TOP]))
+        return turn_of_direction(centres, self.waymo.lasers[TOP]) * TURN_S
 
 
 def _plan(
@@ -241,11 +234,7 @@ def _plan(
     x, y, z = (float(v) for v in place)
     place = f"({x!r}, {y!r}, {z!r})"
     notes.append(f"the world's origin is {place} in the data set's world, its x axis turned by {yaw!r} rad")
-    turn = _measure_turn(waymo, frames)
-    if turn.measured:
-        start, duration = f"{turn.start_s * 1e3:.1f} ms", f"{turn.duration_s * 1e3:.1f} ms"
-        notes.append(f"the top LiDAR's turns begin {start} after the timestamp and take {duration}")
-    middles = {frame.number: _pose_moment(frame, turn) for frame in frames}
+    middles = {frame.number: _pose_moment(frame) for frame in frames}
     assumed = sum(not exact for _, exact in middles.values())
     if assumed:
         notes.append(f"the pose of {assumed} frames is no image's: taken to belong to the middle of the LiDAR's turn")
@@ -259,36 +248,16 @@ def _plan(
         ways = ", ".join(DIRECTIONS[d] if 0 <= d < len(DIRECTIONS) else f"code {d}" for d in rolling)
         notes.append(f"shutters roll {ways}; a view is that of the middle of the exposure")
     middle_s = {number: value for number, (value, _) in middles.items()}
-    return _Plan(waymo, world_from_global, start_us, turn, middle_s, fits)
+    return _Plan(waymo, world_from_global, start_us, middle_s, fits)
 
 
-def _pose_moment(frame: FrameRecord, turn: TurnClock) -> tuple[float, bool]:
+def _pose_moment(frame: FrameRecord) -> tuple[float, bool]:
     """When the vehicle was at the frame's pose, in seconds after the frame's timestamp, and whether that was recorded:
     an image with the same pose has its time. Without one, the middle of the LiDAR's turn is assumed."""
     for shot in frame.shots.values():
         if np.abs(shot.global_from_vehicle - frame.global_from_vehicle).max() < _SAME_POSE:
             return shot.pose_time_s - frame.timestamp_us / 1e6, True
-    return float(turn.after_timestamp_s(np.array(0.5))), False
-
-
-def _measure_turn(waymo: WaymoLog, frames: Sequence[FrameRecord]) -> TurnClock:
-    """The top LiDAR's timing, from the frames during which the vehicle moved most."""
-    moved = [
-        (float(np.linalg.norm(after.global_from_vehicle[:3, 3] - before.global_from_vehicle[:3, 3])), index + 1)
-        for index, (before, after) in enumerate(zip(frames[1:-1], frames[2:], strict=True))
-        if TOP in before.lasers
-    ]
-    turns = []
-    for index in sorted(index for _, index in sorted(moved, reverse=True)[:_CLOCK_FRAMES]):
-        shots = [shot for frame in frames[index - 1 : index + 2] for shot in frame.shots.values()]
-        path = {shot.pose_time_s: shot.global_from_vehicle[:3, 3] for shot in shots}
-        times = np.array(sorted(path))
-        poses = waymo.pixel_poses(frames[index])
-        if poses is not None:
-            places = np.stack([path[time] for time in times])
-            found = measure_turn(poses, frames[index].timestamp_us / 1e6, times, places)
-            turns += [found] if found is not None else []
-    return median_clock(turns)
+    return TURN_S / 2, False
 
 
 def _moment_of_boxes(waymo: WaymoLog, frames: Sequence[FrameRecord], plan: _Plan) -> tuple[records.Moment, str]:
@@ -306,7 +275,7 @@ def _moment_of_boxes(waymo: WaymoLog, frames: Sequence[FrameRecord], plan: _Plan
             continue
         points = _points(plan, frame, TOP, waymo.read(frame, ()).scans[TOP])
         xyz = transform_points(waymo.lasers[TOP].vehicle_from_lidar, points.xyz)
-        seen = plan.turn.after_timestamp_s(points.turn)
+        seen = points.turn * TURN_S
         rotation = plan.world_from_vehicle(frame)[:3, :3]
         for box, late in zip(frame.boxes, plan.seen_s(frame), strict=True):
             if box.id in fast[index]:
@@ -349,29 +318,6 @@ def _points(plan: _Plan, frame: FrameRecord, name: str, scan: records.LaserScan)
     return points_of_scan(scan, plan.waymo.lasers[name], frame.global_from_vehicle, f"{frame.where}: LiDAR {name}")
 
 
-def _check_projections(waymo: WaymoLog, frames: Sequence[FrameRecord], cameras: Sequence[str], plan: _Plan) -> str:
-    """Compare our projections of the first frame's points with those recorded; a note, empty if there are none."""
-    frame = frames[0]
-    if not frame.lasers:
-        return ""
-    shots = {name: (waymo.cameras[name], middle_of_exposure(frame.shots[name])[0]) for name in cameras}
-    errors: dict[str, list[NDArray[np.float64]]] = {}
-    for name, scan in waymo.read(frame, (), projections=True).scans.items():
-        found = projection_errors(
-            _points(plan, frame, name, scan), scan, waymo.lasers[name], frame.global_from_vehicle, shots
-        )
-        for camera, off in found.items():
-            errors.setdefault(camera, []).append(off)
-    medians = {camera: float(np.median(np.concatenate(off))) for camera, off in errors.items()}
-    if not medians:
-        return ""
-    texts = ", ".join(f"{camera} {median:.1f} px" for camera, median in medians.items())
-    if max(medians.values()) > DOUBTFUL_PROJECTION_PX:
-        doubt = f"points do not fall where the log says they do ({texts}, median)"
-        log.warn(f"waymo: {doubt}; are calibrations and poses of this log?")
-    return f"points fall where the log says they do, up to (median, first frame): {texts}"
-
-
 # --- sensors --------------------------------------------------------------------------------------
 #
 # A range image has a row per beam (the highest first) and a column per step of the turn. Column 0 looks backwards, the
@@ -383,10 +329,7 @@ def _check_projections(waymo: WaymoLog, frames: Sequence[FrameRecord], cameras: 
 # vehicle's at the moment the middle column was exposed: the recorded one, up to a few milliseconds older or newer,
 # carried on with the recorded velocity. Source: the message description and the data set's conversion.
 TURN_S: Final = 0.1
-_MIN_MOTION_M: Final = 0.3
-_MAX_FIT_ERROR_S: Final = 0.004
-_CLOCK_ERROR_S: Final = 0.0025
-_MIN_ROWS_SHARE: Final = 0.05
+"""From the frame's timestamp on, which is that of the first column. Source: the message description."""
 MAX_POSE_SHIFT_S: Final = 0.05
 DIRECTIONS: Final = ("in an unknown direction", "downwards", "left to right", "upwards", "right to left", "not at all")
 """How a camera reads its image, by the data set's number."""
@@ -417,7 +360,7 @@ carried object, other ground, other things."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanPoints:
-    """Points of one turn in the LiDAR's frame at the frame's pose, and where each came from in the range images."""
+    """Points of one turn in the LiDAR's frame at the frame's pose."""
 
     xyz: NDArray[np.float64]
     """f64[N, 3] metres."""
@@ -425,9 +368,6 @@ class ScanPoints:
     """f32[N] as recorded, from 0 on without a limit."""
     turn: NDArray[np.float64]
     """f64[N], part of the turn (0..1) after which the point was measured."""
-    pixel: NDArray[np.int64]
-    """i64[N], index into the flattened range image; ``image`` i64[N] says which return."""
-    image: NDArray[np.int64]
     without_pose: int
     """Points that were left out because no pose was recorded for their pixel."""
 
@@ -440,9 +380,8 @@ def points_of_scan(
     other LiDARs are recorded as if all was measured at the frame's pose. Raises InputError: shapes that contradict each
     other, or values that are not finite."""
     shape = scan.returns[0].shape[:2]
-    if any(image.shape[:2] != shape for image in (*scan.returns, *scan.projections)) or (
-        scan.poses is not None and scan.poses.shape[:2] != shape
-    ):
+    poses_of = [] if scan.poses is None else [scan.poses]
+    if any(image.shape[:2] != shape for image in (*scan.returns, *poses_of)):
         raise InputError("range images of one scan differ in size", where=where, expected=str(list(shape)))
     rows, columns = shape
     inclination = laser.beam_inclinations(rows, where)
@@ -467,11 +406,11 @@ def points_of_scan(
             poses = scan.poses.reshape(-1, 6)[pixel]
             known = np.isfinite(poses).all(1) & (poses != 0).any(1)
             without_pose += int((~known).sum())
-            pixel, values, column, xyz, poses = pixel[known], values[known], column[known], xyz[known], poses[known]
-            xyz = _carried(xyz, poses.astype(np.float64), laser.vehicle_from_lidar, global_from_vehicle)
-        parts.append((xyz, values[:, 1], turn[column], pixel, np.full(len(pixel), index)))
-    xyz, intensity, turns, pixels, images = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return ScanPoints(xyz, intensity, turns, pixels, images, without_pose)
+            values, column, poses = values[known], column[known], poses[known].astype(np.float64)
+            xyz = _carried(xyz[known], poses, laser.vehicle_from_lidar, global_from_vehicle)
+        parts.append((xyz, values[:, 1], turn[column]))
+    xyz, intensity, turns = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return ScanPoints(xyz, intensity, turns, without_pose)
 
 
 def heading_of(laser: LaserCalibration) -> float:
@@ -507,74 +446,6 @@ def sweep_points(points: ScanPoints, dt_s: NDArray[np.float64]) -> SweepPoints:
     """Points as a sweep holds them; tanh, as is customary, brings intensity, which has no limit, to 0..1."""
     intensity = np.tanh(np.maximum(points.intensity.astype(np.float64), 0))
     return SweepPoints(points.xyz.astype(np.float32), intensity.astype(np.float32), dt_s.astype(np.float32))
-
-
-# --- time -----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class TurnClock:
-    """When the columns of the top LiDAR are measured: ``start_s`` after the frame's timestamp the turn begins, and
-    lasts ``duration_s``. ``measured``: found by comparing pixel poses with the vehicle's path; else the nominal
-    turn."""
-
-    start_s: float = 0.0
-    duration_s: float = TURN_S
-    measured: bool = False
-
-    def after_timestamp_s(self, turn: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Seconds after the frame's timestamp for parts of the turn (0..1)."""
-        return self.start_s + turn * self.duration_s
-
-
-def measure_turn(
-    poses: NDArray[np.float32], timestamp_s: float, path_times_s: NDArray[np.float64], path_xyz: NDArray[np.float64]
-) -> tuple[float, float] | None:
-    """Start (after the timestamp) and duration of a turn from where the vehicle was when each column was measured.
-
-    Args:
-        poses: f32[H, W, 6], pixel poses of the frame.
-        timestamp_s: of the frame.
-        path_times_s, path_xyz: f64[T], f64[T, 3]: places of the vehicle at known times around the frame, in time order.
-
-    Returns:
-        Seconds, or None where the vehicle moves too little, or its path does not explain the columns.
-    """
-    known = (poses != 0).any(2) & np.isfinite(poses).all(2)
-    columns = np.flatnonzero(known.sum(0) >= max(1, _MIN_ROWS_SHARE * len(known)))
-    if len(columns) < 10 or len(path_times_s) < 3:
-        return None
-    places = np.stack([poses[known[:, c], c, 3:].astype(np.float64).mean(0) for c in columns])
-    direction = path_xyz[-1] - path_xyz[0]
-    length = float(np.linalg.norm(direction))
-    if length < _MIN_MOTION_M:
-        return None
-    direction /= length
-    along_path = (path_xyz - path_xyz[0]) @ direction
-    along = (places - path_xyz[0]) @ direction
-    inside = (along >= along_path[0]) & (along <= along_path[-1])
-    if (np.diff(along_path) <= 0).any() or np.ptp(along) < _MIN_MOTION_M or inside.sum() < 10:
-        return None
-    times = np.interp(along[inside], along_path, path_times_s) - timestamp_s
-    turn = (columns[inside] + 0.5) / poses.shape[1]
-    duration, start = np.polyfit(turn, times, 1)
-    error = float(np.sqrt(np.mean((start + duration * turn - times) ** 2)))
-    if error > _MAX_FIT_ERROR_S or not 0.5 * TURN_S < abs(duration) < 2 * TURN_S:
-        return None
-    return float(start), float(duration)
-
-
-def median_clock(turns: Sequence[tuple[float, float]]) -> TurnClock:
-    """The clock of a log from the turns that could be measured.
-
-    Where they agree with the nominal turn within what the measurement can tell, and without any, it is the nominal one.
-    """
-    if not turns:
-        return TurnClock()
-    start, duration = (float(value) for value in np.median(np.array(turns), axis=0))
-    if max(abs(start), abs(start + duration - TURN_S)) <= _CLOCK_ERROR_S:
-        return TurnClock()
-    return TurnClock(start, duration, True)
 
 
 # --- cameras --------------------------------------------------------------------------------------
@@ -648,44 +519,3 @@ def panoptic_labels(ids: NDArray[np.int32], divisor: int) -> dict[str, NDArray[A
         "sky": classes == SKY_CLASS,
         "ego": classes == EGO_CLASS,
     }
-
-
-def projection_errors(
-    points: ScanPoints,
-    scan: records.LaserScan,
-    laser: LaserCalibration,
-    global_from_vehicle: Matrix,
-    cameras: Mapping[str, tuple[records.CameraCalibration, Matrix]],
-) -> dict[str, NDArray[np.float64]]:
-    """How far our projections of a scan lie from those recorded with it, in pixels of the recorded images.
-
-    The recorded ones follow the rolling shutter, ours hold for the middle column, so while the vehicle moves some
-    pixels are normal; wrong calibrations, poses or conversions show as hundreds.
-
-    Args:
-        points, scan, laser: a scan with projections, and its points.
-        global_from_vehicle: pose that the points are given for.
-        cameras: name -> calibration and the vehicle's pose in the global frame at the middle of the exposure.
-
-    Returns:
-        Camera name -> distances f64[n], for cameras with points.
-    """
-    xyz_vehicle = transform_points(laser.vehicle_from_lidar, points.xyz)
-    errors: dict[str, NDArray[np.float64]] = {}
-    for index, projections in enumerate(scan.projections):
-        chosen = points.image == index
-        recorded = projections.reshape(-1, 6)[points.pixel[chosen]]
-        for half in (recorded[:, :3], recorded[:, 3:]):
-            for number, name in records.CAMERAS.items():
-                if name not in cameras or not (here := half[:, 0] == number).any():
-                    continue
-                calibration, pose = cameras[name]
-                cam_from_vehicle = invert(pose @ vehicle_from_cam(calibration)) @ global_from_vehicle
-                xyz_cam = transform_points(cam_from_vehicle, xyz_vehicle[chosen][here])
-                z = np.where(xyz_cam[:, 2:] > 0.1, xyz_cam[:, 2:], np.nan)
-                fx, fy, cx, cy, *coefficients = calibration.intrinsic
-                uv = brown_conrady(*coefficients)(xyz_cam[:, :2] / z) * [fx, fy] + [cx, cy]
-                uv = np.where(np.isfinite(uv), uv, np.inf)  # behind the camera
-                off = np.linalg.norm(uv - (half[here, 1:] + 0.5), axis=1)
-                errors[name] = np.concatenate([errors.get(name, np.zeros(0)), off])
-    return errors

@@ -11,7 +11,7 @@ import struct
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal, Protocol
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,6 @@ from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Track
 from mudg.formats.importers.common import rigid_pose
 from mudg.formats.importers.drive_log import BoxTracks
-from mudg.formats.unknown_fields import note_unknown
 
 Matrix = NDArray[np.float64]
 Numbers = Sequence[float] | NDArray[np.float64]
@@ -125,8 +124,6 @@ class LaserScan:
     """Range images f32[H, W, 4]: range in metres (not above 0: none), intensity, elongation, no-label flag."""
     poses: NDArray[np.float32] | None = None
     """Of the top LiDAR's pixels, f32[H, W, 6]: roll, pitch, yaw, x, y, z of global from vehicle at their time."""
-    projections: Sequence[NDArray[np.int64]] = ()
-    """A return's i64[H, W, 6]: camera number, x, y of the first two images a point falls into; or empty."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,25 +141,6 @@ class FrameContent:
     images: Mapping[str, bytes]
     panoptic: Mapping[str, Panoptic]
     scans: Mapping[str, LaserScan]
-
-
-class WaymoLog(Protocol):
-    """A log in one of its two forms."""
-
-    name: str
-    form: str
-    cameras: Mapping[str, CameraCalibration]
-    lasers: Mapping[str, LaserCalibration]
-    frames: Sequence[FrameRecord]
-    conditions: str
-
-    def read(self, frame: FrameRecord, cameras: Sequence[str], *, projections: bool = False) -> FrameContent:
-        """The bulky parts of a frame, for the chosen cameras."""
-        ...
-
-    def pixel_poses(self, frame: FrameRecord) -> NDArray[np.float32] | None:
-        """Poses of the top LiDAR's pixels, or None where there are none."""
-        ...
 
 
 # --- records from the numbers of either form ------------------------------------------------------
@@ -243,8 +221,8 @@ def each_once(lasers: Sequence[str], where: str) -> tuple[str, ...]:
 # --- range images ---------------------------------------------------------------------------------
 
 
-def unpack_matrix(packed: bytes | memoryview, message: Message, channels: int, where: str) -> NDArray[Any]:
-    """A zlib-packed matrix message as an array [H, W, channels]. Raises InputError: damaged, too large, or of another
+def float_image(packed: bytes | memoryview, channels: int, where: str) -> NDArray[np.float32]:
+    """A zlib-packed matrix of floats as f32[H, W, channels]. Raises InputError: damaged, too large, or of another
     shape."""
     unpacker = zlib.decompressobj()
     try:
@@ -255,7 +233,7 @@ def unpack_matrix(packed: bytes | memoryview, message: Message, channels: int, w
         cut_off = not unpacker.unconsumed_tail
         what = "range image is cut off" if cut_off else "range image unpacks to more than any has"
         raise InputError(what, where=where, expected=f"at most {MAX_UNPACKED_BYTES} bytes", got=f"{len(content)} bytes")
-    values = parse_message(content, message, where)
+    values = parse_message(content, MATRIX_FLOAT, where)
     return shaped(values["data"], values.get("shape", {}).get("dims", ()), channels, where)
 
 
@@ -266,11 +244,6 @@ def shaped(data: NDArray[Any], dims: Sequence[int] | NDArray[np.integer], channe
         what, expected = "range image has the wrong shape", f"[rows, columns, {channels}], as many values as that"
         raise InputError(what, where=where, expected=expected, got=f"{list(shape)} with {len(data)} values")
     return data.reshape(shape)
-
-
-def float_image(packed: bytes | memoryview, channels: int, where: str) -> NDArray[np.float32]:
-    """A packed float matrix f32[H, W, channels]."""
-    return unpack_matrix(packed, MATRIX_FLOAT, channels, where)
 
 
 # tracks -------------------------------------------------------------------------------------------
@@ -434,11 +407,10 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A message description; ``passed``: numbers of the data set's fields that are not kept."""
+    """A message description: the fields to keep by their numbers."""
 
     name: str
     fields: Mapping[int, Field]
-    passed: frozenset[int] = frozenset()
 
 
 def parse_message(data: bytes | memoryview, message: Message, where: str) -> dict[str, Any]:
@@ -462,8 +434,6 @@ def parse_message(data: bytes | memoryview, message: Message, where: str) -> dic
     for start, number, wire, raw in reader.fields():
         field = message.fields.get(number)
         if field is None:
-            if number not in message.passed:
-                note_unknown(f"{message.name} messages", (f"field {number}",), frozenset())
             continue
         packed = wire == _BYTES and field.kind in ("doubles", "floats", "ints")
         if wire != _WIRE[field.kind] and not packed:
@@ -519,6 +489,11 @@ class _MessageReader:
                 raise self.broken(start, "a number of more than ten bytes")
         raise self.broken(start, "it ends inside a number")
 
+    def varints(self) -> Iterator[int]:
+        """Numbers to the end."""
+        while self._place < len(self._view):
+            yield self._varint()
+
     def _value(self, wire: int) -> Any:
         if wire == _VARINT:
             return self._varint()
@@ -541,7 +516,8 @@ class _MessageReader:
                 raise self.broken(start, f"field {field.name} holds {len(raw)} bytes, no multiple of {size}")
             return np.frombuffer(raw, _DTYPE[field.kind])
         if field.kind == "ints" and packed:
-            return unpack_varints(raw, f"{self._where}: {self._message.name}.{field.name}")
+            numbers = _MessageReader(raw, self._message, self._where)
+            return np.array(list(numbers.varints()), np.uint64).view(np.int64)
         if field.kind in ("int", "ints"):
             value = raw - (1 << 64) if raw >= 1 << 63 else raw
             return np.array([value]) if field.kind == "ints" else value
@@ -553,34 +529,13 @@ class _MessageReader:
         return raw if field.kind == "bytes" else struct.unpack("<d" if field.kind == "double" else "<f", raw)[0]
 
 
-def unpack_varints(data: bytes | memoryview, where: str) -> NDArray[np.int64]:
-    """A row of varints, all at once: i64[n]; negative numbers take ten bytes each. Raises InputError: the last number
-    is cut off, or one is longer than ten bytes."""
-    codes = np.frombuffer(data, np.uint8)
-    if len(codes) == 0:
-        return np.zeros(0, np.int64)
-    last = np.flatnonzero(codes < 0x80)
-    if len(last) == 0 or last[-1] != len(codes) - 1:
-        raise InputError("packed numbers are cut off", where=where)
-    first = np.r_[0, last[:-1] + 1]
-    lengths = last - first + 1
-    if lengths.max() > 10:
-        raise InputError("a packed number has more than ten bytes", where=where)
-    if lengths.max() == 1:
-        return codes.astype(np.int64)
-    shift = (np.arange(len(codes)) - np.repeat(first, lengths)).astype(np.uint64) * np.uint64(7)
-    return np.add.reduceat((codes & np.uint8(0x7F)).astype(np.uint64) << shift, first).view(np.int64)
-
-
 # --- the messages of the data set -----------------------------------------------------------------
 
 
-def _message(title: str, fields: str, passed: str = "", **inner: Message) -> Message:
-    """A description from ``name number kind, ...``; where the name is one of ``inner``, that is its description.
-    ``passed``: numbers of official fields that are not kept."""
+def _message(title: str, fields: str, **inner: Message) -> Message:
+    """A description from ``name number kind, ...``; where the name is one of ``inner``, that is its description."""
     rows = (row.split() for row in fields.split(","))
-    wanted = {int(number): Field(name, kind, inner.get(name)) for name, number, kind in rows}
-    return Message(title, wanted, frozenset(map(int, passed.split())))
+    return Message(title, {int(number): Field(name, kind, inner.get(name)) for name, number, kind in rows})
 
 
 _TRANSFORM = _message("Transform", "values 1 doubles")
@@ -596,10 +551,9 @@ _LASER_CALIBRATION = _message(
 )
 CONTEXT: Final = _message(
     "Context",
-    "name 1 text, cameras 2 messages, lasers 3 messages, stats 4 message",
+    "name 1 text, cameras 2 messages, lasers 3 messages",
     cameras=_CAMERA_CALIBRATION,
     lasers=_LASER_CALIBRATION,
-    stats=_message("Stats", "time_of_day 2 text, location 3 text, weather 4 text", "1 5"),
 )
 _CAMERA_IMAGE = _message(
     "CameraImage",
@@ -607,23 +561,22 @@ _CAMERA_IMAGE = _message(
     "trigger_s 7 double, done_s 8 double, panoptic 10 message",
     pose=_TRANSFORM,
     velocity=_message("Velocity", "v_x 1 float, v_y 2 float, v_z 3 float, w_x 4 double, w_y 5 double, w_z 6 double"),
-    panoptic=_message("CameraSegmentationLabel", "divisor 1 int, png 2 bytes", "3 4 5"),
+    panoptic=_message("CameraSegmentationLabel", "divisor 1 int, png 2 bytes"),
 )
-_RANGE_IMAGE = _message("RangeImage", "ranges 2 bytes, projections 3 bytes, poses 4 bytes", "1 5 6")
+_RANGE_IMAGE = _message("RangeImage", "ranges 2 bytes, poses 4 bytes")
 _BOX = _message(
     "Box", "x 1 double, y 2 double, z 3 double, width 4 double, length 5 double, height 6 double, heading 7 double"
 )
 FRAME: Final = _message(
     "Frame",
     "context 1 bytes, timestamp_us 2 int, pose 3 message, images 4 messages, lasers 5 messages, labels 6 messages",
-    "7 8 9 10 11",
     pose=_TRANSFORM,
     images=_CAMERA_IMAGE,
     lasers=_message(
         "Laser", "name 1 int, return1 2 message, return2 3 message", return1=_RANGE_IMAGE, return2=_RANGE_IMAGE
     ),
-    labels=_message("Label", "box 1 message, type 3 int, id 4 text", "2 5 6 7 8 9 10 11 12 13", box=_BOX),
+    labels=_message("Label", "box 1 message, type 3 int, id 4 text", box=_BOX),
 )
-_SHAPE = _message("MatrixShape", "dims 1 ints")
-MATRIX_FLOAT: Final = _message("MatrixFloat", "data 1 floats, shape 2 message", shape=_SHAPE)
-MATRIX_INT: Final = _message("MatrixInt32", "data 1 ints, shape 2 message", shape=_SHAPE)
+MATRIX_FLOAT: Final = _message(
+    "MatrixFloat", "data 1 floats, shape 2 message", shape=_message("MatrixShape", "dims 1 ints")
+)
