@@ -7,9 +7,7 @@ its transmittance would fall to 1e-4; colours are spherical harmonics plus 0.5, 
 
 Pinhole cameras. ``Camera.distortion`` describes the lens before rectification; images in a scene are rectified, so a
 picture drawn here belongs to the rectified camera and the coefficients play no part. A camera with ``readout_s`` > 0 is
-drawn as a global shutter at the view's time (``core/shutter.py`` moves the Gaussians to where a rolling one sees them),
-unless ``RasterConfig.shutter`` names the direction of its shutter and ``world_from_cam`` holds its poses at the first
-and the last row.
+drawn as a global shutter at the view's time: ``core/shutter.py`` moves the Gaussians to where a rolling one sees them.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal, get_args
+from typing import Final, Literal
 
 import torch
 from torch import Tensor
@@ -26,19 +24,14 @@ from mudg import native
 from mudg.base import log
 from mudg.base.devices import choose_device
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.base.types import Gaussians, Render, Shutter, View
+from mudg.base.types import Gaussians, Render, View
 from mudg.core.raster import cpu as raster_cpu
 from mudg.core.raster import gsplat_cuda, torch_twin
-from mudg.core.raster import gsplat_cuda as gsplat_package
 from mudg.core.raster.request import Request
 
 Backend = Literal["auto", "cpu", "torch", "gsplat"]
-Projection = Literal["linear", "unscented"]
-Primitive = Literal["ellipsoid", "disc"]
 MAX_EXTRA_CHANNELS: Final = 28
 MAX_SH_DEGREE: Final = 3
-ONLY_GSPLAT: Final = {"packed": False, "projection": "linear", "primitive": "ellipsoid", "shutter": "global"}
-"""Settings that only the backend gsplat has, each with the value that every backend draws."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,15 +45,6 @@ class RasterConfig:
         alpha_max: cap on the alpha of one Gaussian at one pixel, in (0, 1).
         antialias: scale opacity by sqrt(det(covariance) / det(covariance + blur)), so that blurring adds no light.
         sh_degree: degree of spherical harmonics in use, 0 to 3; None = what the coefficients allow.
-
-    Only gsplat (CUDA) has these; other backends refuse any value but the first:
-        packed: False, or True = keep working memory only for Gaussians that a view sees: less memory, slightly slower.
-        projection: "linear" = the image of a Gaussian is linearised at its mean; "unscented" = sigma points find where
-            it is seen and its response is evaluated along each pixel's ray (3DGUT, Wu et al. 2025). Without
-            ``blur_px2``, without gradients of projected means and of poses.
-        primitive: "ellipsoid", or "disc" = flat Gaussians, the third scale is not used (2DGS, Huang et al. 2024).
-        shutter: "global", or the direction in which a rolling shutter reads the image; needs projection="unscented" and
-            poses at the first and the last row (or column) in ``world_from_cam``.
     """
 
     backend: Backend = "auto"
@@ -70,10 +54,6 @@ class RasterConfig:
     alpha_max: float = 0.99
     antialias: bool = False
     sh_degree: int | None = None
-    packed: bool = False
-    projection: Projection = "linear"
-    primitive: Primitive = "ellipsoid"
-    shutter: Shutter = "global"
 
     def __post_init__(self) -> None:
         if self.backend not in ("auto", *BACKENDS):
@@ -86,30 +66,6 @@ class RasterConfig:
             )
         if self.sh_degree is not None and not 0 <= self.sh_degree <= MAX_SH_DEGREE:
             raise UsageError("sh_degree is out of range", expected=f"0 to {MAX_SH_DEGREE}", got=str(self.sh_degree))
-        for name, allowed in (("projection", Projection), ("primitive", Primitive), ("shutter", Shutter)):
-            if (value := getattr(self, name)) not in get_args(allowed):
-                raise UsageError(
-                    f"unknown {name} of the rasterizer", expected=", ".join(get_args(allowed)), got=repr(value)
-                )
-        for together, remedy in self._contradictions():
-            raise UsageError(f"the rasterizer cannot combine {together}", remedy=remedy)
-
-    def _contradictions(self) -> list[tuple[str, str]]:
-        """Settings that gsplat does not offer together, and what to do."""
-        unscented, disc = self.projection == "unscented", self.primitive == "disc"
-        rows = [
-            (
-                self.shutter != "global" and not unscented,
-                "a rolling shutter with projection='linear'",
-                "set projection='unscented'",
-            ),
-            (unscented and disc, "projection='unscented' with primitive='disc'", "choose one of them"),
-            (unscented and self.packed, "projection='unscented' with packed", "set packed=False"),
-            (disc and self.packed, "primitive='disc' with packed", "set packed=False"),
-            (unscented and self.antialias, "projection='unscented' with antialias", "set antialias=False"),
-            (disc and self.antialias, "primitive='disc' with antialias", "set antialias=False"),
-        ]
-        return [(together, remedy) for wrong, together, remedy in rows if wrong]
 
 
 # Each backend: Request -> Render. The only place where backends are listed.
@@ -139,8 +95,6 @@ def rasterize(
         background: colour behind everything, in [0, 1]: [3] or [3, H, W], or one per view: [V, 3] or [V, 3, H, W];
             None = black. Differentiable.
         world_from_cam: [4, 4] (with several views [V, 4, 4]) rigid, differentiable poses used instead of the views'.
-            With a rolling shutter [2, 4, 4] ([V, 2, 4, 4]): the poses when the first and the last row (or column) are
-            read.
         absgrad: also fill ``trace.abs_grad2d`` in backward (sum over pixels of |d loss / d mean2d|, pixels).
 
     Returns:
@@ -158,10 +112,9 @@ def rasterize(
     batched = not isinstance(view, View)
     views = (view,) if isinstance(view, View) else tuple(view)
     degree = _check(gaussians, config)
-    _check_views(views, config)
-    poses = _poses(world_from_cam, len(views), batched, config)
+    _check_views(views)
+    poses = _poses(world_from_cam, len(views), batched)
     name = _choose_backend(gaussians, config)
-    refuse_settings(name, config)
     flat, pixelwise = _backgrounds(background, views, batched)
     drawn = BACKENDS[name](Request(gaussians, views, batched, config, degree, flat, poses, absgrad))
     if pixelwise is None:
@@ -174,7 +127,7 @@ def available(backend: str) -> str:
     if backend == "cpu":
         return "" if native.library() is not None else native.status()
     if backend == "gsplat":
-        return gsplat_package.problem()
+        return gsplat_cuda.problem()
     return "" if backend == "torch" else f"unknown backend {backend!r}"
 
 
@@ -208,22 +161,6 @@ def _choose_backend(gaussians: Gaussians, config: RasterConfig) -> str:
     reason = f"tensors are {dtype} on {device}" if not available("cpu") else available("cpu")
     log.info_once(f"rasterizer: torch reference, 10 to 100 times slower than the native kernel ({reason})")
     return "torch"
-
-
-def refuse_settings(backend: str, config: RasterConfig) -> None:
-    """Refuse settings that a backend does not draw.
-
-    Raises:
-        UsageError: one of ``ONLY_GSPLAT`` with another backend.
-    """
-    for name, common in ONLY_GSPLAT.items():
-        value = getattr(config, name)
-        if backend != "gsplat" and value != common:
-            raise UsageError(
-                f"raster backend {backend!r} has no {name}={value!r}; only gsplat on a CUDA device has",
-                expected=f"{name}={common!r}",
-                remedy=f"leave {name} at {common!r}, or use backend='gsplat'",
-            )
 
 
 def _check(gaussians: Gaussians, config: RasterConfig) -> int:
@@ -267,7 +204,7 @@ def _check(gaussians: Gaussians, config: RasterConfig) -> int:
     return degree
 
 
-def _check_views(views: tuple[View, ...], config: RasterConfig) -> None:
+def _check_views(views: tuple[View, ...]) -> None:
     if not views:
         raise InputError("there is no view to draw", expected="a View or a sequence of Views")
     size = (views[0].camera.width, views[0].camera.height)
@@ -280,30 +217,20 @@ def _check_views(views: tuple[View, ...], config: RasterConfig) -> None:
                 expected=f"{size[0]}x{size[1]}",
                 got=f"{camera.width}x{camera.height}",
             )
-        if camera.readout_s > 0 and camera.shutter == config.shutter == "global":
+        if camera.readout_s > 0 and camera.shutter == "global":
             log.info_once(
                 f"rasterizer: the rolling shutter of camera {camera.name!r} ({camera.readout_s} s) is not followed, "
                 "as its direction is unknown; drawn as a global shutter at the view's time"
             )
 
 
-def _poses(world_from_cam: Tensor | None, views: int, batched: bool, config: RasterConfig) -> tuple[Tensor | None, ...]:
-    rolling = config.shutter != "global"
-    wanted = (*((views,) if batched else ()), *((2,) if rolling else ()), 4, 4)
+def _poses(world_from_cam: Tensor | None, views: int, batched: bool) -> tuple[Tensor | None, ...]:
     if world_from_cam is None:
-        if rolling:
-            raise InputError(
-                "a rolling shutter needs the poses at its first and last row",
-                where="world_from_cam",
-                expected=str(list(wanted)),
-                got="None",
-                remedy="give both poses, or set shutter='global'",
-            )
         return (None,) * views
+    wanted = (views, 4, 4) if batched else (4, 4)
     if tuple(world_from_cam.shape) != wanted:
-        raise InputError(
-            "world_from_cam has the wrong shape", expected=str(list(wanted)), got=str(list(world_from_cam.shape))
-        )
+        got = str(list(world_from_cam.shape))
+        raise InputError("world_from_cam has the wrong shape", expected=str(list(wanted)), got=got)
     return world_from_cam.unbind(0) if batched else (world_from_cam,)
 
 
