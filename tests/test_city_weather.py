@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from city_camera import city_light
 
 from mudg import native
 from mudg.base.palette import ID
 from mudg.base.types import View
 from mudg.city.config import CityConfig
-from mudg.city.light import city_light, weather_numbers
+from mudg.city.light import LAMP_POWER, weather_numbers
 from mudg.city.world import CityWorld
 from mudg.core.weather import air as fog
 from mudg.core.weather import ground
-from mudg.core.weather import light as relight
 from mudg.core.weather.gbuffer import euclidean_range, world_points
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="the city needs the native library")
@@ -55,7 +55,7 @@ def test_fog_follows_koschmieder(clear: CityWorld, view: View) -> None:
     camera."""
     truth, light = clear.render(view), city_light(CLEAR)
     hazy = CityWorld(replace(CLEAR, fog_visibility_m=120.0)).render(view)
-    curve, solid = light.response.curve(), ~truth.sky
+    curve, solid = light.response, ~truth.sky
     distance = euclidean_range(view, np.where(solid, truth.depth, 0))
     shares = [np.exp(-fog.extinction(v) * distance) for v in (light.visibility_m, 120.0)]
     air = light.surroundings.airlight
@@ -96,6 +96,16 @@ def test_wet_ground_is_where_the_rule_says_and_nothing_else_changes(clear: CityW
     )
 
 
+def lamp_light(xyz: np.ndarray, normal: np.ndarray, lamps: np.ndarray) -> np.ndarray:
+    """Green irradiance over pi f64[N] of lamps [M, 3] that shine down in a cone; nothing casts shadows."""
+    to = lamps - xyz[:, None]
+    d = np.maximum(np.linalg.norm(to, axis=-1), 0.5)
+    edge = np.cos(np.radians(75.0))
+    cone = fog.smoothstep(edge, edge + 0.25, to[..., 2] / d) * (d < 45.0)
+    facing = np.maximum((normal[:, None] * to).sum(-1) / d, 0)
+    return 0.82 * (LAMP_POWER * facing * cone / d**2).sum(1)
+
+
 def test_lamps_light_the_road_at_night() -> None:
     config = replace(CLEAR, light="night", traffic=0.0)
     world = CityWorld(config)
@@ -104,9 +114,9 @@ def test_lamps_light_the_road_at_night() -> None:
     surfaces, truth = world.surfaces(at), world.render(at)
     road = truth.semantics == ID["road"]
     points = world_points(at, truth.depth)
-    level = relight.lamp_light(points[road], surfaces.normal[road], world.lamps)[:, 1]
-    light = city_light(config, world.lamps)
-    shown = light.response.curve().decode(truth.rgb)[road][:, 1] / np.maximum(surfaces.albedo[road][:, 1], 1e-3)
+    level = lamp_light(points[road], surfaces.normal[road], world.lamps)
+    light = city_light(config)
+    shown = light.response.decode(truth.rgb)[road][:, 1] / np.maximum(surfaces.albedo[road][:, 1], 1e-3)
     assert np.corrcoef(level, shown)[0, 1] > 0.85  # shadows of what stands between are all that differs
     assert np.median(shown / (level + light.surroundings.ambient[1])) == pytest.approx(1, abs=0.2)
 

@@ -32,6 +32,7 @@ from mudg.base.weather_settings import FogSettings
 # puddles and patches of snow.
 
 
+Array = NDArray[np.float64]
 Hashes = NDArray[np.uint32]
 _QUANTILE_SIDE = 192
 _QUANTILE_STEP = 0.73
@@ -94,9 +95,6 @@ def smoothstep(low: float, high: float, v: Any) -> Any:
     """0 below ``low``, 1 above ``high``, smooth between."""
     t = np.clip((v - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)
-
-
-# air ----------------------------------------------------------------------------------------------
 
 
 # fog ----------------------------------------------------------------------------------------------
@@ -165,8 +163,6 @@ def unveiled(color: NDArray[np.floating], share: Array, airlight: Array) -> NDAr
 # particles ----------------------------------------------------------------------------------------
 
 
-Array = NDArray[np.float64]
-
 DROP_LIGHT = 0.94
 RAIN_EDGES_MM = (1.0, 1.5, 2.0, 3.0, 5.0)
 FLAKE_EDGES_MM = (0.7, 1.2, 2.0, 3.5)
@@ -174,6 +170,8 @@ FLAKE_GROWTH = 10.0 ** (1 / 3)
 FLAKE_SPEED = 1.0
 FLAKE_SWAY_M = 0.1
 NEAREST_M = 0.25
+SHUTTER_S = 0.01
+"""Exposure time: length of the streaks."""
 _STEP_PX = 0.7
 _MOST_STEPS = 400
 
@@ -235,15 +233,6 @@ def snow_extinction(mm_h: float) -> float:
         return 0.0
     n0, slope = 3800.0 * mm_h**-0.87, 2.55 * mm_h**-0.48
     return 2 * n0 * math.pi / 4 * FLAKE_GROWTH**2 * 2 / slope**3 * 1e-6
-
-
-def area_per_m(sizes: list[ParticleSize]) -> float:
-    """Area of the particles in a cubic metre, m^2 per m^3: what a ray meets per metre."""
-    return sum(s.density * math.pi / 4 * s.diameter_m**2 for s in sizes)
-
-
-def _velocity(size: ParticleSize, wind: tuple[float, float]) -> Array:
-    return np.array([wind[0], wind[1], -size.fall_m_s])
 
 
 def _inside(view: View, xyz: Array, reach_m: float, margin_m: float) -> NDArray[np.bool_]:
@@ -313,13 +302,11 @@ def places(size: ParticleSize, velocity: Array, view: View, reach_m: float, key:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moving:
-    """Particles at the middle of an exposure: world places f64[N, 3], velocity f64[3] against the camera, diameter,
-    exposure time."""
+    """Particles at the middle of an exposure: world places f64[N, 3], velocity f64[3] against the camera, diameter."""
 
     xyz: Array
     velocity: Array
     diameter_m: float
-    shutter_s: float
 
 
 def covered(view: View, depth: NDArray[np.floating], moving: Moving) -> Array:
@@ -337,7 +324,7 @@ def covered(view: View, depth: NDArray[np.floating], moving: Moving) -> Array:
     camera = view.camera
     turn = view.world_from_cam[:3, :3]
     middle = (moving.xyz - view.center_world) @ turn
-    half = (moving.velocity * moving.shutter_s / 2) @ turn
+    half = (moving.velocity * SHUTTER_S / 2) @ turn
     ends = [middle - half, middle + half]
     kept = (ends[0][:, 2] > NEAREST_M) & (ends[1][:, 2] > NEAREST_M)
     start, end = ends[0][kept], ends[1][kept]
@@ -384,13 +371,11 @@ def _splat(at: Array, mass: Array, z: Array, depth: NDArray[np.floating]) -> Arr
 
 @dataclass(frozen=True, slots=True)
 class Falling:
-    """What falls: sizes, wind along x and y in m/s, how near it is drawn, exposure time, and a name for the random
-    numbers."""
+    """What falls: sizes, wind along x and y in m/s, how near it is drawn, and a name for the random numbers."""
 
     sizes: list[ParticleSize]
     wind_m_s: tuple[float, float]
     reach_m: float
-    shutter_s: float
     purpose: str
 
 
@@ -400,10 +385,8 @@ def falling(
     """Optical depth f64[H, W] of all particles of a kind within their reach, at ``view.time_s``."""
     total = np.zeros(depth.shape)
     for index, size in enumerate(fall.sizes):
-        velocity = _velocity(size, fall.wind_m_s)
+        velocity = np.array([*fall.wind_m_s, -size.fall_m_s])
         xyz = places(size, velocity, view, fall.reach_m, seeds.key(seed, index, fall.purpose))
         xyz = xyz[np.linalg.norm(xyz - view.center_world, axis=1) < fall.reach_m]
-        total += covered(
-            view, depth, Moving(xyz, velocity - np.asarray(camera_velocity), size.diameter_m, fall.shutter_s)
-        )
+        total += covered(view, depth, Moving(xyz, velocity - np.asarray(camera_velocity), size.diameter_m))
     return total
