@@ -13,7 +13,7 @@ two samples of the truth give beside them. ``kernel_distance`` alone is unbiased
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -24,9 +24,6 @@ from mudg.base.errors import InputError
 Features = NDArray[np.float64]
 
 KID_DEGREE: Final = 3
-MIND_DIRECTIONS: Final = 1000
-MIND_FACTOR: Final = 3.0
-INFINITY_SIZES: Final = 15
 CMMD_SIGMA: Final = 10.0
 CMMD_FACTOR: Final = 1000.0
 JEDI_DEGREE: Final = 2
@@ -61,36 +58,6 @@ def _covariance_root(features: Features) -> Features:
     """R ``[min(n, d), d]`` with R^T R = the covariance of rows."""
     centred = (features - features.mean(0)) / math.sqrt(len(features) - 1)
     return np.asarray(np.linalg.qr(centred, mode="r")) if len(features) > features.shape[1] else centred
-
-
-def frechet_at_infinity(
-    generated: ArrayLike, real: ArrayLike, rng: np.random.Generator, sizes: int = INFINITY_SIZES
-) -> float:
-    """The Frechet distance extrapolated to endless sets: its bias is nearly linear in 1/N.
-
-    Both sets are reduced to N random rows (without replacement), for ``sizes`` values of N at even distances from half
-    of the smaller set to all of it; the distances are regressed on 1/N, and the intercept is returned. Useful from
-    about 1000 rows on.
-
-    Args:
-        generated, real: ``[n, d]`` and ``[m, d]``, at least twice ``sizes`` rows each.
-        rng: chooses the rows. sizes: number of sizes, >= 2.
-
-    Returns:
-        In squared units of the features, (-inf, inf): an extrapolation may fall below 0.
-
-    Raises:
-        InputError: as ``frechet_distance``.
-    """
-    a, b = _pair(generated, real, max(4, 2 * sizes))
-    most = min(len(a), len(b))
-    counts = np.unique(np.linspace(most / 2, most, sizes).round().astype(int))
-    found = []
-    for count in counts:
-        rows_a, rows_b = (rng.choice(len(x), count, replace=False) for x in (a, b))
-        found.append(frechet_distance(a[rows_a], b[rows_b]))
-    slope_and_start = np.polynomial.polynomial.polyfit(1.0 / counts, found, 1)
-    return float(slope_and_start[0])
 
 
 def kernel_distance(generated: ArrayLike, real: ArrayLike) -> float:
@@ -168,34 +135,6 @@ def _unbiased(own_a: Features, own_b: Features, across: Features, a: Features, b
     return within(own_a, a) + within(own_b, b) - 2.0 * float(a @ across @ b / (a.sum() * b.sum()))
 
 
-def mind_distance(
-    generated: ArrayLike, real: ArrayLike, rng: np.random.Generator, directions: int = MIND_DIRECTIONS
-) -> float:
-    """MIND: squared 2-Wasserstein distance along random directions, times 3 d (sliced Wasserstein distance).
-
-    Both sets are projected on unit vectors and sorted; the mean over directions and ranks of the squared difference is
-    multiplied by 3 d. A larger set is first reduced to the size of the smaller one, to random rows.
-
-    Args:
-        generated, real: ``[n, d]`` and ``[m, d]``, n, m >= 1.
-        rng: draws rows and directions: the same state and sizes give the same directions. directions: how many.
-
-    Returns:
-        In squared units of the features, [0, inf); 0 for equal sets in any order. Symmetric for sets of equal size; 3
-        |t|^2 on average over directions when one set is the other moved by t.
-
-    Raises:
-        InputError: as ``frechet_distance``.
-    """
-    a, b = _pair(generated, real, 1)
-    width, count = a.shape[1], min(len(a), len(b))
-    lines = rng.standard_normal((width, directions))
-    lines /= np.linalg.norm(lines, axis=0)
-    a, b = (x if len(x) == count else x[rng.choice(len(x), count, replace=False)] for x in (a, b))
-    apart = np.sort(a @ lines, axis=0) - np.sort(b @ lines, axis=0)
-    return float(MIND_FACTOR * width * (apart**2).mean())
-
-
 def cmmd_distance(generated: ArrayLike, real: ArrayLike) -> float:
     """CMMD: squared maximum mean discrepancy of directions under a Gaussian kernel of sigma 10, times 1000.
 
@@ -220,13 +159,12 @@ def cmmd_distance(generated: ArrayLike, real: ArrayLike) -> float:
                 "an embedding of length 0 has no direction", where=f"{name}, row {int(np.argmin(lengths))}"
             )
         units.append(features / lengths)
-    a, b = units
 
-    def mean_kernel(x: Features, y: Features) -> float:
+    def kernel(x: Features, y: Features) -> Features:
         squared = (x**2).sum(1)[:, None] + (y**2).sum(1) - 2.0 * (x @ y.T)
-        return float(np.exp(-np.maximum(squared, 0.0) / (2.0 * CMMD_SIGMA**2)).mean())
+        return np.exp(-np.maximum(squared, 0.0) / (2.0 * CMMD_SIGMA**2))
 
-    return max(0.0, CMMD_FACTOR * (mean_kernel(a, a) + mean_kernel(b, b) - 2.0 * mean_kernel(a, b)))
+    return CMMD_FACTOR * _biased(kernel, units[0], units[1])
 
 
 def polynomial_distance(generated: ArrayLike, real: ArrayLike) -> float:
@@ -246,11 +184,13 @@ def polynomial_distance(generated: ArrayLike, real: ArrayLike) -> float:
         InputError: as ``frechet_distance``.
     """
     a, b = _pair(generated, real, 1)
+    return JEDI_FACTOR * _biased(lambda x, y: (x @ y.T / x.shape[1]) ** JEDI_DEGREE, a, b)
 
-    def mean_kernel(x: Features, y: Features) -> float:
-        return float(((x @ y.T / x.shape[1]) ** JEDI_DEGREE).mean())
 
-    return max(0.0, JEDI_FACTOR * (mean_kernel(a, a) + mean_kernel(b, b) - 2.0 * mean_kernel(a, b)))
+def _biased(kernel: Callable[[Features, Features], Features], a: Features, b: Features) -> float:
+    """Squared maximum mean discrepancy with full kernel matrices, their diagonals included; not below 0."""
+    own_a, own_b, across = (float(kernel(x, y).mean()) for x, y in ((a, a), (b, b), (a, b)))
+    return max(0.0, own_a + own_b - 2.0 * across)
 
 
 def _pair(generated: ArrayLike, real: ArrayLike, fewest: int) -> tuple[Features, Features]:
