@@ -29,7 +29,7 @@ from mudg.base.html import TextTable, cells, markdown_table
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Frame, FusedCloud, Observation, Scene, Track, View
 from mudg.benchmarks.chain import finished, render_page, wall
-from mudg.benchmarks.cities import drawn_pixels
+from mudg.benchmarks.cities import SAME, drawn_pixels
 from mudg.benchmarks.settings import BenchConfig
 from mudg.core import lidar, metrics, pictures, street_scores
 from mudg.core import metrics as flicker
@@ -164,7 +164,7 @@ class Sums:
 
 def changed_pixels(edited: Tensor, unedited: Tensor) -> NDArray[np.bool_]:
     """Where colours f32[3, H, W] in [0, 1] differ by more than a step of 8 bits in a channel, bool[H, W]."""
-    return ((edited - unedited).abs().amax(0) > 1.5 / 255).numpy()
+    return ((edited - unedited).abs().amax(0) > SAME).numpy()
 
 
 def gradient_correlation(edited: Tensor, unedited: Tensor) -> float | None:

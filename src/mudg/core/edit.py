@@ -136,15 +136,10 @@ class HeightMap:
 
     def normal(self, xy: Array) -> Array:
         """Unit normals f64[N, 3] of the ground at places f64[N, 2], upwards; vertical where it is not known."""
-        slopes = np.stack([self._slope(xy, axis) for axis in (0, 1)], 1)
+        rises = [self.height(xy + step) - self.height(xy - step) for step in TILT_M * np.eye(2)]
+        slopes = np.nan_to_num(np.stack(rises, 1) / (2 * TILT_M))
         normals = np.column_stack([-slopes, np.ones(len(slopes))])
         return normals / np.linalg.norm(normals, axis=1, keepdims=True)
-
-    def _slope(self, xy: Array, axis: int) -> Array:
-        """Rise per metre along an axis over `TILT_M` to either side, f64[N]; 0 where not known."""
-        step = np.zeros(2)
-        step[axis] = TILT_M
-        return np.nan_to_num((self.height(xy + step) - self.height(xy - step)) / (2 * TILT_M))
 
     def _at(self, xy: Array) -> Array:
         return (np.asarray(xy, np.float64) - self.origin) / self.cell_m
@@ -313,26 +308,23 @@ def grounded(motion: Motion, before: Motion, ground: HeightMap) -> Motion:
 
     Keys of both belong together. Where the ground is unknown at either place, a key stays as it is.
     """
-    new_xy, old_xy = motion.poses[:, :2, 3], before.poses[:, :2, 3]
-    rise = ground.height(new_xy) - ground.height(old_xy)
-    poses = motion.poses.copy()
-    for i, (up, new, old) in enumerate(zip(rise, ground.normal(new_xy), ground.normal(old_xy), strict=True)):
-        if np.isfinite(up):
-            poses[i, 2, 3] += up
-            poses[i, :3, :3] = _turn_between(old, new) @ poses[i, :3, :3]
-    return replace(motion, poses=poses)
+    new, old = motion.poses[:, :2, 3], before.poses[:, :2, 3]
+    return _set_on(motion, ground.height(new) - ground.height(old), ground.normal(old), ground.normal(new))
 
 
 def regrounded(motion: Motion, old: HeightMap, new: HeightMap) -> Motion:
     """A path on other ground below the same places: the height above it and the tilt against it stay. Unknown ground
     changes nothing."""
     xy = motion.poses[:, :2, 3]
+    return _set_on(motion, new.height(xy) - old.height(xy), old.normal(xy), new.normal(xy))
+
+
+def _set_on(motion: Motion, rise: Array, before: Array, after: Array) -> Motion:
+    """A path whose ground rises, and turns from one normal to another, at every key; NaN: stays."""
     poses = motion.poses.copy()
-    rise = new.height(xy) - old.height(xy)
-    for i, (up, below, above) in enumerate(zip(rise, old.normal(xy), new.normal(xy), strict=True)):
-        if np.isfinite(up):
-            poses[i, 2, 3] += up
-            poses[i, :3, :3] = _turn_between(below, above) @ poses[i, :3, :3]
+    for i in np.flatnonzero(np.isfinite(rise)):
+        poses[i, 2, 3] += rise[i]
+        poses[i, :3, :3] = _turn_between(before[i], after[i]) @ poses[i, :3, :3]
     return replace(motion, poses=poses)
 
 

@@ -257,7 +257,7 @@ def color_points(
     votes: list[tuple[NDArray[np.intp], NDArray[np.uint8], NDArray[np.float32]]] = []
     members = {index: np.flatnonzero(owner == index) for index in owned}
     gap_deg = rules.beam_gap_deg or measure_beam_gap(sweep.points.xyz)
-    stands = standing_points(_apply(_turn_only(sweep.world_from_lidar), sweep.points.xyz))
+    stands = standing_points(_upright(sweep))
     for shot in sweep.shots:
         xyz_cam, known = _points_in_camera(sweep, shot.view, members, owned, dynamic)
         ids, column, row, z = _pixels(xyz_cam, known, shot.view, rules)
@@ -288,7 +288,7 @@ def points_in_image(
     ids, column, row, z = _pixels(xyz_cam, known, view, rules)
     if not rules.occlusion_test or len(ids) == 0:
         return ids, column, row, z
-    stands = standing_points(_apply(_turn_only(sweep.world_from_lidar), sweep.points.xyz))[ids]
+    stands = standing_points(_upright(sweep))[ids]
     visible = ~hidden_points(xyz_cam[ids], stands, view, rules.beam_gap_deg or measure_beam_gap(sweep.points.xyz))
     return ids[visible], column[visible], row[visible], z[visible]
 
@@ -325,6 +325,11 @@ def _pixels(
     column, row = (np.floor(place) for place in pinhole(camera.intrinsics, x, y, z))
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     return ids[inside], column[inside].astype(np.intp), row[inside].astype(np.intp), z[inside]
+
+
+def _upright(sweep: SweepShots) -> NDArray[np.float32]:
+    """Points f32[N, 3] in the world's axes, from the sensor."""
+    return sweep.points.xyz @ sweep.world_from_lidar[:3, :3].T.astype(np.float32)
 
 
 def standing_points(xyz: NDArray[np.floating], cell_m: float = 2.0, margin_m: float = 0.35) -> NDArray[np.bool_]:
@@ -394,17 +399,6 @@ def _count_votes(
     winner = tally.argmax(1).astype(np.uint8)
     winner[tally.max(1, initial=0.0) <= 0] = palette.UNLABELLED
     return winner
-
-
-def _classes_first(classes: NDArray[np.uint8] | None, voted: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Classes given to the points u8[N]; where they have none, those that the images ``voted`` for."""
-    return voted if classes is None else np.where(classes == palette.UNLABELLED, voted, classes)
-
-
-def _turn_only(a_from_b: Matrix) -> Matrix:
-    turn = a_from_b.copy()
-    turn[:3, 3] = 0
-    return turn
 
 
 def largest_beam_gap(xyz_lidar: NDArray[np.floating]) -> float:
@@ -555,7 +549,9 @@ def fuse_sweeps(
         labelled |= sweep.points.classes is not None or any(shot.semantics is not None for shot in sweep.shots)
         owner, owned = separate(sweep, dynamic, rules)
         colors = color_points(sweep, owner, owned, dynamic, rules, cameras)
-        semantics = _classes_first(sweep.points.classes, colors.semantics)
+        semantics, given = colors.semantics, sweep.points.classes
+        if given is not None:  # images vote for points that people gave no class
+            semantics = np.where(given == palette.UNLABELLED, semantics, given)
         keep = colors.seen & (owner == STATIC)
         static.add(
             _apply(sweep.world_from_lidar, sweep.points.xyz[keep]),

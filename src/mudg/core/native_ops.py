@@ -57,10 +57,10 @@ def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, we
     gradient, status = torch.empty_like(image), ctypes.c_int(0)
     library.mudg_photometric.restype = ctypes.c_double
     value = library.mudg_photometric(
-        *map(_address, (image, wanted, weight)),
+        *map(address, (image, wanted, weight)),
         *map(ctypes.c_int, image.shape),
         ctypes.c_float(ssim_weight),
-        _address(gradient),
+        address(gradient),
         ctypes.byref(status),
     )
     if status.value != 0:
@@ -106,12 +106,12 @@ def class_loss(
     gradient, status = torch.empty_like(values), ctypes.c_int(0)
     library.mudg_class_loss.restype = ctypes.c_double
     value = library.mudg_class_loss(
-        *map(_address, (values, ids, weight, added)),
+        *map(address, (values, ids, weight, added)),
         ctypes.c_int(channel),
         ctypes.c_int(len(values)),
         ctypes.c_int64(ids.numel()),
         ctypes.c_float(1.0 / float(total)),
-        _address(gradient),
+        address(gradient),
         ctypes.byref(status),
     )
     if status.value != 0:
@@ -220,7 +220,7 @@ def adam_columns(columns: Sequence[AdamColumn], step: int, chosen: Tensor | None
         table,
         ctypes.c_int(len(columns)),
         integer(rows),
-        ctypes.c_void_p(None if mask is None else mask.data_ptr()),
+        address(mask),
         real(BETA1),
         real(BETA2),
         real(EPSILON),
@@ -279,11 +279,7 @@ class _Over(torch.autograd.Function):
         picture, cover, small = (t.detach().contiguous() for t in (rgb, alpha, coarse))
         out = torch.empty_like(picture)
         ctx.library, ctx.sizes = library, (ctypes.c_int * 5)(*picture.shape, *small.shape[1:])
-        _done(
-            library.mudg_over(
-                *map(_address, (picture, cover, small)), ctx.sizes, *map(_address, (out, None, None, None))
-            )
-        )
+        _call_over(ctx, (picture, cover, small), (out, None, None, None))
         ctx.save_for_backward(cover, small)
         return out
 
@@ -292,12 +288,13 @@ class _Over(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         cover, small = ctx.saved_tensors
         of_alpha, of_coarse, gradient = torch.empty_like(cover), torch.empty_like(small), upstream.contiguous()
-        _done(
-            ctx.library.mudg_over(
-                *map(_address, (None, cover, small)), ctx.sizes, *map(_address, (None, gradient, of_alpha, of_coarse))
-            )
-        )
+        _call_over(ctx, (None, cover, small), (None, gradient, of_alpha, of_coarse))
         return upstream, of_alpha, of_coarse, None
+
+
+def _call_over(ctx: Any, given: tuple[Tensor | None, ...], rest: tuple[Tensor | None, ...]) -> None:
+    if ctx.library.mudg_over(*map(address, given), ctx.sizes, *map(address, rest)) != 0:
+        raise ResourceError("not enough memory to put a picture over the sky")
 
 
 class _BoxMean(torch.autograd.Function):
@@ -316,18 +313,14 @@ def _boxes(values: Tensor, radius: int, transposed: bool, library: ctypes.CDLL) 
     values = values.contiguous()
     out, (height, width) = torch.empty_like(values), values.shape[-2:]
     sizes = map(ctypes.c_int, (values.numel() // (height * width), height, width, radius, transposed))
-    if library.mudg_box_mean(_address(values), *sizes, _address(out)) != 0:
+    if library.mudg_box_mean(address(values), *sizes, address(out)) != 0:
         raise ResourceError("not enough memory for means over boxes of pixels")
     return out
 
 
-def _address(tensor: Tensor | None) -> ctypes.c_void_p:
+def address(tensor: Tensor | None) -> ctypes.c_void_p:
+    """Address of a contiguous tensor's first element, for the native library."""
     return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
-
-
-def _done(status: int) -> None:
-    if status != 0:
-        raise ResourceError("not enough memory to put a picture over the sky")
 
 
 def _library_for(tensors: tuple[Tensor, ...]) -> ctypes.CDLL | None:
