@@ -98,7 +98,7 @@ def test_nothing_measured_is_nothing_known_and_bad_input_is_named() -> None:
     dense = complete_depth(rgb, np.full_like(depth, np.nan), sky)
     assert np.isnan(dense.depth[~sky]).all()
     assert (dense.confidence[~sky] == 0).all()
-    with pytest.raises(InputError, match="size"):
+    with pytest.raises(InputError, match="wrong shape"):
         complete_depth(rgb[:-1], depth, sky)
     with pytest.raises(InputError, match="positive"):
         complete_depth(rgb, np.where(np.isfinite(depth), -depth, np.nan).astype(np.float32), sky)

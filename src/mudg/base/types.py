@@ -106,13 +106,18 @@ def check_array(value: Any, where: str, shape: tuple[int | None, ...], dtype: ty
         raise InputError("an array has the wrong shape or type", where=where, expected=expected, got=found)
 
 
+def check_shape(value: Any, where: str, shape: tuple[int | None, ...]) -> None:
+    """Refuse an array or tensor of another shape; None stands for any size."""
+    got = tuple(getattr(value, "shape", ()))
+    if not _fits(got, shape):
+        expected = str(tuple(shape)).replace("None", "N")
+        raise InputError("a tensor has the wrong shape", where=where, expected=expected, got=str(got))
+
+
 def check_tensors(record: Any, **shapes: tuple[int | None, ...]) -> None:
     """Compare the shapes of tensor fields with the expected ones; None stands for any size."""
     for name, shape in shapes.items():
-        got = tuple(getattr(getattr(record, name), "shape", ()))
-        if not _fits(got, shape):
-            where, expected = f"{type(record).__name__.lower()}.{name}", str(shape).replace("None", "N")
-            raise InputError("a tensor has the wrong shape", where=where, expected=expected, got=str(got))
+        check_shape(getattr(record, name), f"{type(record).__name__.lower()}.{name}", shape)
 
 
 def check_given_tensors(record: Any, **shapes: tuple[int | None, ...]) -> None:

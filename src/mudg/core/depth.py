@@ -30,7 +30,7 @@ from torch import Tensor
 
 from mudg.base.errors import InputError
 from mudg.base.geometry import pixel_rays
-from mudg.base.types import View
+from mudg.base.types import View, check_shape
 
 # align --------------------------------------------------------------------------------------------
 #
@@ -77,11 +77,8 @@ def fit_depth(depth: Tensor, measured: Tensor, valid: Tensor, rounds: int = 12) 
     Raises:
         InputError: shapes differ.
     """
-    if depth.shape != measured.shape or depth.shape != valid.shape:
-        raise InputError(
-            "depth, measured depth and its mask differ in shape",
-            got=f"{tuple(depth.shape)}, {tuple(measured.shape)}, {tuple(valid.shape)}",
-        )
+    check_shape(measured, "fit_depth: measured depth", tuple(depth.shape))
+    check_shape(valid, "fit_depth: mask", tuple(depth.shape))
     known = valid & torch.isfinite(depth) & torch.isfinite(measured) & (measured > 0)
     x, y = _exactly(depth[known]), _exactly(measured[known])
     if len(x) == 0:
@@ -151,13 +148,8 @@ def fit_affine(values: Tensor, measured: Tensor, space: Space, rounds: int = 12)
     Raises:
         InputError: shapes differ, or there is no such space.
     """
-    if values.shape != measured.shape or values.ndim != 1:
-        raise InputError(
-            "values and measured depth differ in shape",
-            where="fit_affine",
-            expected="[N] and [N]",
-            got=f"{tuple(values.shape)}, {tuple(measured.shape)}",
-        )
+    check_shape(values, "fit_affine: values", (None,))
+    check_shape(measured, "fit_affine: measured depth", tuple(values.shape))
     if space not in ("depth", "disparity"):
         raise InputError("there is no such space", where="fit_affine", expected="depth or disparity", got=str(space))
     known = torch.isfinite(values) & torch.isfinite(measured) & (measured > 0)
@@ -291,18 +283,13 @@ def complete_depth(
     shape = measured.shape
     sky = np.zeros(shape, bool) if sky is None else sky
     beyond = np.zeros(shape, bool) if beyond is None else beyond & ~sky
-    if rgb.shape != (*shape, 3) or sky.shape != shape or beyond.shape != shape:
-        raise InputError(
-            "image, depth and sky differ in size",
-            where="complete_depth",
-            expected=f"{shape} and 3 channels",
-            got=f"{rgb.shape}, {sky.shape}",
-        )
+    check_shape(rgb, "complete_depth: image", (*shape, 3))
+    check_shape(sky, "complete_depth: sky", shape)
+    check_shape(beyond, "complete_depth: beyond", shape)
     known = np.isfinite(measured) & ~sky
     if (measured[known] <= 0).any():
-        raise InputError(
-            "measured depth is not positive", where="complete_depth", got=str(float(measured[known].min()))
-        )
+        got = str(float(measured[known].min()))
+        raise InputError("measured depth is not positive", where="complete_depth", got=got)
     depth = np.full(shape, np.nan, np.float32)
     confidence = np.zeros(shape, np.float32)
     depth[sky], confidence[sky] = SKY_M, 0.8

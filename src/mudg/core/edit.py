@@ -111,10 +111,8 @@ class HeightMap:
         points = np.asarray(xyz, np.float64)
         points = points[np.isfinite(points).all(1)]
         if not len(points):
-            raise InputError(
-                "there is no ground: no point is of class road, sidewalk or terrain",
-                remedy="fuse a scene with labels, or leave ground out (ground: false)",
-            )
+            what = "there is no ground: no point is of class road, sidewalk or terrain"
+            raise InputError(what, remedy="fuse a scene with labels, or leave ground out (ground: false)")
         cells = np.floor(points[:, :2] / cell_m).astype(np.int64)
         first = cells.min(0) - int(np.ceil(REACH_M / cell_m))
         shape = cells.max(0) - first + 1 + int(np.ceil(REACH_M / cell_m))
@@ -273,21 +271,13 @@ def lane_changed(
     """
     first, last = float(motion.times_s[0]), float(motion.times_s[-1])
     if not first <= start_s < last:
-        raise InputError(
-            "the lane change begins outside the path",
-            where="start_s",
-            expected=f"{first:.2f}..{last:.2f} s",
-            got=f"{start_s} s",
-        )
+        what = "the lane change begins outside the path"
+        raise InputError(what, where="start_s", expected=f"{first:.2f}..{last:.2f} s", got=f"{start_s} s")
     speed = motion.speed_at(start_s)
     if speed < STANDING_M_S:
-        raise InputError(
-            "only what drives can change lanes",
-            where="start_s",
-            expected=f"at least {STANDING_M_S} m/s",
-            got=f"{speed:.2f} m/s at {start_s} s",
-            remedy="use move to displace what stands",
-        )
+        what, expected = "only what drives can change lanes", f"at least {STANDING_M_S} m/s"
+        got = f"{speed:.2f} m/s at {start_s} s"
+        raise InputError(what, where="start_s", expected=expected, got=got, remedy="use move to displace what stands")
     keyed = motion.with_keys_between(start_s, start_s + duration_s)
     s = (keyed.times_s - start_s) / duration_s
     u = np.clip(s, 0, 1)

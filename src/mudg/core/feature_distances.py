@@ -1,8 +1,9 @@
 """Distances between two sets of feature vectors: how far the distribution of generated images is from that of real
 ones.
 
-All take two arrays ``[n, d]`` and ``[m, d]`` (rows are images, any real dtype), compute in float64 on the CPU and
-return a plain number. Smaller is better everywhere. What the features are decides the name of the number: with those of
+All take two arrays ``generated`` ``[n, d]`` and ``real`` ``[m, d]`` (rows are images, any real dtype), compute in
+float64 on the CPU and return a plain number. Smaller is better everywhere. InputError: sets of other widths, too few
+rows, or values that are not finite. What the features are decides the name of the number: with those of
 ``networks/inception.py`` ``frechet_distance`` is FID and ``kernel_distance`` is KID.
 
 All of them depend on the number of rows. The Frechet distance of two small samples of the *same* law is far from 0:
@@ -35,17 +36,8 @@ def frechet_distance(generated: ArrayLike, real: ArrayLike) -> float:
 
     ``|m1 - m2|^2 + tr S1 + tr S2 - 2 tr (S1 S2)^(1/2)``. The last trace is the nuclear norm of ``A B^T``, where A and B
     are the centred sets over the root of n - 1: exact also for singular covariances (n <= d), with no small number
-    added to any diagonal.
-
-    Args:
-        generated, real: ``[n, d]`` and ``[m, d]``, n, m >= 2.
-
-    Returns:
-        In squared units of the features, [0, inf). 0 for equal means and covariances, up to rounding. Symmetric;
-        unchanged by common rotations and translations of all features; multiplied by c^2 when all are multiplied by c.
-
-    Raises:
-        InputError: sets of other widths, too few rows, or values that are not finite.
+    added to any diagonal. n, m >= 2. In squared units of the features, [0, inf); 0 for equal means and covariances,
+    up to rounding. Symmetric; unchanged by common rotations and translations of all features.
     """
     a, b = _pair(generated, real, 2)
     apart = a.mean(0) - b.mean(0)
@@ -62,17 +54,10 @@ def _covariance_root(features: Features) -> Features:
 
 def kernel_distance(generated: ArrayLike, real: ArrayLike) -> float:
     """Unbiased squared maximum mean discrepancy with the kernel ``(x.y / d + 1)^3`` over all rows; KID on FID's
-    features.
+    features. n, m >= 2; n and m may differ.
 
-    Args:
-        generated, real: ``[n, d]`` and ``[m, d]``, n, m >= 2; n and m may differ.
-
-    Returns:
-        (-inf, inf), raw (not times 100 or 1000). Its mean over samples of one law is 0, so a single value may be
-        negative. Symmetric; unchanged by common rotations of all features.
-
-    Raises:
-        InputError: as ``frechet_distance``.
+    Raw (not times 100 or 1000). Its mean over samples of one law is 0, so a single value may be negative. Symmetric;
+    unchanged by common rotations of all features.
     """
     a, b = _pair(generated, real, 2)
     return _unbiased(_cubic(a, a), _cubic(b, b), _cubic(a, b), np.ones(len(a)), np.ones(len(b)))
@@ -87,15 +72,8 @@ def kernel_distance_error(
     A row that is drawn twice is never compared with itself: pairs of one row are left out, as in the distance itself.
 
     Args:
-        generated, real: ``[n, d]`` and ``[m, d]``.
-        blocks: block number of every row of either set; at least two blocks each.
+        blocks: block number of every row of either set; at least two blocks each, else InputError.
         rng: draws the blocks. draws: number of resamples, >= 2.
-
-    Returns:
-        [0, inf), in units of the distance.
-
-    Raises:
-        InputError: as ``frechet_distance``, or block numbers that do not fit the rows.
     """
     a, b = _pair(generated, real, 2)
     groups = []
@@ -103,11 +81,8 @@ def kernel_distance_error(
         given = np.asarray(numbers, np.int64)
         names, where = np.unique(given, return_inverse=True)
         if given.shape != (len(rows),) or len(names) < 2:
-            raise InputError(
-                "blocks do not fit the features",
-                expected=f"a number for each of {len(rows)} rows, two blocks or more",
-                got=f"{given.size} numbers, {len(names)} blocks",
-            )
+            what, got = "blocks do not fit the features", f"{given.size} numbers, {len(names)} blocks"
+            raise InputError(what, expected=f"a number for each of {len(rows)} rows, two blocks or more", got=got)
         groups.append((where, len(names)))
     own_a, own_b, across = _cubic(a, a), _cubic(b, b), _cubic(a, b)
     found = []
@@ -138,18 +113,9 @@ def _unbiased(own_a: Features, own_b: Features, across: Features, a: Features, b
 def cmmd_distance(generated: ArrayLike, real: ArrayLike) -> float:
     """CMMD: squared maximum mean discrepancy of directions under a Gaussian kernel of sigma 10, times 1000.
 
-    Rows are brought to length 1 first. Biased: means over full kernel matrices, with their diagonals. Published values
-    are of image embeddings of CLIP ViT-L/14 at 336 pixels.
-
-    Args:
-        generated, real: ``[n, d]`` and ``[m, d]``, n, m >= 1, no row of length 0.
-
-    Returns:
-        [0, 1000 * 2 * (1 - exp(-4 / 200))], that is at most 39.6; 0 for equal sets. Symmetric; unchanged by common
-        rotations and by the length of rows.
-
-    Raises:
-        InputError: as ``frechet_distance``, or a row of length 0.
+    Rows are brought to length 1 first (InputError: one of length 0). Biased: means over full kernel matrices, with
+    their diagonals. [0, 1000 * 2 * (1 - exp(-4 / 200))], that is at most 39.6; 0 for equal sets. Published values are
+    of image embeddings of CLIP ViT-L/14 at 336 pixels.
     """
     units = []
     for name, features in zip(("generated", "real"), _pair(generated, real, 1), strict=True):
@@ -169,20 +135,7 @@ def cmmd_distance(generated: ArrayLike, real: ArrayLike) -> float:
 
 def polynomial_distance(generated: ArrayLike, real: ArrayLike) -> float:
     """Squared maximum mean discrepancy with the kernel ``(x.y / d)^2``, times 100, as JEDi has it on features of
-    videos.
-
-    Biased: means over full kernel matrices, with their diagonals.
-
-    Args:
-        generated, real: ``[n, d]`` and ``[m, d]``, n, m >= 1.
-
-    Returns:
-        [0, inf); 0 for equal sets, and for sets with equal second moments. Symmetric; multiplied by c^4 when all
-        features are multiplied by c.
-
-    Raises:
-        InputError: as ``frechet_distance``.
-    """
+    videos. Biased: means over full kernel matrices, with their diagonals. 0 for sets with equal second moments."""
     a, b = _pair(generated, real, 1)
     return JEDI_FACTOR * _biased(lambda x, y: (x @ y.T / x.shape[1]) ** JEDI_DEGREE, a, b)
 
@@ -196,23 +149,16 @@ def _biased(kernel: Callable[[Features, Features], Features], a: Features, b: Fe
 def _pair(generated: ArrayLike, real: ArrayLike, fewest: int) -> tuple[Features, Features]:
     a, b = (_checked(features, name, fewest) for features, name in ((generated, "generated"), (real, "real")))
     if a.shape[1] != b.shape[1]:
-        raise InputError(
-            "two sets of features differ in width",
-            expected=f"{b.shape[1]} values a row, as the real set",
-            got=str(a.shape[1]),
-        )
+        what = "two sets of features differ in width"
+        raise InputError(what, expected=f"{b.shape[1]} values a row, as the real set", got=str(a.shape[1]))
     return a, b
 
 
 def _checked(features: Any, name: str, fewest: int) -> Features:
     found = np.asarray(features, np.float64)
     if found.ndim != 2 or not found.shape[-1] or len(found) < fewest:
-        raise InputError(
-            "a set of features has the wrong shape",
-            where=f"{name} images",
-            expected=f"[n >= {fewest}, d >= 1]",
-            got=str(list(found.shape)),
-        )
+        what = "a set of features has the wrong shape"
+        raise InputError(what, where=f"{name} images", expected=f"[n >= {fewest}, d >= 1]", got=str(list(found.shape)))
     if not np.isfinite(found).all():
         bad = int(np.flatnonzero(~np.isfinite(found).all(1))[0])
         raise InputError("a set of features holds values that are not finite", where=f"{name} images, row {bad}")

@@ -482,13 +482,9 @@ def voxel_keys(xyz: NDArray[np.floating], voxel_m: float) -> NDArray[np.int64]:
     cells = np.floor(np.asarray(xyz, np.float64) / voxel_m).astype(np.int64)
     limit = 1 << 20
     if len(cells) and (np.abs(cells) >= limit).any():
-        raise InputError(
-            "points lie too far away for this voxel size",
-            where="voxel filter",
-            expected=f"within {limit * voxel_m:g} m",
-            got=f"{float(np.abs(xyz).max()):g} m",
-            remedy="use larger voxels, or check the poses",
-        )
+        what, got = "points lie too far away for this voxel size", f"{float(np.abs(xyz).max()):g} m"
+        remedy = "use larger voxels, or check the poses"
+        raise InputError(what, where="voxel filter", expected=f"within {limit * voxel_m:g} m", got=got, remedy=remedy)
     cells += limit
     return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
 

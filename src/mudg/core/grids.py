@@ -25,6 +25,7 @@ from torch.autograd.function import once_differentiable
 from mudg import native
 from mudg.base import log
 from mudg.base.errors import InputError, UsageError
+from mudg.base.types import check_shape
 from mudg.core.native_ops import address
 
 # hex planes ---------------------------------------------------------------------------------------
@@ -94,12 +95,8 @@ def look_up(places: Tensor, numbers: Tensor, sizes: PlaneSizes) -> Tensor:
     Raises:
         InputError: shapes do not fit.
     """
-    if places.ndim != 2 or places.shape[1] != 4 or tuple(numbers.shape) != (sizes.numbers,):
-        raise InputError(
-            "planes of place and time: shapes do not fit",
-            expected=f"places [N, 4], planes ({sizes.numbers},)",
-            got=f"{tuple(places.shape)}, {tuple(numbers.shape)}",
-        )
+    check_shape(places, "planes of place and time: places", (None, 4))
+    check_shape(numbers, "planes of place and time: numbers", (sizes.numbers,))
     library = native.library()
     known = sizes.features in NATIVE_FEATURES and sizes.levels <= NATIVE_LEVELS and sizes.space > 1 and sizes.time > 1
     fits = known and all(t.dtype == torch.float32 and t.device.type == "cpu" for t in (places, numbers))
@@ -256,12 +253,8 @@ def encode(points: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
     Raises:
         InputError: shapes do not fit the grid.
     """
-    if points.ndim != 2 or points.shape[1] != grid.dimensions or tuple(table.shape) != grid.table_shape:
-        raise InputError(
-            "hash grid: shapes do not fit",
-            expected=f"points [N, {grid.dimensions}], table {grid.table_shape}",
-            got=f"{tuple(points.shape)}, {tuple(table.shape)}",
-        )
+    check_shape(points, "hash grid: points", (None, grid.dimensions))
+    check_shape(table, "hash grid: table", grid.table_shape)
     library = native.library()
     fits = all(t.dtype == torch.float32 and t.device.type == "cpu" for t in (points, table))
     if library is None or not fits or not len(points):

@@ -25,7 +25,7 @@ from mudg import native
 from mudg.base import log
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import UNLABELLED
-from mudg.base.types import Camera, FusedCloud, PointCloud, Track, View
+from mudg.base.types import Camera, FusedCloud, PointCloud, Track, View, check_shape
 
 # zbuffer ------------------------------------------------------------------------------------------
 #
@@ -268,10 +268,7 @@ def visible_depth(
     Raises:
         InputError: points have the wrong shape.
     """
-    if xyz_world.ndim != 2 or xyz_world.shape[1] != 3:
-        raise InputError(
-            "points have the wrong shape", where="visible_depth", expected="[N, 3]", got=str(xyz_world.shape)
-        )
+    check_shape(xyz_world, "visible_depth: points", (None, 3))
     layer = PointLayer(np.ascontiguousarray(xyz_world, np.float32), np.eye(4))
     depth, index = draw_points([layer], view, DrawLimits(near_m, far_m))
     depth[index < 0] = np.inf
@@ -387,8 +384,7 @@ def project_points(
         rgb: u8[N, 3], or None: colour stays 0.
         splat_px: side of the square of pixels that a point covers.
     """
-    if xyz.ndim != 2 or xyz.shape[1] != 3:
-        raise InputError("points have the wrong shape", expected="[N, 3]", got=str(xyz.shape))
+    check_shape(xyz, "project_points: points", (None, 3))
     config = ProjectConfig(static_splat_px=splat_px, near_m=near_m, far_m=far_m)
     return _draw([PointLayer(xyz, np.eye(4), splat_px)], None if rgb is None else [rgb], view, config)
 

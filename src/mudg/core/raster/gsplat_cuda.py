@@ -107,11 +107,8 @@ def load() -> ModuleType:
     """
     reason = problem()
     if reason:
-        raise ResourceError(
-            "raster backend 'gsplat' is not available",
-            got=reason,
-            remedy="see docs/gsplat.md; pip install 'mudg[gsplat]'",
-        )
+        what = "raster backend 'gsplat' is not available"
+        raise ResourceError(what, got=reason, remedy="see docs/gsplat.md; pip install 'mudg[gsplat]'")
     return importlib.import_module("gsplat")
 
 

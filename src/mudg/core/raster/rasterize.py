@@ -24,7 +24,7 @@ from mudg import native
 from mudg.base import log
 from mudg.base.devices import choose_device
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.base.types import Gaussians, Render, View
+from mudg.base.types import Gaussians, Render, View, check_shape
 from mudg.core.raster import cpu as raster_cpu
 from mudg.core.raster import gsplat_cuda, torch_twin
 from mudg.core.raster.request import Request
@@ -136,11 +136,8 @@ def _choose_backend(gaussians: Gaussians, config: RasterConfig) -> str:
     if config.backend != "auto":
         problem = available(config.backend)
         if problem:
-            raise ResourceError(
-                f"raster backend {config.backend!r} is not available",
-                got=problem,
-                remedy="install what is missing or use backend='auto'",
-            )
+            what = f"raster backend {config.backend!r} is not available"
+            raise ResourceError(what, got=problem, remedy="install what is missing or use backend='auto'")
         wanted = {"cpu": "cpu", "gsplat": "cuda"}.get(config.backend)
         if wanted is not None and device.type != wanted:
             raise ResourceError(f"raster backend {config.backend!r} works on {wanted} tensors", got=str(device))
@@ -148,11 +145,8 @@ def _choose_backend(gaussians: Gaussians, config: RasterConfig) -> str:
     if device.type == "cuda":
         problem = available("gsplat")
         if problem:
-            raise ResourceError(
-                "drawing on a GPU needs gsplat",
-                got=problem,
-                remedy="pip install 'mudg[gsplat]', or keep the Gaussians on the CPU",
-            )
+            what, got = "drawing on a GPU needs gsplat", problem
+            raise ResourceError(what, got=got, remedy="pip install 'mudg[gsplat]', or keep the Gaussians on the CPU")
         log.info_once("rasterizer: gsplat (CUDA)")
         return "gsplat"
     if device.type == "cpu" and dtype == torch.float32 and not available("cpu"):
@@ -169,12 +163,9 @@ def _check(gaussians: Gaussians, config: RasterConfig) -> int:
     allowed = math.isqrt(coefficients) - 1
     degree = allowed if config.sh_degree is None else config.sh_degree
     if not 0 <= degree <= min(allowed, MAX_SH_DEGREE):
-        raise InputError(
-            "spherical harmonics do not have enough coefficients for their degree",
-            where="gaussians.sh",
-            expected=f"[N, {(max(degree, 0) + 1) ** 2}, 3]",
-            got=f"[{len(gaussians)}, {coefficients}, 3]",
-        )
+        what = "spherical harmonics do not have enough coefficients for their degree"
+        expected = f"[N, {(max(degree, 0) + 1) ** 2}, 3]"
+        raise InputError(what, where="gaussians.sh", expected=expected, got=f"[{len(gaussians)}, {coefficients}, 3]")
     parts = {
         "means": gaussians.means,
         "quats": gaussians.quats,
@@ -187,20 +178,13 @@ def _check(gaussians: Gaussians, config: RasterConfig) -> int:
     if gaussians.extra is not None:
         parts["extra"] = gaussians.extra
         if gaussians.extra.shape[1] > MAX_EXTRA_CHANNELS:
-            raise InputError(
-                "too many feature channels",
-                where="gaussians.extra",
-                expected=f"at most {MAX_EXTRA_CHANNELS}",
-                got=str(gaussians.extra.shape[1]),
-            )
+            what, expected = "too many feature channels", f"at most {MAX_EXTRA_CHANNELS}"
+            raise InputError(what, where="gaussians.extra", expected=expected, got=str(gaussians.extra.shape[1]))
     for name, tensor in parts.items():
         if tensor.device != gaussians.means.device or tensor.dtype != gaussians.means.dtype:
-            raise InputError(
-                "all parameters must share device and type",
-                where=f"gaussians.{name}",
-                expected=f"{gaussians.means.dtype} on {gaussians.means.device}",
-                got=f"{tensor.dtype} on {tensor.device}",
-            )
+            what, where = "all parameters must share device and type", f"gaussians.{name}"
+            expected = f"{gaussians.means.dtype} on {gaussians.means.device}"
+            raise InputError(what, where=where, expected=expected, got=f"{tensor.dtype} on {tensor.device}")
     return degree
 
 
@@ -211,12 +195,8 @@ def _check_views(views: tuple[View, ...]) -> None:
     for index, view in enumerate(views):
         camera = view.camera
         if (camera.width, camera.height) != size:
-            raise InputError(
-                "views drawn together must share one image size",
-                where=f"view {index}, camera {camera.name!r}",
-                expected=f"{size[0]}x{size[1]}",
-                got=f"{camera.width}x{camera.height}",
-            )
+            what, where = "views drawn together must share one image size", f"view {index}, camera {camera.name!r}"
+            raise InputError(what, where=where, expected=f"{size[0]}x{size[1]}", got=f"{camera.width}x{camera.height}")
         if camera.readout_s > 0 and camera.shutter == "global":
             log.info_once(
                 f"rasterizer: the rolling shutter of camera {camera.name!r} ({camera.readout_s} s) is not followed, "
@@ -228,9 +208,7 @@ def _poses(world_from_cam: Tensor | None, views: int, batched: bool) -> tuple[Te
     if world_from_cam is None:
         return (None,) * views
     wanted = (views, 4, 4) if batched else (4, 4)
-    if tuple(world_from_cam.shape) != wanted:
-        got = str(list(world_from_cam.shape))
-        raise InputError("world_from_cam has the wrong shape", expected=str(list(wanted)), got=got)
+    check_shape(world_from_cam, "world_from_cam", wanted)
     return world_from_cam.unbind(0) if batched else (world_from_cam,)
 
 
@@ -288,11 +266,6 @@ def drawing_device(wanted: str, purpose: str, backend: Backend = "auto") -> torc
         wanted = kinds[0] if len(kinds) == 1 else "cpu" if problem else "auto"
     chosen = choose_device(wanted, purpose)
     if chosen.type in ("cpu", "cuda") and chosen.type not in kinds:
-        raise UsageError(
-            f"raster backend {backend!r} does not draw on this device",
-            where="--raster",
-            expected=f"--device {kinds[0]}",
-            got=f"--device {wanted}",
-            remedy="leave --raster at auto",
-        )
+        what, where, got = f"raster backend {backend!r} does not draw on this device", "--raster", f"--device {wanted}"
+        raise UsageError(what, where=where, expected=f"--device {kinds[0]}", got=got, remedy="leave --raster at auto")
     return chosen

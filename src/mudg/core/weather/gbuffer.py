@@ -15,7 +15,7 @@ from scipy import ndimage
 from mudg.base import geometry
 from mudg.base.errors import InputError
 from mudg.base.palette import ID, UNLABELLED
-from mudg.base.types import View
+from mudg.base.types import View, check_shape
 
 Image = NDArray[np.float32]
 Plane = NDArray[np.float32]
@@ -54,12 +54,8 @@ class GBuffer:
     def __post_init__(self) -> None:
         shape = self.depth.shape
         for name in ("color", "classes", "normal", "openness", "sunlit", "new_sunlit"):
-            value = getattr(self, name)
-            expected = (*shape, 3) if name in ("color", "normal") else shape
-            if value is not None and value.shape != expected:
-                raise InputError(
-                    "planes differ in size", where=f"G-buffer: {name}", expected=str(expected), got=str(value.shape)
-                )
+            if (value := getattr(self, name)) is not None:
+                check_shape(value, f"G-buffer: {name}", (*shape, 3) if name in ("color", "normal") else shape)
 
     @property
     def sky(self) -> NDArray[np.bool_]:
