@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from city_camera import CityLight, city_light
+from city_camera import CityLight, city_light, surfaces
 
 from mudg.base import store
 from mudg.base.palette import ID
@@ -111,7 +111,7 @@ class Case:
 
     def exact(self) -> GBuffer:
         """With exact normals and visible share of the sky, too."""
-        s = self.world.surfaces(self.view)
+        s = surfaces(self.world, self.view)
         return replace(self.gbuffer(), normal=s.normal, openness=s.openness, sunlit=s.sunlit)
 
     def heights(self) -> OccluderMap:
@@ -197,7 +197,7 @@ def score_light(case: Case, name: str) -> Result:
         sunlit=sun_visibility(estimated, case.view, heights, around.sun_direction),
         new_sunlit=sun_visibility(estimated, case.view, heights, goal.sun_direction),
     )
-    exact = replace(case.exact(), new_sunlit=world.surfaces(case.view).sunlit)
+    exact = replace(case.exact(), new_sunlit=surfaces(world, case.view).sunlit)
     for label, gbuffer in (("exact surfaces", exact), ("height map", estimated)):
         clear = np.exp(
             -air.extinction(case.light.visibility_m) * np.where(truth.sky, 0, euclidean_range(case.view, gbuffer.depth))
@@ -229,7 +229,7 @@ def score_snow(case: Case, cover: float = 0.7) -> Result:
     """Where snow lies, and the image."""
     config = replace(case.world.config, snow_cover=cover)
     world = CityWorld(config)
-    truth, lies = world.render(case.view), world.surfaces(case.view).snow > 0.5
+    truth, lies = world.render(case.view), surfaces(world, case.view).snow > 0.5
     own, around = case.light.response, case.light.surroundings
     solid = ~truth.sky
     heights = case.heights()

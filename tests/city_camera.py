@@ -1,4 +1,4 @@
-"""The generated city's camera and light in Python, for tests and measurements that invert them."""
+"""The generated city's camera, light and exact surfaces, for tests and measurements."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mudg.base.types import View
 from mudg.city.config import CityConfig
 from mudg.city.light import light_numbers
+from mudg.city.world import CityWorld, library
 from mudg.core.weather.gbuffer import Surroundings
 from mudg.core.weather.light import LUMA, srgb_decode, srgb_encode
 
@@ -77,3 +79,28 @@ def city_light(config: CityConfig) -> CityLight:
     r, g, b = (float(w) for w in white)
     response = FilmicResponse(float(exposure), (r, g, b), float(saturation), float(contrast), float(vignette))
     return CityLight(around, response, 3.0 * float(haze_m))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CitySurfaces:
+    """Exact surfaces behind pixel centres, 0 in the sky: unit normals f32[H, W, 3] in the world and albedo f32[H, W,
+    3]; and f32[H, W] in [0, 1]: share of the sky that is seen, whether the sun shines on it, snow cover, standing
+    water."""
+
+    normal: NDArray[np.float32]
+    albedo: NDArray[np.float32]
+    openness: NDArray[np.float32]
+    sunlit: NDArray[np.float32]
+    snow: NDArray[np.float32]
+    water: NDArray[np.float32]
+
+
+def surfaces(world: CityWorld, view: View) -> CitySurfaces:
+    """Exact surfaces behind the pixel centres of a view, as ``CityWorld.render`` sees them."""
+    camera, handle = view.camera, world._handle._handle
+    planes = np.empty((camera.height, camera.width, 10), np.float32)
+    poses = np.ascontiguousarray(world._object_keys_at(np.array([view.time_s]))[0])
+    phases, pose = world._phases(view.time_s), np.ascontiguousarray(view.world_from_cam)
+    frame = (np.array(camera.intrinsics), camera.width, camera.height, pose)
+    assert library().mudg_city_planes(handle, poses, phases, *frame, planes) == 0
+    return CitySurfaces(planes[..., :3], planes[..., 3:6], *(planes[..., i] for i in range(6, 10)))

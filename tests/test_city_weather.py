@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import city_camera
 import numpy as np
 import pytest
 from city_camera import city_light
@@ -36,10 +37,10 @@ def view(clear: CityWorld) -> View:
 
 def test_surfaces_are_unit_normals_and_albedos_without_weather(clear: CityWorld, view: View) -> None:
     assert weather_numbers(CLEAR) is None
-    surfaces = clear.surfaces(view)
+    surfaces = city_camera.surfaces(clear, view)
     assert not surfaces.snow.any()
     assert not surfaces.water.any()
-    surfaces, truth = clear.surfaces(view), clear.render(view)
+    surfaces, truth = city_camera.surfaces(clear, view), clear.render(view)
     solid = ~truth.sky
     np.testing.assert_allclose(np.linalg.norm(surfaces.normal[solid], axis=-1), 1, atol=2e-3)
     assert (surfaces.normal[truth.semantics == ID["road"]] == [0, 0, 1]).all()
@@ -69,7 +70,7 @@ def test_fog_follows_koschmieder(clear: CityWorld, view: View) -> None:
 def test_snow_lies_where_the_rule_says() -> None:
     world = CityWorld(replace(CLEAR, snow_cover=0.6))
     at = world.frame_views("front")[1]
-    truth, surfaces = world.render(at), world.surfaces(at)
+    truth, surfaces = world.render(at), city_camera.surfaces(world, at)
     solid = ~truth.sky & ~np.isin(truth.semantics, (ID["person"], ID["rider"], ID["vegetation"]))
     expected = ground.snow_weight(
         world_points(at, truth.depth)[solid], surfaces.normal[solid], surfaces.openness[solid], 0.6, CLEAR.seed
@@ -83,7 +84,7 @@ def test_snow_lies_where_the_rule_says() -> None:
 
 def test_wet_ground_is_where_the_rule_says_and_nothing_else_changes(clear: CityWorld, view: View) -> None:
     world = CityWorld(replace(CLEAR, wet=1.0, puddles=0.4))
-    dry, wet, surfaces = clear.render(view), world.render(view), world.surfaces(view)
+    dry, wet, surfaces = clear.render(view), world.render(view), city_camera.surfaces(world, view)
     np.testing.assert_array_equal(dry.depth, wet.depth)
     elsewhere = ~np.isin(dry.semantics, WET_IDS)
     np.testing.assert_array_equal(dry.rgb[elsewhere], wet.rgb[elsewhere])
@@ -92,7 +93,7 @@ def test_wet_ground_is_where_the_rule_says_and_nothing_else_changes(clear: CityW
     assert (np.abs(surfaces.water[level] - expected) < 0.1).mean() > 0.98
     film = level & (surfaces.water == 0)
     np.testing.assert_allclose(
-        surfaces.albedo[film], ground.WET_DARKENING * clear.surfaces(view).albedo[film], rtol=1e-4
+        surfaces.albedo[film], ground.WET_DARKENING * city_camera.surfaces(clear, view).albedo[film], rtol=1e-4
     )
 
 
@@ -111,7 +112,7 @@ def test_lamps_light_the_road_at_night() -> None:
     world = CityWorld(config)
     assert len(world.lamps) > 2
     at = world.frame_views("front")[1]
-    surfaces, truth = world.surfaces(at), world.render(at)
+    surfaces, truth = city_camera.surfaces(world, at), world.render(at)
     road = truth.semantics == ID["road"]
     points = world_points(at, truth.depth)
     level = lamp_light(points[road], surfaces.normal[road], world.lamps)

@@ -129,7 +129,6 @@ def light_numbers(config: CityConfig) -> tuple[str, NDArray[np.float64]]:
 
 
 # weather ------------------------------------------------------------------------------------------
-#
 # Wet ground, snow and street lamps of a generated city: the numbers its ray caster needs, by the same rules as
 # ``mudg.core.weather``.
 
@@ -158,7 +157,6 @@ def lamp_places(rows: Sequence[Sequence[float]]) -> NDArray[np.float64]:
 
 
 # photos --------------------------------------------------------------------------------------------
-#
 # Photographic surfaces and skies for a city, from a folder of the user's: `textures/*.jpg` or `.png` and `sky/*.hdr`.
 #
 # A surface's photograph multiplies its drawn colour, so only its variation around its own mean is used. Which surface a

@@ -32,7 +32,6 @@ from mudg.city.light import draw_photos, lamp_places, light_numbers, weather_num
 from mudg.city.traffic import PosedObject, ego_keys, key_times, plan_traffic
 
 # native --------------------------------------------------------------------------------------------
-#
 # Thin ctypes layer over the city's ray caster in the native library.
 
 
@@ -102,21 +101,6 @@ class CityHandle:
         values, places = _f64(numbers), _f64(lamps).reshape(-1, 3)
         if self._lib.mudg_city_set_weather(self._handle, values, places, len(places)):
             raise ResourceError("not enough memory for the lamps of the city")
-
-    def planes(
-        self,
-        poses: NDArray[np.float64],
-        phases: NDArray[np.float64],
-        camera: Camera,
-        world_from_cam: NDArray[np.float64],
-    ) -> NDArray[np.float32]:
-        """Normal, albedo, open sky, sun, snow and water f32[H, W, 10] of what the rays through pixel centres meet."""
-        out = np.empty((camera.height, camera.width, 10), np.float32)
-        poses, phases, numbers, pose = map(_f64, (poses, phases, camera.intrinsics, world_from_cam))
-        size = (camera.width, camera.height)
-        if self._lib.mudg_city_planes(self._handle, poses, phases, numbers, *size, pose, out):
-            raise ResourceError("not enough memory to render the city")
-        return out
 
     def __del__(self) -> None:
         if getattr(self, "_handle", None):
@@ -211,20 +195,6 @@ class CityTruth:
     def sky(self) -> NDArray[np.bool_]:
         """bool[H, W]: no depth here."""
         return ~np.isfinite(self.depth)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CitySurfaces:
-    """Exact surfaces behind pixel centres, 0 in the sky: unit normals f32[H, W, 3] in the world and albedo f32[H, W,
-    3]; and f32[H, W] in [0, 1]: share of the sky that is seen, whether the sun shines on it, snow cover, standing
-    water."""
-
-    normal: NDArray[np.float32]
-    albedo: NDArray[np.float32]
-    openness: NDArray[np.float32]
-    sunlit: NDArray[np.float32]
-    snow: NDArray[np.float32]
-    water: NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -484,12 +454,6 @@ class CityWorld:
         poses = self._object_keys_at(np.array([view.time_s]))[0]
         frame = (intrinsics, camera.width, camera.height, view.world_from_cam)
         return CityTruth(*self._handle.render(poses, self._phases(view.time_s), *frame, per_axis, noise_key))
-
-    def surfaces(self, view: View) -> CitySurfaces:
-        """Exact surfaces behind the pixel centres of a view, as ``render`` sees them."""
-        poses = self._object_keys_at(np.array([view.time_s]))[0]
-        planes = self._handle.planes(poses, self._phases(view.time_s), view.camera, view.world_from_cam)
-        return CitySurfaces(planes[..., :3], planes[..., 3:6], *(planes[..., i] for i in range(6, 10)))
 
     def observation(self, view: View, truth: CityTruth | None = None) -> Observation:
         """Noise-free truth as torch tensors; depth is 0 (= none) in the sky, everything may be used. ``truth``: what

@@ -33,7 +33,6 @@ from mudg.base.geometry import pixel_rays
 from mudg.base.types import View, check_shape
 
 # align --------------------------------------------------------------------------------------------
-#
 # Bringing generated depth to the scale of what was measured: one scale and one shift per frame, robustly.
 #
 # ``fit_depth`` starts from metres that are nearly right; ``fit_affine`` from any numbers that grow with depth, or with

@@ -23,7 +23,6 @@ from mudg.base import geometry
 from mudg.base.errors import InputError
 
 # boxes --------------------------------------------------------------------------------------------
-#
 # Boxes of road users against each other and against cameras: do they collide, and which sides were ever seen?
 
 
@@ -72,7 +71,6 @@ def angle_to_nearest(asked: Array, seen: Array) -> Array:
 
 
 # ground -------------------------------------------------------------------------------------------
-#
 # A height map of the ground, from points that lie on it: what a vehicle stands on that is put somewhere else.
 
 

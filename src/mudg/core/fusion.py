@@ -256,15 +256,13 @@ def color_points(
     in_image = np.zeros(count, bool)
     votes: list[tuple[NDArray[np.intp], NDArray[np.uint8], NDArray[np.float32]]] = []
     members = {index: np.flatnonzero(owner == index) for index in owned}
-    gap_deg = rules.beam_gap_deg or measure_beam_gap(sweep.points.xyz)
-    stands = standing_points(_upright(sweep))
+    stands = _standing(sweep, rules)
     for shot in sweep.shots:
         xyz_cam, known = _points_in_camera(sweep, shot.view, members, owned, dynamic)
         ids, column, row, z = _pixels(xyz_cam, known, shot.view, rules)
         in_image[ids] = True
-        if rules.occlusion_test and len(ids):
-            visible = ~hidden_points(xyz_cam[ids], stands[ids], shot.view, gap_deg)
-            ids, column, row, z = ids[visible], column[visible], row[visible], z[visible]
+        visible = _unhidden(xyz_cam[ids], ids, stands, shot.view)
+        ids, column, row, z = ids[visible], column[visible], row[visible], z[visible]
         cosine = z / np.linalg.norm(xyz_cam[ids], axis=1)
         better = cosine > best[ids]
         chosen = ids[better]
@@ -286,10 +284,7 @@ def points_in_image(
     members = {index: np.flatnonzero(owner == index) for index in owned}
     xyz_cam, known = _points_in_camera(sweep, view, members, owned, dynamic)
     ids, column, row, z = _pixels(xyz_cam, known, view, rules)
-    if not rules.occlusion_test or len(ids) == 0:
-        return ids, column, row, z
-    stands = standing_points(_upright(sweep))[ids]
-    visible = ~hidden_points(xyz_cam[ids], stands, view, rules.beam_gap_deg or measure_beam_gap(sweep.points.xyz))
+    visible = _unhidden(xyz_cam[ids], ids, _standing(sweep, rules), view)
     return ids[visible], column[visible], row[visible], z[visible]
 
 
@@ -327,9 +322,21 @@ def _pixels(
     return ids[inside], column[inside].astype(np.intp), row[inside].astype(np.intp), z[inside]
 
 
-def _upright(sweep: SweepShots) -> NDArray[np.float32]:
-    """Points f32[N, 3] in the world's axes, from the sensor."""
-    return sweep.points.xyz @ sweep.world_from_lidar[:3, :3].T.astype(np.float32)
+def _standing(sweep: SweepShots, rules: FusionRules) -> tuple[NDArray[np.bool_], float] | None:
+    """Which points of a sweep stand, and the angle between its beams in degrees; None: nothing hides a point."""
+    if not rules.occlusion_test:
+        return None
+    upright = sweep.points.xyz @ sweep.world_from_lidar[:3, :3].T.astype(np.float32)
+    return standing_points(upright), rules.beam_gap_deg or measure_beam_gap(sweep.points.xyz)
+
+
+def _unhidden(
+    xyz_cam: NDArray[np.float32], ids: NDArray[np.intp], standing: tuple[NDArray[np.bool_], float] | None, view: View
+) -> NDArray[np.bool_]:
+    """Which points ``ids`` of a sweep, in the frame of a camera, nothing hides; bool[n]."""
+    if standing is None or not len(ids):
+        return np.ones(len(ids), bool)
+    return ~hidden_points(xyz_cam, standing[0][ids], view, standing[1])
 
 
 def standing_points(xyz: NDArray[np.floating], cell_m: float = 2.0, margin_m: float = 0.35) -> NDArray[np.bool_]:

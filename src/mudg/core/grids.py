@@ -29,7 +29,6 @@ from mudg.base.types import check_shape
 from mudg.core.native_ops import address
 
 # hex planes ---------------------------------------------------------------------------------------
-#
 # Six planes of several sizes (HexPlane, Cao and Johnson 2023; K-Planes, Fridovich-Keil et al. 2023): learnt features of
 # places and times.
 #

@@ -149,7 +149,6 @@ def spiral(count: int) -> Array:
 
 
 # harmonics ----------------------------------------------------------------------------------------
-#
 # Spherical harmonics of colours in a turned frame.
 #
 # A colour is the sum of harmonics of the direction from the camera to a Gaussian. Where the harmonics belong to a frame

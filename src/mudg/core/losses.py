@@ -27,7 +27,6 @@ from mudg.base.palette import UNLABELLED
 from mudg.base.types import check_shape
 
 # perceptual ---------------------------------------------------------------------------------------
-#
 # Distances of two images in the features of a network or a filter bank: losses of a fit, and rows of the scores.
 
 

@@ -64,7 +64,6 @@ class ViewFacts:
 
 
 # flicker ------------------------------------------------------------------------------------------
-#
 # How restless a video is: what static surfaces change from frame to frame, against what they change in the truth.
 
 

@@ -22,7 +22,6 @@ from mudg.base.types import Track, View
 from mudg.core.pictures import resize_nearest
 
 # lane scores --------------------------------------------------------------------------------------
-#
 # How well road markings are where they should be: NTL-IoU from a detector's masks, and lane IoU and lane gradients from
 # the images.
 #

@@ -234,7 +234,6 @@ def _backgrounds(
 
 
 # place --------------------------------------------------------------------------------------------
-#
 # Which device Gaussians are drawn on, and so where everything that is learnt about them lives.
 
 

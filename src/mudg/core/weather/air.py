@@ -25,7 +25,6 @@ from mudg.base.types import View
 from mudg.base.weather_settings import FogSettings
 
 # noise --------------------------------------------------------------------------------------------
-#
 # Hashes and value noise of world places: the same numbers for every camera and frame.
 #
 # Twins of ``hash_bits``, ``hash01`` and ``noise2`` in native/city_math.h, so that the generated city can show the same
@@ -98,7 +97,6 @@ def smoothstep(low: float, high: float, v: Any) -> Any:
 
 
 # fog ----------------------------------------------------------------------------------------------
-#
 # Fog and haze: Koschmieder's law in linear light, ``L = L0 t + A (1 - t)`` with transmittance t and airlight A.
 #
 # Extinction is 3.0 / visibility, as contrast falls to 5 % at the meteorological optical range. Distances are along the
@@ -207,30 +205,24 @@ def _exponential(intercept: float, slope: float, edges_mm: tuple[float, ...]) ->
 
 
 def rain_sizes(mm_h: float) -> list[ParticleSize]:
-    """Drops of 1 to 5 mm at a rate in mm/h; smaller ones are part of the veil."""
-    if mm_h <= 0:
-        return []
+    """Drops of 1 to 5 mm at a rate in mm/h, above 0; smaller ones are part of the veil."""
     rows = _exponential(8000.0, 4.1 * mm_h**-0.21, RAIN_EDGES_MM)
     return [ParticleSize(n, d * 1e-3, 9.65 - 10.3 * math.exp(-0.6 * d)) for n, d in rows]
 
 
 def snow_sizes(mm_h: float) -> list[ParticleSize]:
-    """Flakes at a rate in mm/h of water, melted diameters of 0.7 to 3.5 mm."""
-    if mm_h <= 0:
-        return []
+    """Flakes at a rate in mm/h of water, above 0: melted diameters of 0.7 to 3.5 mm."""
     rows = _exponential(3800.0 * mm_h**-0.87, 2.55 * mm_h**-0.48, FLAKE_EDGES_MM)
     return [ParticleSize(n, d * 1e-3 * FLAKE_GROWTH, FLAKE_SPEED, FLAKE_SWAY_M) for n, d in rows]
 
 
 def rain_extinction(mm_h: float) -> float:
     """Extinction of rain per metre: 0.312 R^0.67 per km."""
-    return 0.312e-3 * mm_h**0.67 if mm_h > 0 else 0.0
+    return 0.312e-3 * mm_h**0.67
 
 
 def snow_extinction(mm_h: float) -> float:
-    """Extinction of falling snow per metre: twice the area of all flakes in a cubic metre."""
-    if mm_h <= 0:
-        return 0.0
+    """Extinction of falling snow per metre: twice the area of all flakes in a cubic metre. mm_h: above 0."""
     n0, slope = 3800.0 * mm_h**-0.87, 2.55 * mm_h**-0.48
     return 2 * n0 * math.pi / 4 * FLAKE_GROWTH**2 * 2 / slope**3 * 1e-6
 

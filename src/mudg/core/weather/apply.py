@@ -130,9 +130,9 @@ def _with_particles(
 ) -> Image:
     """Drops and flakes near the camera, one by one."""
     kinds: list[tuple[RainSettings | SnowSettings, list[air.ParticleSize], Array, str]] = []
-    if weather.rain is not None:
+    if weather.rain is not None and weather.rain.mm_h > 0:
         kinds.append((weather.rain, air.rain_sizes(weather.rain.mm_h), air.DROP_LIGHT * light.ambient, "rain"))
-    if weather.snow is not None:
+    if weather.snow is not None and weather.snow.mm_h > 0:
         radiance = ground.SNOW_COLOR * (light.ambient + 0.25 * light.sun)
         kinds.append((weather.snow, air.snow_sizes(weather.snow.mm_h), radiance, "flakes"))
     for fall, sizes, radiance, purpose in kinds:

@@ -43,7 +43,6 @@ def srgb_decode(display: NDArray[np.floating]) -> Image:
 
 
 # season -------------------------------------------------------------------------------------------
-#
 # Other seasons, as far as colours go: green leaves and grass take the colours of autumn or of winter.
 #
 # Luminance is kept but for one factor per season, so light, shadow and texture stay; only chromaticity changes, and
