@@ -223,10 +223,11 @@ class CityWorld:
         self.light_name, self._light = light_numbers(config)
         self._ego_times, self._ego_poses = ego_keys(config, self.plan)
         self.objects: tuple[PosedObject, ...] = tuple(plan_traffic(config, self.plan, self._ego_times, self._ego_poses))
-        self._key_times = key_times(config)
+        self.key_times_s = key_times(config)
+        """Times f64[K] of the keys of all objects."""
         self._furniture = furnish(config, self.plan)
         self.lamps: NDArray[np.float64] = lamp_places(self._furniture + [m.row for m in self.objects])
-        no_keys = np.zeros((len(self._key_times), 0, 4))
+        no_keys = np.zeros((len(self.key_times_s), 0, 4))
         self._keys = np.stack([m.keys for m in self.objects], 1) if self.objects else no_keys
         self._gaits = np.array([m.gait_rad_per_s for m in self.objects], np.float64)
         self._gait_starts = seeds.numpy_rng(config.seed, 0, "city gait").uniform(0, 2 * np.pi, len(self.objects))
@@ -313,11 +314,6 @@ class CityWorld:
         other._handle = other._native_world()
         return other
 
-    @property
-    def key_times_s(self) -> NDArray[np.float64]:
-        """Times f64[K] of the keys of all objects."""
-        return self._key_times
-
     def source(self) -> Source:
         """What a scene of this world records about its origin."""
         recipe: Mapping[str, Any] = {"city": to_dict(self.config), "generator_version": GENERATOR_VERSION}
@@ -334,18 +330,13 @@ class CityWorld:
         moving = sum(m.moving for m in self.objects)
         return (
             f"{quarter}, {self.light_name}, {lanes}, {crossing}, {plan.drive_length:.0f} m of drive, {moving} moving"
-            f" and {len(self.objects) - moving} standing objects, {self.shape_count} shapes"
+            f" and {len(self.objects) - moving} standing objects, {self._handle.shape_count} shapes"
         )
-
-    @property
-    def shape_count(self) -> int:
-        """Number of primitive shapes in the world."""
-        return self._handle.shape_count
 
     @property
     def span_s(self) -> tuple[float, float]:
         """First and last time that can be rendered."""
-        return float(self._key_times[0]), float(self._key_times[-1])
+        return float(self.key_times_s[0]), float(self.key_times_s[-1])
 
     def frame_time(self, index: int) -> float:
         """Time of a frame in seconds."""
@@ -368,7 +359,7 @@ class CityWorld:
             label = rec.LABELS[int(posed.row[0])]
             half = posed.size[2] / 2
             poses = np.stack([geometry.yaw_matrix(float(yaw), (x, y, z + half)) for x, y, z, yaw in posed.keys])
-            tracks.append(Track(f"{label}-{index + 1:03d}", label, np.array(posed.size), self._key_times, poses))
+            tracks.append(Track(f"{label}-{index + 1:03d}", label, np.array(posed.size), self.key_times_s, poses))
         return tuple(tracks)
 
     def instance_of(self, track_id: str) -> int:
@@ -395,7 +386,7 @@ class CityWorld:
 
     def _object_keys_at(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """x, y, z, yaw f64[T, objects, 4] between the keys, as Track.pose_at interpolates."""
-        times, keys = self._key_times, self._keys
+        times, keys = self.key_times_s, self._keys
         first, last = self.span_s
         if times_s.min() < first - 1e-6 or times_s.max() > last + 1e-6:
             what = "time lies outside the log"

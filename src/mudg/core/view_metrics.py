@@ -1,7 +1,7 @@
 """Metrics of one view, or of neighbouring views, that need more than a true image: LiDAR points, exact boxes, markings
 and motion.
 
-``view_facts.ViewFacts`` is what is known of a view beside its true image. The metrics are accumulators as in
+``metrics.ViewFacts`` is what is known of a view beside its true image. The metrics are accumulators as in
 ``core/metrics.py``.
 """
 
@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from functools import partial
+from typing import Any, Final, Literal
 
 import numpy as np
 import torch
@@ -32,9 +33,6 @@ from mudg.core.metrics import (
     frame_mean,
 )
 from mudg.core.street_scores import agent_ious
-
-# view metrics -------------------------------------------------------------------------------------
-
 
 POINT_PARTS: Final = ("", "static", "dynamic")
 
@@ -203,11 +201,17 @@ def warp_error(motion: ExactMotion) -> Neighbours:
 
 EVERY_VIEW: Final = ("temporal_flickering", "warp_error")
 """Metrics that want all views of a trajectory, in order."""
+
+
+def _at_points(part: str) -> dict[str, Callable[[], Metric]]:
+    """What is computed at LiDAR points: all, or the static or dynamic ones."""
+    fields: tuple[Literal["abs_rel", "rmse_m", "delta1"], ...] = ("abs_rel", "rmse_m", "delta1")
+    errors = {f"lidar_{field}": partial(depth_error, field, _POINT_DEPTHS[part]) for field in fields}
+    return {**errors, "lidar_psnr": partial(decibels, _POINT_COLORS[part])}
+
+
 FACTS: Final[Mapping[str, Callable[[], Metric]]] = {
-    "lidar_abs_rel": lambda: depth_error("abs_rel", _POINT_DEPTHS[""]),
-    "lidar_rmse_m": lambda: depth_error("rmse_m", _POINT_DEPTHS[""]),
-    "lidar_delta1": lambda: depth_error("delta1", _POINT_DEPTHS[""]),
-    "lidar_psnr": lambda: decibels(_POINT_COLORS[""]),
+    **_at_points(""),
     "agreement": lambda: Segmentation("miou", _carried_classes),
     "agent_iou": AgentIou,
     "lane_iou": LaneIou,
@@ -218,14 +222,7 @@ FACTS: Final[Mapping[str, Callable[[], Metric]]] = {
 """Rows of ``metrics.METRICS`` that are computed from ``ViewFacts`` or from neighbouring views; the warp error needs a
 motion besides."""
 PARTS: Final[Mapping[str, Callable[[], Metric]]] = {
-    f"{name}_{part}": build
-    for part in ("static", "dynamic")
-    for name, build in (
-        ("lidar_abs_rel", lambda part=part: depth_error("abs_rel", _POINT_DEPTHS[part])),
-        ("lidar_rmse_m", lambda part=part: depth_error("rmse_m", _POINT_DEPTHS[part])),
-        ("lidar_delta1", lambda part=part: depth_error("delta1", _POINT_DEPTHS[part])),
-        ("lidar_psnr", lambda part=part: decibels(_POINT_COLORS[part])),
-    )
+    f"{name}_{part}": build for part in ("static", "dynamic") for name, build in _at_points(part).items()
 }
 """The same for static points and for points of dynamic objects; beside the table, in ``points`` of a result."""
 
