@@ -483,18 +483,18 @@ def test_drops_fall_with_their_speed_and_are_as_many_as_the_volume_holds() -> No
 @pytest.mark.parametrize("velocity", [(0, 0, 0), (0, 0, -6.0), (15.0, 0, -6)], ids=["still", "falling", "driving"])
 def test_a_drop_covers_the_area_of_its_disc_whatever_its_streak(velocity: tuple[float, float, float]) -> None:
     view = view_at(size=(300, 200))
-    moving = air.Moving(np.array([[4.0, 0.4, 1.6]]), 2 * np.array(velocity, float), 0.02)
+    moving = np.array([[4.0, 0.4, 1.6]]), 2 * np.array(velocity, float), 0.02
     depth = np.full((200, 300), 50.0, np.float32)
-    shown = air.covered(view, depth, moving)
+    shown = air.covered(view, depth, *moving)
     stretch = math.sqrt(1 + 0.1**2 + 0.025**2)  # off the axis
     assert shown.sum() == pytest.approx(stretch * math.pi / 4 * (50 * 0.02 / 4.0) ** 2, rel=1e-6)
-    assert air.covered(view, np.full_like(depth, 3.0), moving).sum() == 0  # behind a surface
+    assert air.covered(view, np.full_like(depth, 3.0), *moving).sum() == 0  # behind a surface
 
 
 def test_rows_of_a_streak_follow_the_motion() -> None:
     view = view_at(size=(300, 200))
-    moving = air.Moving(np.array([[2.0, 0.0, 1.5]]), np.array([0, 0, -40.0]), 0.002)
-    shown = air.covered(view, np.full((200, 300), 50.0), moving)
+    moving = np.array([[2.0, 0.0, 1.5]]), np.array([0, 0, -40.0]), 0.002
+    shown = air.covered(view, np.full((200, 300), 50.0), *moving)
     lit = np.flatnonzero(shown.sum(1))
     assert lit[-1] - lit[0] == pytest.approx(50 * 40 * air.SHUTTER_S / 2.0, abs=2)
     assert np.flatnonzero(shown.sum(0)).tolist() == [149, 150]

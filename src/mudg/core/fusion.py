@@ -43,6 +43,10 @@ Matrix = NDArray[np.float64]
 STATIC: Final = -1
 GAP_SPREAD: Final = 1.4
 """Largest usual angle between beams as a multiple of the median one."""
+NEAR_M, FAR_M = 0.5, 200.0
+"""Camera depth limits of colouring, metres."""
+MOVING_TURN_DEG: Final = 15.0
+"""Turn from which a long box moves (half turns, a habit of annotators, do not count)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,27 +56,18 @@ class FusionRules:
     Args:
         voxel_m: keep one point per voxel of this side, the one seen from nearest by; 0 keeps all.
         occlusion_test: leave out colours from behind nearer surfaces.
-        beam_gap_deg: vertical angle between LiDAR beams; 0 = measured per sweep.
-        near_m, far_m: camera depth limits of colouring, metres.
         box_growth_m: moving boxes are grown by this on each side and on top.
         floor_margin_m: points this close above the box's floor stay static.
         moving_distance_m: dead-banded displacement or path length from which a track moves.
-        moving_turn_deg: turn from which a long box moves (half turns, a habit of annotators, do not count).
         min_object_points: dynamic objects with fewer coloured points are left out.
-        point_times: take the object's motion during the sweep (``dt_s``) into account.
     """
 
     voxel_m: float = 0.0
     occlusion_test: bool = True
-    beam_gap_deg: float = 0.0
-    near_m: float = 0.5
-    far_m: float = 200.0
     box_growth_m: float = 0.1
     floor_margin_m: float = 0.1
     moving_distance_m: float = 0.5
-    moving_turn_deg: float = 15.0
     min_object_points: int = 100
-    point_times: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +124,7 @@ def judge_track(track: Track, rules: FusionRules) -> TrackVerdict:
         reasons.append(f"centre moved {displacement:.2f} m away from its start")
     if path > rules.moving_distance_m:
         reasons.append(f"centre travelled {path:.2f} m")
-    if turn > rules.moving_turn_deg:
+    if turn > MOVING_TURN_DEG:
         reasons.append(f"heading turned {turn:.0f} degrees")
     words = (
         "; ".join(reasons) or f"static: displacement {displacement:.2f} m, path {path:.2f} m, turn {turn:.0f} degrees"
@@ -184,7 +179,7 @@ def separate(
     owned: dict[int, NDArray[np.float32]] = {}
     if len(xyz) == 0:
         return owner, owned
-    dt_s = sweep.points.dt_s if rules.point_times and np.any(sweep.points.dt_s) else None
+    dt_s = sweep.points.dt_s if np.any(sweep.points.dt_s) else None
     reach_s = float(np.abs(dt_s).max()) if dt_s is not None else 0.0
     for index in sorted(range(len(dynamic)), key=lambda i: float(np.prod(dynamic[i].size_m))):
         track = dynamic[index]
@@ -259,7 +254,7 @@ def color_points(
     stands = _standing(sweep, rules)
     for shot in sweep.shots:
         xyz_cam, known = _points_in_camera(sweep, shot.view, members, owned, dynamic)
-        ids, column, row, z = _pixels(xyz_cam, known, shot.view, rules)
+        ids, column, row, z = _pixels(xyz_cam, known, shot.view)
         in_image[ids] = True
         visible = _unhidden(xyz_cam[ids], ids, stands, shot.view)
         ids, column, row, z = ids[visible], column[visible], row[visible], z[visible]
@@ -283,7 +278,7 @@ def points_in_image(
     owner, owned = separate(sweep, dynamic, rules)
     members = {index: np.flatnonzero(owner == index) for index in owned}
     xyz_cam, known = _points_in_camera(sweep, view, members, owned, dynamic)
-    ids, column, row, z = _pixels(xyz_cam, known, view, rules)
+    ids, column, row, z = _pixels(xyz_cam, known, view)
     visible = _unhidden(xyz_cam[ids], ids, _standing(sweep, rules), view)
     return ids[visible], column[visible], row[visible], z[visible]
 
@@ -311,11 +306,11 @@ def _points_in_camera(
 
 
 def _pixels(
-    xyz_cam: NDArray[np.float32], known: NDArray[np.bool_], view: View, rules: FusionRules
+    xyz_cam: NDArray[np.float32], known: NDArray[np.bool_], view: View
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
     """Points that fall into the image: indices, column, row (integers) and depth."""
     camera = view.camera
-    ids = np.flatnonzero((xyz_cam[:, 2] > rules.near_m) & (xyz_cam[:, 2] < rules.far_m) & known)
+    ids = np.flatnonzero((xyz_cam[:, 2] > NEAR_M) & (xyz_cam[:, 2] < FAR_M) & known)
     x, y, z = xyz_cam[ids].T
     column, row = (np.floor(place) for place in pinhole(camera.intrinsics, x, y, z))
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
@@ -327,7 +322,7 @@ def _standing(sweep: SweepShots, rules: FusionRules) -> tuple[NDArray[np.bool_],
     if not rules.occlusion_test:
         return None
     upright = sweep.points.xyz @ sweep.world_from_lidar[:3, :3].T.astype(np.float32)
-    return standing_points(upright), rules.beam_gap_deg or measure_beam_gap(sweep.points.xyz)
+    return standing_points(upright), measure_beam_gap(sweep.points.xyz)
 
 
 def _unhidden(

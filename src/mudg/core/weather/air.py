@@ -292,16 +292,7 @@ def places(size: ParticleSize, velocity: Array, view: View, reach_m: float, key:
     return found
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Moving:
-    """Particles at the middle of an exposure: world places f64[N, 3], velocity f64[3] against the camera, diameter."""
-
-    xyz: Array
-    velocity: Array
-    diameter_m: float
-
-
-def covered(view: View, depth: NDArray[np.floating], moving: Moving) -> Array:
+def covered(view: View, depth: NDArray[np.floating], xyz: Array, velocity: Array, diameter_m: float) -> Array:
     """Optical depth f64[H, W] of particles before the surfaces.
 
     A ball of w pixels that moves during the exposure covers, summed over pixels, pi/4 w^2 of one pixel on the axis,
@@ -311,12 +302,12 @@ def covered(view: View, depth: NDArray[np.floating], moving: Moving) -> Array:
     Args:
         view: camera and pose.
         depth: camera z of the surfaces f[H, W], metres.
-        moving: the particles.
+        xyz: world places f64[N, 3] at the middle of the exposure. velocity: f64[3] against the camera, m/s.
     """
     camera = view.camera
     turn = view.world_from_cam[:3, :3]
-    middle = (moving.xyz - view.center_world) @ turn
-    half = (moving.velocity * SHUTTER_S / 2) @ turn
+    middle = (xyz - view.center_world) @ turn
+    half = (velocity * SHUTTER_S / 2) @ turn
     ends = [middle - half, middle + half]
     kept = (ends[0][:, 2] > NEAREST_M) & (ends[1][:, 2] > NEAREST_M)
     start, end = ends[0][kept], ends[1][kept]
@@ -325,7 +316,7 @@ def covered(view: View, depth: NDArray[np.floating], moving: Moving) -> Array:
         return np.stack([camera.fx * p[:, 0] / p[:, 2] + camera.cx, camera.fy * p[:, 1] / p[:, 2] + camera.cy], 1)
 
     a, b = pixel(start), pixel(end)
-    width = camera.fx * moving.diameter_m / middle[kept, 2]
+    width = camera.fx * diameter_m / middle[kept, 2]
     lengths = np.linalg.norm(b - a, axis=1)
     along = np.minimum(np.ceil(lengths / _STEP_PX).astype(np.int64) + 1, _MOST_STEPS)
     across = np.ceil(width / _STEP_PX).astype(np.int64)
@@ -380,5 +371,5 @@ def falling(
         velocity = np.array([*fall.wind_m_s, -size.fall_m_s])
         xyz = places(size, velocity, view, fall.reach_m, seeds.key(seed, index, fall.purpose))
         xyz = xyz[np.linalg.norm(xyz - view.center_world, axis=1) < fall.reach_m]
-        total += covered(view, depth, Moving(xyz, velocity - np.asarray(camera_velocity), size.diameter_m))
+        total += covered(view, depth, xyz, velocity - np.asarray(camera_velocity), size.diameter_m)
     return total
