@@ -19,6 +19,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from city_camera import CityLight, city_light, surfaces
+
 from mudg.base import store
 from mudg.base.palette import ID
 from mudg.base.types import View
@@ -31,29 +35,25 @@ from mudg.base.weather_settings import (
     WeatherSettings,
 )
 from mudg.city.config import CityConfig
-from mudg.city.light import CityLight, city_light
 from mudg.city.world import CityTruth, CityWorld
 from mudg.core import weather
 from mudg.core.weather import air, ground
 from mudg.core.weather import light as relight
 from mudg.core.weather.gbuffer import (
-    BufferRules,
     GBuffer,
     OccluderMap,
     Surroundings,
     euclidean_range,
     from_render,
-    mirror_view,
     sun_visibility,
     world_points,
 )
-from mudg.core.weather.light import SRGB, ToneCurve
+from mudg.core.weather.light import srgb_decode, srgb_encode
 
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.float32]
 WET_IDS = (ID["road"], ID["sidewalk"])
-KERB_M = 0.13
-"""Height of sidewalks above the road in the generated city."""
+Decode = Callable[[NDArray[np.floating]], Picture]
 
 
 def say(line: str) -> None:
@@ -104,16 +104,15 @@ class Case:
     truth: CityTruth
     light: CityLight
 
-    def gbuffer(self, curve: ToneCurve, heights: OccluderMap | None = None) -> GBuffer:
-        """From the image, exact depth and exact classes."""
-        return from_render(
-            self.view, curve.decode(self.truth.rgb), self.truth.depth, self.truth.semantics, BufferRules(heights)
-        )
+    def gbuffer(self, heights: OccluderMap | None = None, decode: Decode | None = None) -> GBuffer:
+        """From the image, exact depth and exact classes; without ``decode``, by the city's own camera."""
+        light = (decode or self.light.response.decode)(self.truth.rgb)
+        return from_render(self.view, light, self.truth.depth, self.truth.semantics, heights)
 
-    def exact(self, curve: ToneCurve) -> GBuffer:
+    def exact(self) -> GBuffer:
         """With exact normals and visible share of the sky, too."""
-        s = self.world.surfaces(self.view)
-        return replace(self.gbuffer(curve), normal=s.normal, openness=s.openness, sunlit=s.sunlit)
+        s = surfaces(self.world, self.view)
+        return replace(self.gbuffer(), normal=s.normal, openness=s.openness, sunlit=s.sunlit)
 
     def heights(self) -> OccluderMap:
         """From depth images of all frames and cameras."""
@@ -136,13 +135,13 @@ def case_of(config: CityConfig) -> Case:
     """The middle frame of the front camera."""
     world = CityWorld(config)
     view = world.frame_views("front")[config.n_frames // 2]
-    return Case(world, view, world.render(view), city_light(config, world.lamps))
+    return Case(world, view, world.render(view), city_light(config))
 
 
 def foggy(case: Case, gbuffer: GBuffer, visibility_m: float, light: Surroundings, recorded_m: float) -> Picture:
     """Linear light in fog."""
     settings = WeatherSettings(fog=FogSettings(visibility_m=visibility_m), recorded_visibility_m=recorded_m)
-    return weather.apply(gbuffer, Conditions(weather=settings), case.view, case.view.time_s, 0, light).color
+    return weather.apply(gbuffer, Conditions(weather=settings), case.view, case.view.time_s, 0, light)
 
 
 def score_fog(
@@ -151,27 +150,27 @@ def score_fog(
     """Right curve and plain sRGB curve, exact depth and depth of a fitted scene."""
     truth = CityWorld(replace(case.world.config, fog_visibility_m=visibility_m)).render(case.view)
     solid = ~truth.sky
-    own, around = case.light.response.curve(), case.light.surroundings
+    own, around = case.light.response, case.light.surroundings
     lines = [f"unedited {psnr(case.truth.rgb, truth.rgb, solid):.1f}"]
-    exact = case.gbuffer(own)
+    exact = case.gbuffer()
     best = own.encode(foggy(case, exact, visibility_m, around, case.light.visibility_m))
     lines.append(f"city's curve, exact depth {psnr(best, truth.rgb, solid):.1f}")
-    generic = case.gbuffer(SRGB)
+    generic = case.gbuffer(None, srgb_decode)
     guess = weather.estimate_surroundings([(case.view, generic)])
     lines.append(
-        f"sRGB, exact depth {psnr(SRGB.encode(foggy(case, generic, visibility_m, guess, 0.0)), truth.rgb, solid):.1f}"
+        f"sRGB, exact depth {psnr(srgb_encode(foggy(case, generic, visibility_m, guess, 0.0)), truth.rgb, solid):.1f}"
     )
     share = np.exp(-air.extinction(visibility_m) * np.where(truth.sky, 0, exact.depth).astype(np.float64))
-    shown = air.veiled(case.truth.rgb, share, SRGB.encode(guess.airlight[None])[0])
+    shown = air.veiled(case.truth.rgb, share, srgb_encode(guess.airlight[None])[0])
     lines.append(f"display values and camera z {psnr(shown, truth.rgb, solid):.1f}")
     if fitted is not None:
         rgb, depth = fitted
         depth = np.where(truth.sky, np.inf, np.where(np.isfinite(depth), depth, 200.0)).astype(np.float32)
         for name, colors in (("recorded image", case.truth.rgb), ("rendered image", rgb)):
             with_own = replace(exact, color=own.decode(colors), depth=depth)
-            with_srgb = replace(exact, color=SRGB.decode(colors), depth=depth)
+            with_srgb = replace(exact, color=srgb_decode(colors), depth=depth)
             a = psnr(own.encode(foggy(case, with_own, visibility_m, around, case.light.visibility_m)), truth.rgb, solid)
-            b = psnr(SRGB.encode(foggy(case, with_srgb, visibility_m, guess, 0.0)), truth.rgb, solid)
+            b = psnr(srgb_encode(foggy(case, with_srgb, visibility_m, guess, 0.0)), truth.rgb, solid)
             lines.append(
                 f"fitted depth, {name}: city's curve {a:.1f}, sRGB {b:.1f} (unedited"
                 f" {psnr(colors, case.truth.rgb, solid):.1f})"
@@ -183,31 +182,28 @@ def score_light(case: Case, name: str) -> Result:
     """Another light against a global colour transfer that knows the target's statistics."""
     config = replace(case.world.config, light=name)
     world = CityWorld(config)
-    truth, target = world.render(case.view), city_light(config, world.lamps)
+    truth, target = world.render(case.view), city_light(config)
     solid = ~truth.sky
-    own, there = case.light.response.curve(), target.response.curve()
+    there = target.response
     lines = [
         f"unedited {psnr(case.truth.rgb, truth.rgb, solid):.1f}",
         f"global transfer {best_transfer(case.truth.rgb, truth.rgb, solid):.1f}",
     ]
     heights = case.heights()
     around, goal = case.light.surroundings, target.surroundings
-    estimated = case.gbuffer(own, heights)
+    estimated = case.gbuffer(heights)
     estimated = replace(
         estimated,
         sunlit=sun_visibility(estimated, case.view, heights, around.sun_direction),
         new_sunlit=sun_visibility(estimated, case.view, heights, goal.sun_direction),
     )
-    exact = replace(case.exact(own), new_sunlit=world.surfaces(case.view).sunlit)
+    exact = replace(case.exact(), new_sunlit=surfaces(world, case.view).sunlit)
     for label, gbuffer in (("exact surfaces", exact), ("height map", estimated)):
         clear = np.exp(
             -air.extinction(case.light.visibility_m) * np.where(truth.sky, 0, euclidean_range(case.view, gbuffer.depth))
         )
         gbuffer = replace(gbuffer, color=air.unveiled(gbuffer.color, clear, around.airlight))
-        points = None
-        if name == "night":
-            points = relight.night_lights(gbuffer, case.view, goal, LightSettings(time="night", headlights=False))
-        lit, _ = relight.relit(gbuffer, case.view, around, goal, points)
+        lit = relight.relit(gbuffer, case.view, around, goal)
         hazy = np.exp(
             -air.extinction(target.visibility_m) * np.where(truth.sky, 0, euclidean_range(case.view, gbuffer.depth))
         )
@@ -217,20 +213,15 @@ def score_light(case: Case, name: str) -> Result:
 
 
 def score_wet(case: Case) -> Result:
-    """Road and sidewalk, mirrored in the image itself and by a second render."""
+    """Road and sidewalk, mirrored in the image itself."""
     config = replace(case.world.config, wet=1.0, puddles=0.35)
     truth = CityWorld(config).render(case.view)
     where = np.isin(truth.semantics, WET_IDS)
-    own, around = case.light.response.curve(), case.light.surroundings
-    dry = case.gbuffer(own)
-    # the vignette belongs to the pixel, so the mirrored image is decoded as it was taken, then turned
-    planes = [own.decode(case.world.render(mirror_view(case.view, z)).rgb)[::-1] for z in (0.0, KERB_M)]
-    mirrored = np.where(dry.classes[..., None] == ID["road"], *planes)
-    lines = [f"unedited {psnr(case.truth.rgb, truth.rgb, where):.1f}"]
-    for label, gbuffer in (("mirror in the image", dry), ("mirror pass", replace(dry, mirror=mirrored))):
-        light, _ = ground.wet_ground(gbuffer, case.view, around, 1.0, 0.35, config.seed)
-        shown = own.encode(light)
-        lines.append(f"{label} {psnr(shown, truth.rgb, where):.1f}")
+    light = ground.wet_ground(case.gbuffer(), case.view, case.light.surroundings, 1.0, 0.35, config.seed)
+    shown = case.light.response.encode(light)
+    lines = [
+        f"{name} {psnr(rgb, truth.rgb, where):.1f}" for name, rgb in (("unedited", case.truth.rgb), ("wet", shown))
+    ]
     return Result(lines, shown, truth.rgb)
 
 
@@ -238,14 +229,14 @@ def score_snow(case: Case, cover: float = 0.7) -> Result:
     """Where snow lies, and the image."""
     config = replace(case.world.config, snow_cover=cover)
     world = CityWorld(config)
-    truth, lies = world.render(case.view), world.surfaces(case.view).snow > 0.5
-    own, around = case.light.response.curve(), case.light.surroundings
+    truth, lies = world.render(case.view), surfaces(world, case.view).snow > 0.5
+    own, around = case.light.response, case.light.surroundings
     solid = ~truth.sky
     heights = case.heights()
-    estimated = case.gbuffer(own, heights)
+    estimated = case.gbuffer(heights)
     estimated = replace(estimated, sunlit=sun_visibility(estimated, case.view, heights, around.sun_direction))
     lines = [f"unedited {psnr(case.truth.rgb, truth.rgb, solid):.1f}", f"covered {lies.mean():.2f}"]
-    for label, gbuffer in (("exact surfaces", case.exact(own)), ("height map", estimated)):
+    for label, gbuffer in (("exact surfaces", case.exact()), ("height map", estimated)):
         found = ground.snow_cover(gbuffer, case.view, cover, config.seed)
         iou = ((found > 0.5) & lies).sum() / max(((found > 0.5) | lies).sum(), 1)
         sunlit = relight.sunlit_of(gbuffer, around)
@@ -266,7 +257,7 @@ def fitted_view(run: Path, size: tuple[int, int]) -> tuple[Case, tuple[Picture, 
     view = views[len(views) // 2].resized(*size)
     folder = next(p for name in ("mudg_s", "street_gaussians") if (p := run / "fit" / name).is_dir())
     shown = FittedScene.read(folder, "cpu").render(view.camera, view.world_from_cam, view.time_s)
-    case = Case(world, view, world.render(view), city_light(world.config, world.lamps))
+    case = Case(world, view, world.render(view), city_light(world.config))
     return case, ((shown.rgb / 255).astype(np.float32), shown.depth_m)
 
 
@@ -295,14 +286,13 @@ def write_picture(path: Path, rows: list[Picture]) -> None:
 
 def sheet(case: Case, path: Path) -> None:
     """All effects on one view, two rows of three."""
-    own = case.light.response.curve()
-    heights = case.heights()
-    gbuffer = case.gbuffer(own, heights)
+    own, heights = case.light.response, case.heights()
+    gbuffer = case.gbuffer(heights)
     gbuffer = replace(
         gbuffer, sunlit=sun_visibility(gbuffer, case.view, heights, case.light.surroundings.sun_direction)
     )
     shown = [
-        own.encode(weather.apply(gbuffer, c, case.view, case.view.time_s, 1, case.light.surroundings).color)
+        own.encode(weather.apply(gbuffer, c, case.view, case.view.time_s, 1, case.light.surroundings))
         for c in SHEET.values()
     ]
     rows = [np.concatenate(shown[i : i + 3], 1) for i in (0, 3)]
@@ -315,14 +305,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="*", default=[41, 42])
     parser.add_argument("--size", default="240x160")
-    parser.add_argument("--only", nargs="+", default=["fog", "dusk", "overcast", "night", "wet", "snow"])
+    parser.add_argument("--only", nargs="+", default=["fog", "dusk", "overcast", "wet", "snow"])
     parser.add_argument("--fit", type=Path)
     parser.add_argument("--sheet", type=Path)
     parser.add_argument("--pairs", type=Path)
     options = parser.parse_args()
     width, height = (int(n) for n in options.size.split("x"))
     scores: dict[str, Callable[[Case], Result]] = {"fog": score_fog, "wet": score_wet, "snow": score_snow}
-    scores |= {name: lambda case, name=name: score_light(case, name) for name in ("dusk", "overcast", "night")}
+    scores |= {name: lambda case, name=name: score_light(case, name) for name in ("dusk", "overcast")}
     if options.fit is not None:
         case, fitted = fitted_view(options.fit, (width, height))
         say(f"fog, {options.fit}: " + "; ".join(score_fog(case, fitted=fitted).lines))

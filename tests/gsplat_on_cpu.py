@@ -1,10 +1,10 @@
 """gsplat without CUDA: the real package with stand-ins for its compiled kernels.
 
-Everything that gsplat does in Python runs as it is: argument checks, autograd functions, packing, tiles, what it
-returns. Only the compiled functions are replaced, by gsplat's own references in torch (`gsplat.cuda._torch_impl`) and,
-where those need further packages, by the formulas of the kernels' source (alpha cut 1/255, cap 0.999, stop at a
-transmittance of 1e-4, radii that know the opacity). Backward kernels are autograd of the forward ones. As on a GPU,
-what a kernel does not write is whatever was in memory: here NaN.
+Everything that gsplat does in Python runs as it is: argument checks, autograd functions, tiles, what it returns. Only
+the compiled functions are replaced, by gsplat's own references in torch (`gsplat.cuda._torch_impl`) and, where those
+need further packages, by the formulas of the kernels' source (alpha cut 1/255, cap 0.999, stop at a transmittance of
+1e-4, radii that know the opacity). Backward kernels are autograd of the forward ones. As on a GPU, what a kernel does
+not write is whatever was in memory: here NaN.
 """
 
 from __future__ import annotations
@@ -159,36 +159,12 @@ class Kernels:
         v = self._projection_gradients(drawn, inputs, cotangents)
         return v[0], None, v[1], v[2], v[3]
 
-    def projection_ewa_3dgs_packed_fwd(
-        self, means: Tensor, covars: None, quats: Tensor, scales: Tensor, *rest: Any
-    ) -> Any:
-        radii, *values = self.projection_ewa_3dgs_fused_fwd(means, covars, quats, scales, *rest)
-        camera, gaussian = torch.nonzero((radii > 0).all(-1), as_tuple=True)
-        rows = [None if value is None else value[camera, gaussian] for value in (radii, *values)]
-        return torch.zeros(0), torch.zeros_like(camera), camera, gaussian, *rows
-
-    def projection_ewa_3dgs_packed_bwd(
-        self, means: Tensor, covars: None, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, *rest: Any
-    ) -> Any:
-        width, height, eps2d, model, _, camera, gaussian, _, _, *cotangents, _, sparse = rest
-        assert not sparse
-        inputs = (means, quats, scales, viewmats, Ks, width, height, eps2d, model)
-        v = self._projection_gradients((camera, gaussian), inputs, cotangents)
-        return v[0], None, v[1], v[2], v[3]
-
-    # ---- tiles ----
-
     def intersect_tile(self, means2d: Tensor, radii: Tensor, depths: Tensor, *rest: Any) -> Any:
         from gsplat.cuda._torch_impl import _isect_tiles
 
-        images, gaussians, count, tile, across, down, sort, _ = rest
-        if images is None or gaussians is None:
-            return _isect_tiles(means2d.nan_to_num(), radii, depths.nan_to_num(), tile, across, down, sort)
-        most, place = int(gaussians.max()) + 1 if len(gaussians) else 1, (images, gaussians)
-        full = [v.new_zeros(count, most, *v.shape[1:]).index_put(place, v) for v in (means2d, radii, depths)]
-        per_gauss, codes, ids = _isect_tiles(*full, tile, across, down, sort)
-        row = torch.full((count, most), -1).index_put(place, torch.arange(len(images)))
-        return per_gauss[place], codes, row.flatten()[ids.long()].int()
+        images, _, _, tile, across, down, sort, _ = rest
+        assert images is None  # nothing is packed
+        return _isect_tiles(means2d.nan_to_num(), radii, depths.nan_to_num(), tile, across, down, sort)
 
     def intersect_offset(self, codes: Tensor, count: int, across: int, down: int) -> Tensor:
         from gsplat.cuda._torch_impl import _isect_offset_encode
@@ -260,115 +236,3 @@ class Kernels:
             v_abs.index_add_(0, entries, gradient.abs().sum(0))
         v_flat = [one.view_as(like) for one, like in zip(v[:3], (conics, colors, opacities), strict=True)]
         return v_abs.view_as(means2d) if absolute else None, v_means.view_as(means2d), *v_flat
-
-    # ---- responses in space ----
-
-    def projection_ut_3dgs_fused(self, means: Tensor, quats: Tensor, scales: Tensor, *rest: Any) -> Any:
-        """Only what the pixels need of it: the order, and rectangles that certainly hold every response (the whole
-        image)."""
-        opacities, viewmats, viewmats_rs, Ks, width, height, _, near, far, *_ = rest
-        middle = viewmats if viewmats_rs is None else (viewmats + viewmats_rs) / 2
-        here = means @ middle[:, :3, :3].transpose(1, 2) + middle[:, None, :3, 3]
-        means2d = (here @ Ks.transpose(1, 2))[..., :2] / here[..., 2:]
-        drawn = (here[..., 2] >= near) & (here[..., 2] <= far) & (opacities >= ALPHA_MIN)
-        radii = torch.where(drawn[..., None], width + height + means2d.abs(), 0).int()
-        conics, depths = torch.full((*drawn.shape, 3), torch.nan), torch.where(drawn, here[..., 2], torch.nan)
-        return radii, torch.where(drawn[..., None], means2d, torch.nan), depths, conics, None
-
-    def rasterize_to_pixels_from_world_3dgs_fwd(
-        self, means: Tensor, quats: Tensor, scales: Tensor, colors: Tensor, opacities: Tensor, *rest: Any
-    ) -> Any:
-        from gsplat.cuda._torch_impl import _quat_to_rotmat
-
-        background, mask, width, height, tile, first, last, Ks, _, _, shutter, *lens, offsets, ids = rest
-        assert first.shape[0] == 1
-        rotation = _quat_to_rotmat(quats)
-        opacity = opacities.reshape(-1)
-
-        def response(image: int, pixels: Tensor, entries: Tensor) -> tuple[Tensor, Tensor]:
-            x, y = _centers(pixels, width)
-            rows = {
-                "TOP_TO_BOTTOM": y.floor() / (height - 1),
-                "LEFT_TO_RIGHT": x.floor() / (width - 1),
-                "BOTTOM_TO_TOP": (height - y.ceil()) / (height - 1),
-                "RIGHT_TO_LEFT": (width - x.ceil()) / (width - 1),
-            }
-            time = rows.get(shutter.removeprefix("ROLLING_"), torch.zeros_like(x))[:, None]
-            end = first if last is None else last
-            assert torch.equal(end[0, :3, :3], first[0, :3, :3])  # a turning camera would need spherical interpolation
-            turn, shift = first[0, :3, :3], (1 - time) * first[0, :3, 3] + time * end[0, :3, 3]
-            (fx, _, cx), (_, fy, cy), _ = Ks[0]
-            ray = torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], 1) @ turn
-            origin = -shift @ turn
-            whiten = rotation[entries].transpose(1, 2) / scales[entries][:, :, None]
-            offset = torch.einsum("mij,pmj->pmi", whiten, origin[:, None] - means[entries])
-            along = torch.nn.functional.normalize(torch.einsum("mij,pj->pmi", whiten, ray), dim=2)
-            power = 0.5 * torch.linalg.cross(along, offset).square().sum(2)
-            return opacity[entries] * torch.exp(-power), power
-
-        flat = colors.reshape(-1, colors.shape[-1])
-        image, alpha = self._pixels(flat, (width, height, tile), offsets, ids, response, background, mask)
-        return image, alpha, torch.zeros(0)
-
-    def rasterize_to_pixels_from_world_3dgs_bwd(self, *arguments: Any) -> Any:
-        *inputs, _, _, v_image, v_alpha = arguments
-        with torch.enable_grad():
-            leaves = _leaves(*inputs[:5])
-            image, alpha, _ = self.rasterize_to_pixels_from_world_3dgs_fwd(*leaves, *inputs[5:])
-            return _gradients([image, alpha], [v_image, v_alpha], leaves)
-
-    # ---- discs ----
-
-    def projection_2dgs_fused_fwd(
-        self, means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, *rest: Any
-    ) -> Any:
-        from gsplat.cuda._torch_impl_2dgs import _fully_fused_projection_2dgs
-
-        width, height, _, near, far, _ = rest
-        return _fully_fused_projection_2dgs(means, quats, scales, viewmats, Ks, width, height, near, far)
-
-    def projection_2dgs_fused_bwd(
-        self, means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, *rest: Any
-    ) -> Any:
-        width, height, radii, _, v_means2d, v_depths, v_normals, v_rays, _ = rest
-        drawn = (radii > 0).all(-1)
-        with torch.enable_grad():
-            leaves = _leaves(means, quats, scales, viewmats)
-            settings = (width, height, 0.3, 0.01, 1e10, 0.0)
-            _, means2d, depths, rays, normals = self.projection_2dgs_fused_fwd(*leaves, Ks, *settings)
-            pairs = ((means2d, v_means2d), (depths, v_depths), (rays, v_rays), (normals, v_normals))
-            return _gradients([out[drawn] for out, _ in pairs], [v[drawn] for _, v in pairs], leaves)
-
-    def _disc_response(self, means: Tensor, rays: Tensor, opacity: Tensor, width: int) -> Any:
-        def response(image: int, pixels: Tensor, entries: Tensor) -> tuple[Tensor, Tensor]:
-            x, y = _centers(pixels, width)
-            ray = rays[entries]
-            planes = (ray[:, 2] * along[:, None, None] - ray[:, axis] for axis, along in enumerate((x, y)))
-            across = torch.linalg.cross(*planes)
-            in_space = (across[..., :2] / across[..., 2:]).square().sum(-1)
-            in_image = 2 * (torch.stack([x, y], 1)[:, None] - means[entries]).square().sum(-1)
-            sigma = 0.5 * torch.minimum(in_space, in_image)
-            return opacity[entries] * torch.exp(-sigma), sigma
-
-        return response
-
-    def rasterize_to_pixels_2dgs_fwd(
-        self, means2d: Tensor, rays: Tensor, colors: Tensor, opacities: Tensor, normals: Tensor, *rest: Any
-    ) -> Any:
-        background, mask, width, height, tile, offsets, ids = rest
-        assert torch.isfinite(colors).all()  # gsplat pads with uninitialised memory
-        response = self._disc_response(means2d.reshape(-1, 2), rays.reshape(-1, 3, 3), opacities.reshape(-1), width)
-        flat = torch.cat([colors, normals], -1).reshape(-1, colors.shape[-1] + 3)
-        image, alpha = self._pixels(flat, (width, height, tile), offsets, ids, response, background, mask)
-        nothing = torch.zeros_like(alpha)
-        return image[..., :-3], alpha, image[..., -3:], nothing, nothing.clone(), torch.zeros(0), torch.zeros(0)
-
-    def rasterize_to_pixels_2dgs_bwd(self, means2d: Tensor, rays: Tensor, *rest: Any) -> Any:
-        colors, opacities, normals, _, *settings, _, _, _, _, v_image, v_alpha, v_normals, _, _, _ = rest
-        with torch.enable_grad():
-            leaves = _leaves(means2d, rays, colors, opacities, normals)
-            image, alpha, seen, *_ = self.rasterize_to_pixels_2dgs_fwd(*leaves, *settings)
-            v = _gradients([image, alpha, seen], [v_image, v_alpha, v_normals], leaves)
-        depth = rays[..., 2, 2]
-        v_densify = torch.stack([v[1][..., 0, 2] * depth, v[1][..., 1, 2] * depth], -1)
-        return None, *v, v_densify

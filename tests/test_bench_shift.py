@@ -49,9 +49,14 @@ def test_lists_are_apart_from_each_other_and_from_all_training_cities():
     ("first", "name"), [(2_100_000, "development"), pytest.param(2_100_100, "reported", marks=pytest.mark.slow)]
 )
 def test_a_list_is_what_the_rule_gives(first, name):
-    assert city_logs.choose(first, len(city_logs.LISTS[name])) == city_logs.LISTS[name]
-    with pytest.raises(UsageError, match="half"):
-        city_logs.choose(0, 3)
+    """Half of the list is curved; seeds are walked upwards."""
+    kept, half, seed = {True: [], False: []}, len(city_logs.LISTS[name]) // 2, first
+    while min(map(len, kept.values())) < half:
+        curved = city_logs.turn_deg(city_logs.log_config(seed)) >= city_logs.CURVED_DEG
+        if len(kept[curved]) < half and city_logs.facts(seed).moving >= city_logs.MOVING:
+            kept[curved].append(seed)
+        seed += 1
+    assert tuple(sorted(kept[True] + kept[False])) == city_logs.LISTS[name]
 
 
 def test_moving_instances_are_those_of_the_generator():

@@ -27,11 +27,10 @@ from mudg.city.sensors import (
     pose_errors,
     recorded,
     thinned,
-    to_display,
-    to_light,
     with_look,
 )
 from mudg.city.world import CityWorld
+from mudg.core.weather.light import srgb_decode, srgb_encode
 from mudg.diffusion import city_clips
 from mudg.diffusion.city_clips import CityLog, record_with_faults
 
@@ -60,21 +59,21 @@ def test_the_default_look_and_faults_change_nothing() -> None:
 def test_a_look_is_what_it_states() -> None:
     image = picture()
     shown = with_look(image, CameraLook(gain=1.5, white=(1.1, 1.0, 0.8)), 0.7)
-    assert np.allclose(to_light(shown) / to_light(image), 1.5 * np.array([1.1, 1.0, 0.8]), rtol=1e-3)
+    assert np.allclose(srgb_decode(shown) / srgb_decode(image), 1.5 * np.array([1.1, 1.0, 0.8]), rtol=1e-3)
     look = CameraLook(drift_stops=0.5, drift_period_s=4.0)
     gains = [look.gains(t)[1] for t in (0.0, 1.0, 2.0, 3.0)]
     assert np.allclose(gains, [1, math.sqrt(2), 1, math.sqrt(0.5)])
     balance = CameraLook(drift_white=0.05).gains(0.0)
     assert balance[0] / balance[2] == pytest.approx(1.05 / 0.95)
     flat = np.full((200, 300, 3), 0.5, np.float32)
-    light = to_light(with_look(flat, CameraLook(vignette=0.4), 0.0)) / to_light(flat)
+    light = srgb_decode(with_look(flat, CameraLook(vignette=0.4), 0.0)) / srgb_decode(flat)
     assert light[100, 150, 0] == pytest.approx(1.0, abs=1e-3)
     assert light[0, 0, 0] == pytest.approx(0.6, abs=0.01)
     image = np.full((2, 2, 3), 0.6, np.float32)
     assert np.allclose(with_look(image, CameraLook(contrast=1.5), 0.0), 0.65, atol=1e-5)
     values = np.linspace(0, 1, 11, dtype=np.float32)
-    assert np.allclose(to_display(to_light(values)), values, atol=1e-6)
-    assert to_light(np.float32([0.5]))[0] == pytest.approx(0.2140, abs=1e-4)
+    assert np.allclose(srgb_encode(srgb_decode(values)), values, atol=1e-6)
+    assert srgb_decode(np.float32([0.5]))[0] == pytest.approx(0.2140, abs=1e-4)
 
 
 def test_varied_clips_stay_in_the_free_space() -> None:

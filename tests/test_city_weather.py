@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import city_camera
 import numpy as np
 import pytest
+from city_camera import city_light
 
 from mudg import native
 from mudg.base.palette import ID
 from mudg.base.types import View
 from mudg.city.config import CityConfig
-from mudg.city.light import city_light, weather_numbers
+from mudg.city.light import LAMP_POWER, weather_numbers
 from mudg.city.world import CityWorld
 from mudg.core.weather import air as fog
 from mudg.core.weather import ground
-from mudg.core.weather import light as relight
 from mudg.core.weather.gbuffer import euclidean_range, world_points
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="the city needs the native library")
@@ -36,10 +37,10 @@ def view(clear: CityWorld) -> View:
 
 def test_surfaces_are_unit_normals_and_albedos_without_weather(clear: CityWorld, view: View) -> None:
     assert weather_numbers(CLEAR) is None
-    surfaces = clear.surfaces(view)
+    surfaces = city_camera.surfaces(clear, view)
     assert not surfaces.snow.any()
     assert not surfaces.water.any()
-    surfaces, truth = clear.surfaces(view), clear.render(view)
+    surfaces, truth = city_camera.surfaces(clear, view), clear.render(view)
     solid = ~truth.sky
     np.testing.assert_allclose(np.linalg.norm(surfaces.normal[solid], axis=-1), 1, atol=2e-3)
     assert (surfaces.normal[truth.semantics == ID["road"]] == [0, 0, 1]).all()
@@ -55,7 +56,7 @@ def test_fog_follows_koschmieder(clear: CityWorld, view: View) -> None:
     camera."""
     truth, light = clear.render(view), city_light(CLEAR)
     hazy = CityWorld(replace(CLEAR, fog_visibility_m=120.0)).render(view)
-    curve, solid = light.response.curve(), ~truth.sky
+    curve, solid = light.response, ~truth.sky
     distance = euclidean_range(view, np.where(solid, truth.depth, 0))
     shares = [np.exp(-fog.extinction(v) * distance) for v in (light.visibility_m, 120.0)]
     air = light.surroundings.airlight
@@ -69,7 +70,7 @@ def test_fog_follows_koschmieder(clear: CityWorld, view: View) -> None:
 def test_snow_lies_where_the_rule_says() -> None:
     world = CityWorld(replace(CLEAR, snow_cover=0.6))
     at = world.frame_views("front")[1]
-    truth, surfaces = world.render(at), world.surfaces(at)
+    truth, surfaces = world.render(at), city_camera.surfaces(world, at)
     solid = ~truth.sky & ~np.isin(truth.semantics, (ID["person"], ID["rider"], ID["vegetation"]))
     expected = ground.snow_weight(
         world_points(at, truth.depth)[solid], surfaces.normal[solid], surfaces.openness[solid], 0.6, CLEAR.seed
@@ -83,7 +84,7 @@ def test_snow_lies_where_the_rule_says() -> None:
 
 def test_wet_ground_is_where_the_rule_says_and_nothing_else_changes(clear: CityWorld, view: View) -> None:
     world = CityWorld(replace(CLEAR, wet=1.0, puddles=0.4))
-    dry, wet, surfaces = clear.render(view), world.render(view), world.surfaces(view)
+    dry, wet, surfaces = clear.render(view), world.render(view), city_camera.surfaces(world, view)
     np.testing.assert_array_equal(dry.depth, wet.depth)
     elsewhere = ~np.isin(dry.semantics, WET_IDS)
     np.testing.assert_array_equal(dry.rgb[elsewhere], wet.rgb[elsewhere])
@@ -92,8 +93,18 @@ def test_wet_ground_is_where_the_rule_says_and_nothing_else_changes(clear: CityW
     assert (np.abs(surfaces.water[level] - expected) < 0.1).mean() > 0.98
     film = level & (surfaces.water == 0)
     np.testing.assert_allclose(
-        surfaces.albedo[film], ground.WET_DARKENING * clear.surfaces(view).albedo[film], rtol=1e-4
+        surfaces.albedo[film], ground.WET_DARKENING * city_camera.surfaces(clear, view).albedo[film], rtol=1e-4
     )
+
+
+def lamp_light(xyz: np.ndarray, normal: np.ndarray, lamps: np.ndarray) -> np.ndarray:
+    """Green irradiance over pi f64[N] of lamps [M, 3] that shine down in a cone; nothing casts shadows."""
+    to = lamps - xyz[:, None]
+    d = np.maximum(np.linalg.norm(to, axis=-1), 0.5)
+    edge = np.cos(np.radians(75.0))
+    cone = fog.smoothstep(edge, edge + 0.25, to[..., 2] / d) * (d < 45.0)
+    facing = np.maximum((normal[:, None] * to).sum(-1) / d, 0)
+    return 0.82 * (LAMP_POWER * facing * cone / d**2).sum(1)
 
 
 def test_lamps_light_the_road_at_night() -> None:
@@ -101,12 +112,12 @@ def test_lamps_light_the_road_at_night() -> None:
     world = CityWorld(config)
     assert len(world.lamps) > 2
     at = world.frame_views("front")[1]
-    surfaces, truth = world.surfaces(at), world.render(at)
+    surfaces, truth = city_camera.surfaces(world, at), world.render(at)
     road = truth.semantics == ID["road"]
     points = world_points(at, truth.depth)
-    level = relight.lamp_light(points[road], surfaces.normal[road], world.lamps)[:, 1]
-    light = city_light(config, world.lamps)
-    shown = light.response.curve().decode(truth.rgb)[road][:, 1] / np.maximum(surfaces.albedo[road][:, 1], 1e-3)
+    level = lamp_light(points[road], surfaces.normal[road], world.lamps)
+    light = city_light(config)
+    shown = light.response.decode(truth.rgb)[road][:, 1] / np.maximum(surfaces.albedo[road][:, 1], 1e-3)
     assert np.corrcoef(level, shown)[0, 1] > 0.85  # shadows of what stands between are all that differs
     assert np.median(shown / (level + light.surroundings.ambient[1])) == pytest.approx(1, abs=0.2)
 

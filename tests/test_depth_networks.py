@@ -14,12 +14,11 @@ from PIL import Image
 from tiny_networks import package
 
 from mudg.base.errors import InputError, ResourceError
-from mudg.core.depth import CompletionRules
+from mudg.core.depth import SKY_M
 from mudg.labels.depth_networks import align_to_lidar, kind_of, lidar_cue, load_depth_network, residual_confidence
 from mudg.labels.inputs import DepthInput, Prediction
 from mudg.networks.folders import Compute
 
-RULES = CompletionRules()
 real_packages = pytest.mark.filterwarnings("ignore")
 """What the packages warn about among themselves is theirs."""
 
@@ -30,7 +29,7 @@ def street(height: int = 48, width: int = 72, measured: float = 0.2, seed: int =
     v, u = np.mgrid[0:height, 0:width].astype(np.float64)
     depth = np.minimum(1.5 * width / np.maximum(v - height / 2, 0.5), 6 + 0.9 * np.abs(u - width / 2)).clip(2, 80)
     sky = (v < height / 4) & (np.abs(u - width / 2) < width / 4)
-    depth[sky] = RULES.sky_m
+    depth[sky] = SKY_M
     depth = depth.astype(np.float32)
     seen = (rng.uniform(size=depth.shape) < measured) & ~sky
     rgb = np.stack([255 * (depth % 7) / 7, 3 * u, 2 * v], 2).clip(0, 255).astype(np.uint8)
@@ -55,9 +54,9 @@ def test_an_affine_map_of_the_truth_comes_back_as_the_truth(
     measured[bad] = rng.uniform(1, 90, int(bad.sum()))
     given = DepthInput(given.rgb, measured, given.filled, given.sky)
     prediction = Prediction((scale * goal + shift).astype(np.float32), space)
-    dense, fit = align_to_lidar(prediction, given, RULES)
+    dense, fit = align_to_lidar(prediction, given)
     assert fit.used and dense is not None and np.abs(dense.depth / truth - 1).max() < 1e-3
-    assert (dense.depth[given.sky] == RULES.sky_m).all() and fit.residual < 1e-3
+    assert (dense.depth[given.sky] == SKY_M).all() and fit.residual < 1e-3
 
 
 def test_wrong_returns_from_behind_do_not_pull_and_depth_that_does_not_fit_is_not_used() -> None:
@@ -68,24 +67,24 @@ def test_wrong_returns_from_behind_do_not_pull_and_depth_that_does_not_fit_is_no
     bad = np.isfinite(measured) & (np.random.default_rng(2).uniform(size=truth.shape) < 0.4)
     measured[bad] *= 1.4
     asked = DepthInput(given.rgb, measured, given.filled, given.sky)
-    dense, fit = align_to_lidar(Prediction(truth / 80 - 0.1, "depth"), asked, RULES)
+    dense, fit = align_to_lidar(Prediction(truth / 80 - 0.1, "depth"), asked)
     assert dense is not None and np.abs(dense.depth / truth - 1).max() < 1e-3
     rng = np.random.default_rng(3)
     noise = rng.uniform(1, 2, truth.shape).astype(np.float32)
     for values in (noise, -truth, np.full_like(truth, 3.0)):
-        assert align_to_lidar(Prediction(values, "depth"), given, RULES)[0] is None
+        assert align_to_lidar(Prediction(values, "depth"), given)[0] is None
     few = np.where(np.cumsum(np.isfinite(given.measured)).reshape(truth.shape) <= 20, given.measured, np.nan)
     asked = DepthInput(given.rgb, few, given.filled, given.sky)
-    assert align_to_lidar(Prediction(truth, "depth"), asked, RULES)[0] is None
+    assert align_to_lidar(Prediction(truth, "depth"), asked)[0] is None
     with pytest.raises(InputError, match="size"):
-        align_to_lidar(Prediction(truth[1:], "depth"), given, RULES)
+        align_to_lidar(Prediction(truth[1:], "depth"), given)
 
 
 def test_confidence_is_low_where_the_depth_is_off() -> None:
     given, truth = street()
     off = truth.copy()
     off[:, :24] *= 1.3
-    confidence = residual_confidence(off, given.measured, given.sky, RULES.sky_m)
+    confidence = residual_confidence(off, given.measured, given.sky, SKY_M)
     right, wrong = np.median(confidence[30:, 40:]), np.median(confidence[30:, :16])
     assert right > 0.5 > 0.1 > wrong and confidence.dtype == np.float32
     assert ((confidence >= 0) & (confidence <= 1)).all()

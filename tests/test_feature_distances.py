@@ -38,12 +38,7 @@ def frechet_by_sqrtm(a: np.ndarray, b: np.ndarray) -> float:
     return float(((a.mean(0) - b.mean(0)) ** 2).sum() + np.trace(s + t - 2 * root.real))
 
 
-ALL = {
-    "frechet": distances.frechet_distance,
-    "kernel": distances.kernel_distance,
-    "mind": lambda a, b: distances.mind_distance(a, b, seeds.numpy_rng(0, 0, "mind")),
-    "cmmd": distances.cmmd_distance,
-}
+ALL = {"frechet": distances.frechet_distance, "kernel": distances.kernel_distance, "cmmd": distances.cmmd_distance}
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -56,7 +51,7 @@ def test_symmetric_and_independent_of_the_order_of_rows(name: str) -> None:
     assert ALL[name](a.astype(np.float32), b.astype(np.float32)) == pytest.approx(value, rel=1e-4)
 
 
-@pytest.mark.parametrize(("name", "count"), [(n, c) for n in ("frechet", "mind", "cmmd") for c in (5, 60)])
+@pytest.mark.parametrize(("name", "count"), [(n, c) for n in ("frechet", "cmmd") for c in (5, 60)])
 def test_a_set_is_0_from_itself(name: str, count: int) -> None:
     a = rows(count, 12, "a") + 3
     assert 0 <= ALL[name](a, a[::-1].copy()) < 1e-9 * (a**2).sum()
@@ -88,15 +83,11 @@ def test_frechet_agrees_with_the_matrix_root(n: int, m: int) -> None:
     assert distances.frechet_distance(a, b) == pytest.approx(frechet_by_sqrtm(a, b), rel=digits)
 
 
-def test_frechet_of_few_rows_is_mostly_bias_and_the_extrapolation_takes_most_of_it() -> None:
+def test_frechet_of_few_rows_is_mostly_bias() -> None:
     rng = seeds.numpy_rng(0, 0, "bias")
     a, b = rng.standard_normal((300, 40)), rng.standard_normal((300, 40))
     biased = distances.frechet_distance(a, b)
     assert distances.frechet_distance(a[:60], b[:60]) > 3 * biased > 3.0
-    assert abs(distances.frechet_at_infinity(a, b, seeds.numpy_rng(0, 0, "sizes"))) < biased / 3
-    a = seeds.numpy_rng(0, 0, "shift").standard_normal((400, 3))
-    found = distances.frechet_at_infinity(a, a + [10.0, 0, 0], seeds.numpy_rng(0, 1, "sizes"))
-    assert found == pytest.approx(100.0, rel=0.02)
 
 
 def kernel_by_loops(a: np.ndarray, b: np.ndarray) -> float:
@@ -140,23 +131,6 @@ def test_kernel_error_agrees_with_the_spread_of_fresh_samples_and_grows_with_blo
     blocks = np.repeat(np.arange(12), 5)
     apart = distances.kernel_distance_error(a, b, (range(60), range(60)), seeds.numpy_rng(0, 0, "boot"))
     assert distances.kernel_distance_error(a, b, (blocks, blocks), seeds.numpy_rng(0, 0, "boot")) > 1.5 * apart
-
-
-def test_mind_of_a_shift_and_against_loops() -> None:
-    a = rows(30, 3, "a")
-    moved = distances.mind_distance(a, a + [0.0, 2.0, 0.0], seeds.numpy_rng(0, 0, "mind"), 4000)
-    assert moved == pytest.approx(3 * 4.0, rel=0.05)
-    b = rows(30, 3, "b")
-    lines = seeds.numpy_rng(0, 0, "mind").standard_normal((3, 20))
-    total = []
-    for line in lines.T:
-        unit = line / math.sqrt(sum(line**2))
-        total += [(p - q) ** 2 for p, q in zip(sorted(a @ unit), sorted(b @ unit))]
-    assert distances.mind_distance(a, b, seeds.numpy_rng(0, 0, "mind"), 20) == pytest.approx(
-        9 * np.mean(total), rel=1e-12
-    )
-    larger = np.concatenate([b, rows(11, 3, "c")])
-    assert distances.mind_distance(a, larger, seeds.numpy_rng(0, 0, "mind"), 20) > 0
 
 
 def test_cmmd_by_hand() -> None:

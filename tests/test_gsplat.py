@@ -16,12 +16,12 @@ from torch import Tensor
 
 from mudg import native
 from mudg.base import geometry
-from mudg.base.errors import InputError, NumericsError, ResourceError, UsageError
+from mudg.base.errors import InputError, NumericsError, ResourceError
 from mudg.base.types import Camera, Gaussians, Render, View
 from mudg.core.raster import gsplat_cuda
 from mudg.core.raster import gsplat_cuda as gsplat_package
 from mudg.core.raster import rasterize as raster
-from mudg.core.raster.rasterize import ONLY_GSPLAT, RasterConfig, rasterize
+from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.steps import doctor as diagnosis
 
 GROUPS = ("means", "quats", "scales", "opacity", "sh", "extra")
@@ -88,8 +88,8 @@ def _compare(
     pose_a = torch.tensor(poses, dtype=torch.float32).requires_grad_()
     pose_b = pose_a.detach().to(single).requires_grad_()
     behind = torch.tensor([0.2, 0.5, 0.7])
-    shared = {"absgrad": config.primitive == "ellipsoid"}
-    common = replace(config, backend=other, alpha_max=gsplat_cuda.ALPHA_MAX, **ONLY_GSPLAT)
+    shared = {"absgrad": True}
+    common = replace(config, backend=other, alpha_max=gsplat_cuda.ALPHA_MAX)
     got = rasterize(
         _gaussians(ours), views, replace(config, backend="gsplat"), background=behind, world_from_cam=pose_a, **shared
     )
@@ -106,9 +106,8 @@ def _compare(
     pairs = {f"d {n}": (ours[n].grad, theirs[n].grad) for n in groups} | {"d pose": (pose_a.grad, pose_b.grad)}
     both = (got.trace.visible & want.trace.visible)[..., None]
     pairs["means2d"] = (got.trace.means2d.detach() * both, want.trace.means2d.detach() * both)
-    if config.primitive == "ellipsoid":
-        pairs["d means2d"] = (got.trace.means2d.grad, want.trace.means2d.grad)
-        pairs["abs"] = (got.trace.abs_grad2d, want.trace.abs_grad2d)
+    pairs["d means2d"] = (got.trace.means2d.grad, want.trace.means2d.grad)
+    pairs["abs"] = (got.trace.abs_grad2d, want.trace.abs_grad2d)
     for name, (mine, reference) in pairs.items():
         assert reference.norm() > 0, name
         found[name] = float((mine.double() - reference).norm() / reference.norm())
@@ -131,18 +130,15 @@ OTHERS = ["torch", pytest.param("cpu", marks=pytest.mark.skipif(native.library()
 
 
 @pytest.mark.parametrize("other", OTHERS)
-@pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("antialias", [False, True])
-def test_it_draws_what_the_other_backends_draw(gsplat: ModuleType, antialias: bool, packed: bool, other: str) -> None:
-    found = _compare(_parameters(), _views()[0], RasterConfig(antialias=antialias, packed=packed), other)
-    _hold(found)
+def test_it_draws_what_the_other_backends_draw(gsplat: ModuleType, antialias: bool, other: str) -> None:
+    _hold(_compare(_parameters(), _views()[0], RasterConfig(antialias=antialias), other))
 
 
-@pytest.mark.parametrize("packed", [False, True])
-def test_several_views_are_drawn_in_one_call(gsplat: ModuleType, monkeypatch: pytest.MonkeyPatch, packed: bool) -> None:
+def test_several_views_are_drawn_in_one_call(gsplat: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     calls, draw = [], gsplat.rasterization
     monkeypatch.setattr(gsplat, "rasterization", lambda **a: (calls.append(a), draw(**a))[1])
-    config = RasterConfig(packed=packed, near_m=2.0, far_m=20.0, blur_px2=0.1)
+    config = RasterConfig(near_m=2.0, far_m=20.0, blur_px2=0.1)
     _hold(_compare(_parameters(60), _views(), config, "torch"))
     assert len(calls) == 1
 
@@ -221,8 +217,7 @@ class _Canary(torch.autograd.Function):
         return gradients[0], None
 
 
-@pytest.mark.parametrize("primitive", ["ellipsoid", "disc"])
-def test_a_dropped_picture_frees_its_graph_at_once(gsplat: ModuleType, primitive: Any) -> None:
+def test_a_dropped_picture_frees_its_graph_at_once(gsplat: ModuleType) -> None:
     """Not when Python next looks for circles: on a GPU every picture would cost memory until then."""
 
     class Alive:
@@ -233,9 +228,9 @@ def test_a_dropped_picture_frees_its_graph_at_once(gsplat: ModuleType, primitive
     gc.collect()
     gc.disable()
     try:
-        config = RasterConfig(backend="gsplat", primitive=primitive)
+        config = RasterConfig(backend="gsplat")
         watched = _gaussians(p | {"means": _Canary.apply(p["means"], alive)})
-        out = rasterize(watched, _views()[0], config, absgrad=primitive == "ellipsoid")
+        out = rasterize(watched, _views()[0], config, absgrad=True)
         del alive, watched
         assert graph() is not None
         del out
@@ -256,13 +251,11 @@ def test_a_dropped_picture_frees_its_graph_at_once(gsplat: ModuleType, primitive
         *(("opacity", value) for value in (0.0, 1.0)),
     ],
 )
-@pytest.mark.parametrize("projection", ["linear", "unscented"])
-def test_absurd_values_never_spread(gsplat: ModuleType, projection: Any, name: str, value: float) -> None:
+def test_absurd_values_never_spread(gsplat: ModuleType, name: str, value: float) -> None:
     p = _parameters(30)
     p[name][3:6] = value
     p = _leaves(p)
-    config = RasterConfig(backend="gsplat", projection=projection)
-    out = rasterize(_gaussians(p), _views()[0], config, absgrad=projection == "linear")
+    out = rasterize(_gaussians(p), _views()[0], RasterConfig(backend="gsplat"), absgrad=True)
     (out.rgb.square().sum() + out.alpha.sum()).backward()
     assert all(torch.isfinite(getattr(out, n)).all() for n in IMAGES)
     assert torch.isfinite(out.trace.means2d).all()
@@ -294,9 +287,8 @@ def test_values_that_are_not_finite(gsplat: ModuleType) -> None:
         assert torch.isfinite(leaves["means"].grad).all()
 
 
-@pytest.mark.parametrize("settings", [{}, {"packed": True}, {"projection": "unscented"}, {"primitive": "disc"}])
-def test_nothing_to_draw(gsplat: ModuleType, settings: dict[str, Any]) -> None:
-    config, (view, _) = RasterConfig(backend="gsplat", **settings), _views()
+def test_nothing_to_draw(gsplat: ModuleType) -> None:
+    config, (view, _) = RasterConfig(backend="gsplat"), _views()
     centre = _leaves(_parameters(10) | {"means": torch.zeros(10, 3)})  # at the very centre of the camera
     rasterize(_gaussians(centre), View(view.camera, np.eye(4), 0.0), config).rgb.sum().backward()
     assert centre["means"].grad is None or torch.isfinite(centre["means"].grad).all()
@@ -307,116 +299,6 @@ def test_nothing_to_draw(gsplat: ModuleType, settings: dict[str, Any]) -> None:
         assert out.alpha.abs().max() == 0
         assert out.rgb[:, 0, 0].tolist() == pytest.approx([0.1, 0.2, 0.3])
         assert not out.trace.visible.any()
-    rolling = RasterConfig(backend="gsplat", projection="unscented", shutter="top_to_bottom")
-    assert rasterize(_gaussians(none), view, rolling, world_from_cam=torch.eye(4).repeat(2, 1, 1)).alpha.max() == 0
-
-
-# ---- what only gsplat has ------------------------------------------------------------------------
-
-
-def _facing(count: int = 12) -> tuple[Parameters, View]:
-    """Flat Gaussians that face a camera at the origin, wide enough that no low-pass filter shows."""
-    rng = np.random.default_rng(1)
-    p = _parameters(count, degree=1)
-    z = torch.tensor(rng.uniform(4, 9, count), dtype=torch.float32)
-    slopes = torch.tensor(rng.uniform(-1, 1, (count, 2)) * [0.4, 0.3], dtype=torch.float32)
-    p["means"] = torch.cat([z[:, None] * slopes, z[:, None]], 1)
-    p["quats"] = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
-    p["scales"] = torch.tensor(rng.uniform(0.2, 0.6, (count, 3)), dtype=torch.float32) * torch.tensor([1, 1, 1e-4])
-    return p, View(Camera("front", 50, 37, 45.0, 46.0, 26.0, 17.0), np.eye(4), 0.0)
-
-
-@pytest.mark.parametrize("channels", [0, 1, 5])
-def test_discs_that_face_the_camera_equal_flat_ellipsoids(gsplat: ModuleType, channels: int) -> None:
-    p, view = _facing()
-    p["extra"] = p["extra"][:, :1].repeat(1, max(channels, 1))
-    found = _compare(
-        p, view, RasterConfig(primitive="disc", blur_px2=0.0), "torch", groups=("means", "opacity", "sh", "extra")
-    )
-    assert all(found[name] <= 1e-5 for name in IMAGES), found
-    assert found["band"] < 0.005
-    assert all(found[f"d {name}"] <= 1e-4 for name in ("means", "opacity", "sh", "extra")), found
-
-
-def test_discs_hand_out_the_gradient_that_densification_needs(gsplat: ModuleType) -> None:
-    p, view = _facing()
-    leaves = _leaves(p)
-    out = rasterize(_gaussians(leaves), view, RasterConfig(backend="gsplat", primitive="disc"))
-    out.rgb.square().sum().backward()
-    assert (out.trace.means2d.grad[out.trace.visible].norm(dim=1) > 0).all()
-    assert leaves["scales"].grad[:, 2].abs().max() == 0
-
-
-def test_unscented_projection_draws_small_gaussians_like_the_linear_one(gsplat: ModuleType) -> None:
-    p, view = _facing()
-    p["scales"] = p["means"][:, 2:] * torch.full((1, 3), 0.03)
-    config = RasterConfig(backend="gsplat", projection="unscented")
-    got = rasterize(_gaussians(p), view, config)
-    want = rasterize(_gaussians(p), view, RasterConfig(backend="torch", blur_px2=0.0, alpha_max=0.999))
-    assert (got.alpha - want.alpha).abs().max() < 0.02  # measured 0.0047: the linear image is the approximation
-    assert (got.rgb - want.rgb).abs().max() < 0.05
-    batch = rasterize(_gaussians(p), [view, view], config)
-    assert torch.equal(batch.rgb[0], got.rgb)
-    assert torch.equal(batch.rgb[1], got.rgb)
-
-
-def test_depth_has_its_gradient_in_every_mode(gsplat: ModuleType) -> None:
-    """Of one Gaussian alone the depth is its camera z. With unscented projection gsplat's own depth has no gradient."""
-    for settings in ({}, {"projection": "unscented"}, {"primitive": "disc"}):
-        p, view = _facing(1)
-        leaves = _leaves(p)
-        out = rasterize(_gaussians(leaves), view, RasterConfig(backend="gsplat", **settings))
-        row, column = divmod(int(out.alpha.argmax()), 50)
-        out.depth[0, row, column].backward()
-        assert float(out.depth[0, row, column].detach()) == pytest.approx(float(p["means"][0, 2]), rel=1e-5)
-        torch.testing.assert_close(leaves["means"].grad, torch.tensor([[0.0, 0, 1]]), atol=1e-4, rtol=0)
-        assert (out.trace.means2d.grad is None) == ("projection" in settings)
-
-
-@pytest.mark.parametrize("shutter", ["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"])
-def test_a_rolling_shutter_shows_every_row_from_its_own_place(gsplat: ModuleType, shutter: Any) -> None:
-    p, view = _facing()
-    p["scales"] = p["means"][:, 2:] * torch.full((1, 3), 0.03)
-    first, last = torch.eye(4), torch.eye(4)
-    last[:3, 3] = torch.tensor([0.6, 0.1, 0.3])
-    config = RasterConfig(backend="gsplat", projection="unscented")
-    rolling = rasterize(
-        _gaussians(p), view, replace(config, shutter=shutter), world_from_cam=torch.stack([first, last])
-    )
-    along, count = (2, 50) if "left" in shutter else (1, 37)
-    for line in (0, count // 3, count - 1):
-        time = line / (count - 1) if shutter in ("top_to_bottom", "left_to_right") else 1 - line / (count - 1)
-        still = rasterize(_gaussians(p), view, config, world_from_cam=(1 - time) * first + time * last)
-        assert (rolling.alpha.select(along, line) - still.alpha.select(along, line)).abs().max() < 1e-5
-    assert (rolling.alpha - rasterize(_gaussians(p), view, config).alpha).abs().max() > 0.1
-
-
-UNSCENTED, DISC = {"projection": "unscented"}, {"primitive": "disc"}
-ROLLING = {**UNSCENTED, "shutter": "top_to_bottom"}
-
-
-@pytest.mark.parametrize(
-    ("config", "asked", "error", "said"),
-    [
-        *(({"backend": name, "packed": True}, {}, UsageError, "packed=True") for name in ("auto", "torch")),
-        *(({"backend": name, **UNSCENTED}, {}, UsageError, "unscented") for name in ("auto", "torch")),
-        *(({"backend": name, **DISC}, {}, UsageError, "primitive='disc'") for name in ("auto", "torch")),
-        ({"shutter": "top_to_bottom"}, {}, UsageError, None),
-        ({**UNSCENTED, **DISC}, {}, UsageError, None),
-        *(({**kind, "packed": True}, {}, UsageError, None) for kind in (UNSCENTED, DISC)),
-        *(({**kind, "antialias": True}, {}, UsageError, None) for kind in (UNSCENTED, DISC)),
-        *(({name: "odd"}, {}, UsageError, None) for name in ("primitive", "projection", "shutter")),
-        (ROLLING, {}, InputError, "first and last row"),
-        (ROLLING, {"world_from_cam": torch.eye(4)}, InputError, "wrong shape"),
-        *((kind, {"absgrad": True}, UsageError, "absolute gradients") for kind in (UNSCENTED, DISC)),
-        (UNSCENTED, {"world_from_cam": torch.eye(4).requires_grad_()}, UsageError, "poses"),
-    ],
-)
-def test_settings_that_cannot_be_carried_out_are_refused(
-    gsplat: ModuleType, config: dict[str, Any], asked: dict[str, Any], error: type[Exception], said: str | None
-) -> None:
-    with pytest.raises(error, match=said):
-        rasterize(_gaussians(_parameters(3)), _views()[0], RasterConfig(**{"backend": "gsplat", **config}), **asked)
 
 
 # ---- whether it can be used ----------------------------------------------------------------------

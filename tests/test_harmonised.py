@@ -30,7 +30,7 @@ from mudg.core.edit import Motion
 from mudg.core.pictures import to_bytes
 from mudg.core.weather import DriveFacts
 from mudg.core.weather.gbuffer import Surroundings
-from mudg.core.weather.light import SRGB
+from mudg.core.weather.light import srgb_decode, srgb_encode
 from mudg.diffusion import condition as clip_parts
 from mudg.diffusion import model_files as files
 from mudg.diffusion.condition import ConditionRules, build_conditions, image_tensor
@@ -539,7 +539,7 @@ def test_points_and_reference_of_the_published_condition_are_in_fog_at_their_own
     far = how.image(views[0], torch.zeros(3, 32, 48), torch.full((1, 32, 48), 2000.0), ids)
     across, down = np.meshgrid((np.arange(48) + 0.5 - 24) / 40, (np.arange(32) + 0.5 - 16) / 40)
     share = 1 - np.exp(-3 * 12 * np.sqrt(1 + across**2 + down**2) / 30)
-    expected = torch.from_numpy(SRGB.encode(SRGB.decode(far.numpy()) * share)).float()
+    expected = torch.from_numpy(srgb_encode(srgb_decode(far.numpy()) * share)).float()
     small = torch.nn.functional.interpolate(expected[None], size=(8, 12), mode="bilinear")[0]
     assert torch.allclose(made.reference, small, atol=0.015)
     assert torch.allclose(made.color[0][:, colored], expected[:, ::4, ::4][:, colored], atol=0.015)

@@ -85,7 +85,7 @@ def test_miou_and_rmse_are_pooled_over_the_trajectory_not_averaged_over_views():
     for made in (torch.zeros(1, 9, dtype=torch.long), torch.ones(1, 1, dtype=torch.long)):
         add(metric, semantics=made, truth_semantics=torch.zeros_like(made))
     assert metric.value() == pytest.approx(0.9)
-    metric, ten = metrics.DepthError("rmse_m"), torch.full((1, 1, 3), 10.0)
+    metric, ten = metrics.depth_error("rmse_m"), torch.full((1, 1, 3), 10.0)
     add(metric, depth=ten + 2, truth_depth=ten, truth_depth_valid=ten > 0)
     add(metric, depth=ten[..., :1], truth_depth=ten[..., :1])
     assert metric.value() == pytest.approx(math.sqrt(3 * 4 / 4))

@@ -548,7 +548,7 @@ def test_streaks_stand_where_the_program_draws_them(rainy: tuple[Browser, SceneM
     snowy = brightness(page)
     wanted = STREET.view(0.4, 160, 96)
     depth = render_view(model, wanted, raster_of(model)).depth[0].nan_to_num(np.inf).numpy()
-    fall = particles.Falling(particles.snow_sizes(4), (0.5, 0.0), 8.0, 0.01, "flakes")
+    fall = particles.Falling(particles.snow_sizes(4), (0.5, 0.0), 8.0, "flakes")
     velocity = page.run("mudg.drive.velocity(0.4)")
     covered = 1 - np.exp(-particles.falling(wanted, depth, fall, tuple(velocity), SEED))
     preview = "w.preview(mudg.renderer.conditions, mudg.loaded[0].scene.sky)"

@@ -310,16 +310,16 @@ def test_warp_error_follows_vehicles_by_their_boxes() -> None:
     poses = np.stack([np.eye(4), np.eye(4)])
     poses[1, 0, 3] = 2 / 20 * 9.0
     track = Track("car-005", "car", np.ones(3), np.array([0.0, 0.1]), poses)
-    metric = view_metrics.WarpError(view_metrics.ExactMotion([(5, track)]))
+    metric = view_metrics.warp_error(metrics.ExactMotion([(5, track)]))
     first, second = wall_pair(0, frame(8), 8), wall_pair(1, frame(10), 10)
     metric.add(metric.source(first))
     metric.add(metric.source(second))
     assert metric.value() == pytest.approx(0.0, abs=1e-5)
-    motion = view_metrics.ExactMotion([(5, track)]).between(first, second)
+    motion = metrics.ExactMotion([(5, track)]).between(first, second)
     # Kept: all of the vehicle, and the wall but for what the vehicle hid in either frame.
     assert motion.same[:, 8:12].all() and not motion.same[:, 12:14].any()
     assert int(motion.same.sum()) == 16 * (24 - 2)
-    darker = view_metrics.WarpError(view_metrics.ExactMotion([(5, track)]))
+    darker = view_metrics.warp_error(metrics.ExactMotion([(5, track)]))
     darker.add(wall_pair(0, frame(8) * 0.5 + 0.1, 8))
     darker.add(wall_pair(1, frame(10) * 0.5 + 0.2, 10))
     assert darker.value() == pytest.approx(0.1, abs=1e-5)
@@ -329,7 +329,7 @@ def test_vehicles_without_boxes_do_not_count_and_flickering_by_hand() -> None:
     pairs = [wall_pair(n, torch.zeros(3, 16, 24), 8) for n in (0, 1)]
     frames = [metrics.TrueFrame.of(p.view, p.truth_depth, p.truth_semantics) for p in pairs]
     assert not metrics.pixel_motion(*frames).same[:, 8:12].any()
-    metric = view_metrics.TemporalFlickering()
+    metric = view_metrics.temporal_flickering()
     assert metric.value() is None
     for tone in (0, 51, 0):
         metric.add(metric.source(Pair(torch.full((3, 4, 4), tone / 255), *[None] * 6)))

@@ -1,6 +1,6 @@
 """Skeleton of a metric: how much brighter a view is than the truth (docs/extend/metric.md)."""
 
-from mudg.core.metrics import FrameMean, MetricRow, Pair
+from mudg.core.metrics import MetricRow, Pair, frame_mean
 
 
 def brightness_bias(pair: Pair) -> float | None:
@@ -12,4 +12,4 @@ def brightness_bias(pair: Pair) -> float | None:
 
 
 # Title, unit, what a method must produce, which way is better, and how to build the accumulator.
-ROW = MetricRow("brightness bias", "", ("rgb",), "lower", lambda: FrameMean(brightness_bias))
+ROW = MetricRow("brightness bias", "", ("rgb",), "lower", lambda: frame_mean(brightness_bias))

@@ -12,7 +12,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from mudg.base import palette
 
 # tables -------------------------------------------------------------------------------------------
-#
 # Tables of text as Markdown and CSV; the macro ``table`` of ``assets/templates/macros.html.j2`` is their HTML.
 # No torch.
 

@@ -39,29 +39,19 @@ Lines = dict[tuple[str | int, ...], int]
 """Where a value stands, as keys and numbers of entries from the outermost value in -> line, from 1."""
 
 
-def parse_yaml(text: str | bytes, where: str, largest: int = LARGEST_BYTES) -> Any:
+def parse_yaml(text: str | bytes, where: str, largest: int = LARGEST_BYTES, lines: Lines | None = None) -> Any:
     """The value that YAML text stands for: null, true or false, decimal numbers, texts, lists, and mappings whose keys
     are texts.
 
     Dates, numbers in other bases and numbers with colons are texts.
 
     Args:
-        where: name of the file for messages. largest: bytes that it may have.
+        where: name of the file for messages. largest: bytes that it may have. lines: gets the line of each value.
 
     Raises:
         InputError: it is not YAML, says what a plain value is, has anchors, or is larger, deeper or holds more values
             than any file of its kind.
     """
-    return _parse(text, where, largest, None)
-
-
-def parse_with_lines(text: str | bytes, where: str) -> tuple[Any, Lines]:
-    """``parse_yaml``, and the line of each of the values."""
-    lines: Lines = {}
-    return _parse(text, where, LARGEST_BYTES, lines), lines
-
-
-def _parse(text: str | bytes, where: str, largest: int, lines: Lines | None) -> Any:
     if len(text) > largest:
         raise InputError("YAML file is too large", where=where, expected=f"at most {largest} bytes", got=f"{len(text)}")
     reader = _Reader(where, largest // BYTES_A_VALUE, lines)

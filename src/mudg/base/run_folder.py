@@ -597,7 +597,6 @@ def refuse_while_others_work(lock: Path, what: Path | None = None) -> None:
 
 
 # result file --------------------------------------------------------------------------------------
-#
 # Beside the file OUT (or a second form of it, such as the folder of a large page) lies OUT.json, its description: verb,
 # key of settings and inputs, SHA-256, and what else the verb says. The description gets its name first and the file its
 # last, so that the same command completes what a stop leaves in between.

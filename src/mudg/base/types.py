@@ -106,18 +106,29 @@ def check_array(value: Any, where: str, shape: tuple[int | None, ...], dtype: ty
         raise InputError("an array has the wrong shape or type", where=where, expected=expected, got=found)
 
 
+def check_shape(value: Any, where: str, shape: tuple[int | None, ...]) -> None:
+    """Refuse an array or tensor of another shape; None stands for any size."""
+    got = tuple(getattr(value, "shape", ()))
+    if not _fits(got, shape):
+        expected = str(tuple(shape)).replace("None", "N")
+        raise InputError("a tensor has the wrong shape", where=where, expected=expected, got=str(got))
+
+
 def check_tensors(record: Any, **shapes: tuple[int | None, ...]) -> None:
     """Compare the shapes of tensor fields with the expected ones; None stands for any size."""
     for name, shape in shapes.items():
-        got = tuple(getattr(getattr(record, name), "shape", ()))
-        if not _fits(got, shape):
-            where, expected = f"{type(record).__name__.lower()}.{name}", str(shape).replace("None", "N")
-            raise InputError("a tensor has the wrong shape", where=where, expected=expected, got=str(got))
+        check_shape(getattr(record, name), f"{type(record).__name__.lower()}.{name}", shape)
 
 
 def check_given_tensors(record: Any, **shapes: tuple[int | None, ...]) -> None:
     """As ``check_tensors``, for fields that may be None."""
     check_tensors(record, **{name: shape for name, shape in shapes.items() if getattr(record, name) is not None})
+
+
+def _complete(record: Any, **values: Any) -> None:
+    """Set fields of a frozen record while it is made."""
+    for name, value in values.items():
+        object.__setattr__(record, name, value)
 
 
 class _Brief:
@@ -262,8 +273,8 @@ class View(_Brief):
 
     def __post_init__(self) -> None:
         owner = f"view of {self.camera.name!r}"
-        object.__setattr__(self, "world_from_cam", rigid(self.world_from_cam, f"{owner}: world_from_cam"))
-        object.__setattr__(self, "time_s", finite(self.time_s, f"{owner}: time_s"))
+        pose = rigid(self.world_from_cam, f"{owner}: world_from_cam")
+        _complete(self, world_from_cam=pose, time_s=finite(self.time_s, f"{owner}: time_s"))
 
     @property
     def cam_from_world(self) -> Matrix:
@@ -310,7 +321,7 @@ class Frame(_Brief):
     labels: Mapping[str, Ref] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "labels", _freeze(self.labels))
+        _complete(self, labels=_freeze(self.labels))
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -338,8 +349,7 @@ class Sweep(_Brief):
 
     def __post_init__(self) -> None:
         pose = rigid(self.world_from_lidar, f"sweep {self.id!r}: world_from_lidar")
-        object.__setattr__(self, "world_from_lidar", pose)
-        object.__setattr__(self, "time_s", finite(self.time_s, f"sweep {self.id!r}: time_s"))
+        _complete(self, world_from_lidar=pose, time_s=finite(self.time_s, f"sweep {self.id!r}: time_s"))
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -386,9 +396,7 @@ class Track(_Brief):
         times, poses = pose_keys(self.times_s, self.world_from_object, owner, "world_from_object")
         if len(times) == 0:
             raise InputError("a track needs at least one box", where=f"{owner}: times_s")
-        object.__setattr__(self, "size_m", size)
-        object.__setattr__(self, "times_s", times)
-        object.__setattr__(self, "world_from_object", poses)
+        _complete(self, size_m=size, times_s=times, world_from_object=poses)
 
     def pose_at(self, time_s: float) -> Matrix | None:
         """World-from-object f64[4, 4] at ``time_s``, interpolated between neighbouring keys; None outside the span."""
@@ -404,8 +412,7 @@ class EgoPath(_Brief):
 
     def __post_init__(self) -> None:
         times, poses = pose_keys(self.times_s, self.world_from_ego, "ego path", "world_from_ego")
-        object.__setattr__(self, "times_s", times)
-        object.__setattr__(self, "world_from_ego", poses)
+        _complete(self, times_s=times, world_from_ego=poses)
 
     def pose_at(self, time_s: float) -> Matrix | None:
         """World-from-ego f64[4, 4] at ``time_s``; None outside the recording."""
@@ -453,7 +460,7 @@ class FusedCloud(_Brief):
     colors: CameraColors = SAME_COLORS
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "objects", _freeze(self.objects))
+        _complete(self, objects=_freeze(self.objects))
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -472,8 +479,7 @@ class Scene(_Brief):
     source: Source
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "cameras", _freeze(self.cameras))
-        object.__setattr__(self, "split", _freeze(self.split))
+        _complete(self, cameras=_freeze(self.cameras), split=_freeze(self.split))
 
     def __repr__(self) -> str:
         counts = f"{len(self.frames)} frames, {len(self.cameras)} cameras, {len(self.tracks)} objects"

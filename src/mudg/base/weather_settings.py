@@ -1,4 +1,4 @@
-"""Settings of weather, light, season and camera response for edited drives. Torch-free; ``mudg.core.weather`` applies
+"""Settings of weather, light and season for edited drives. Torch-free; ``mudg.core.weather`` applies
 them.
 
 Names and units are those of an edit script. The defaults change nothing.
@@ -16,7 +16,6 @@ Wind = Annotated[
     tuple[Annotated[float, Field(ge=-40, le=40)], Annotated[float, Field(ge=-40, le=40)]], Field(strict=False)
 ]
 LightTime = Literal["as_recorded", "overcast", "dusk", "night"]
-ToneName = Literal["srgb", "gamma", "linear"]
 
 
 class FogSettings(StrictRecord):
@@ -86,8 +85,6 @@ class LightSettings(StrictRecord):
     """Height of the dusk sun, degrees."""
     headlights: bool = True
     """Headlights of the recording vehicle, at night."""
-    lamps: bool = True
-    """Street lamps, at night."""
     exposure_ev: Annotated[float, Field(ge=-10, le=10)] = 0.0
     """Change of exposure, stops."""
 
@@ -101,19 +98,8 @@ class SeasonSettings(StrictRecord):
     """How far: 0 = as recorded."""
 
 
-class ResponseSettings(StrictRecord):
-    """How the recording camera turned light into display values. On a driving log this is a guess."""
-
-    tone: ToneName = "srgb"
-    """Curve from linear light to display values."""
-    gamma: Annotated[float, Field(ge=1, le=4)] = 2.2
-    """Exponent of the curve ``gamma``."""
-    shutter_s: Annotated[float, Field(gt=0, le=0.2)] = 0.01
-    """Exposure time, seconds: length of streaks of rain and snow."""
-
-
 class Conditions(StrictRecord):
-    """Weather, light, season and camera response of an edited drive."""
+    """Weather, light and season of an edited drive."""
 
     weather: WeatherSettings = Field(default_factory=WeatherSettings)
     """Weather."""
@@ -121,8 +107,6 @@ class Conditions(StrictRecord):
     """Light."""
     season: SeasonSettings | None = None
     """Season; none = as recorded."""
-    response: ResponseSettings = Field(default_factory=ResponseSettings)
-    """Camera response."""
 
     @property
     def changes_air_ground_or_light(self) -> bool:

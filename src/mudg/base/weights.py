@@ -25,7 +25,6 @@ from mudg.base.errors import InputError
 from mudg.base.plain_pickle import PERSISTENT, Maker, Name, PickledObject, read_pickle
 
 # torchscript --------------------------------------------------------------------------------------
-#
 # ``torch.jit.load`` would take in code. The archive is a zip, its ``data.pkl`` a pickle that names classes of the
 # program and places in ``data/``: the interpreter of ``base/plain_pickle.py`` makes plain objects of them.
 

@@ -39,7 +39,6 @@ from mudg.core.edit import Motion
 from mudg.core.fusion import fuse_sweeps
 from mudg.core.losses import lpips_distance, unit_features
 from mudg.core.raster.rasterize import drawing_device, rasterize
-from mudg.core.view_metrics import SAME
 from mudg.diffusion import city_clips as from_city
 from mudg.diffusion import model_files as mdm_files
 from mudg.diffusion import score as learn_score
@@ -149,6 +148,8 @@ LISTS: dict[str, tuple[int, ...]] = {
     "reported": tuple(range(2_000_100, 2_000_106)),
 }
 """Seeds of cities: for development, and to report on."""
+SAME = 1.5 / 255
+"""Colours of 8 bits that differ by more than this differ by more than one step."""
 NOISE_M, NOISE_RAD = 0.1, np.radians(1.0)
 SEEN_PX, FEWEST_KEYS = 60, 4
 FRAMES, WIDTH, HEIGHT = 16, 240, 160

@@ -8,6 +8,7 @@ unedited fit; docs/edit.md explains the measures.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,6 +19,8 @@ from typing import Any, Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy import ndimage
+from torch import Tensor
 
 from mudg.base import geometry, log, store
 from mudg.base.config import result_settings
@@ -26,14 +29,15 @@ from mudg.base.html import TextTable, cells, markdown_table
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Frame, FusedCloud, Observation, Scene, Track, View
 from mudg.benchmarks.chain import finished, render_page, wall
-from mudg.benchmarks.cities import drawn_pixels
+from mudg.benchmarks.cities import SAME, drawn_pixels
 from mudg.benchmarks.settings import BenchConfig
-from mudg.core import lidar, metrics, pictures, street_scores, view_metrics
+from mudg.core import lidar, metrics, pictures, street_scores
 from mudg.core import metrics as flicker
 from mudg.core.edit import Motion
 from mudg.core.fusion import STATIC
 from mudg.core.lidar import DEPTH_LIMIT_M, OwnedPoints
 from mudg.core.raster.rasterize import drawing_device
+from mudg.core.weather.light import LUMA
 from mudg.editing import apply
 from mudg.editing.plan import EditPlan, EditSources, EditWorld, collisions, plan_edits
 from mudg.editing.recorded import boxes_mask, ground_mask, outlines, touched_boxes
@@ -92,8 +96,7 @@ class Video:
         mine = np.zeros(seen.rgb.shape[1:], bool) if pose is None else drawn_pixels(self.model, self.actor, view)
         if pose is not None:
             shown = outlines(view, [(pose, np.asarray(self.size_m, np.float64))])
-            common, either = view_metrics.mask_counts(mine, shown)
-            self.common, self.either = self.common + common, self.either + either
+            self.common, self.either = self.common + int((mine & shown).sum()), self.either + int((mine | shown).sum())
         now = (seen, _carrier(seen), mine)
         if self.before is not None:
             where = self._motion(self.before, now)
@@ -137,7 +140,7 @@ class Sums:
     changed: int = 0
     structure: list[float] = field(default_factory=list)
     colors: list[NDArray[np.float32]] = field(default_factory=list)
-    depth: dict[str, metrics.DepthError] = field(default_factory=dict)
+    depth: dict[str, metrics.Pooled] = field(default_factory=dict)
 
     def add_depth(self, name: str, seen: Observation, truth: NDArray[np.float32], where: NDArray[np.bool_]) -> None:
         """Relative error of rendered depth at LiDAR points; where there is no depth, it counts as the farthest that is
@@ -146,7 +149,7 @@ class Sums:
             return
         made = torch.nan_to_num(seen.depth, DEPTH_LIMIT_M, DEPTH_LIMIT_M, DEPTH_LIMIT_M)
         errors = metrics.depth_errors(made, torch.from_numpy(truth)[None], torch.from_numpy(where)[None])
-        self.depth.setdefault(name, metrics.DepthError("abs_rel")).add(errors if errors.pixels else None)
+        self.depth.setdefault(name, metrics.depth_error("abs_rel")).add(errors)
 
     @property
     def uncovered_psnr(self) -> float | None:
@@ -159,6 +162,20 @@ class Sums:
         return self.depth[name].value() if name in self.depth else None
 
 
+def changed_pixels(edited: Tensor, unedited: Tensor) -> NDArray[np.bool_]:
+    """Where colours f32[3, H, W] in [0, 1] differ by more than a step of 8 bits in a channel, bool[H, W]."""
+    return ((edited - unedited).abs().amax(0) > SAME).numpy()
+
+
+def gradient_correlation(edited: Tensor, unedited: Tensor) -> float | None:
+    """Correlation of Sobel derivatives of the brightness of two images f32[3, H, W]: [-1, 1], 1 = every edge in its
+    place with the same relative strength, also under another exposure or contrast. None: an image has no edges."""
+    brightness = [np.tensordot(LUMA, image.numpy(), 1) for image in (edited, unedited)]
+    a, b = (np.stack([ndimage.sobel(one, axis, mode="nearest") for axis in (1, 0)]) for one in brightness)
+    scale = math.sqrt(float((a**2).sum()) * float((b**2).sum()))
+    return float((a * b).sum()) / scale if scale > 0 else None
+
+
 def measured(case: RunCase, script: EditScript, shown: Shown | None = None) -> dict[str, Any]:
     """The numbers of one edit. ``shown``: gets the number of each frame, and its renders without and with the edit.
     InputError: the script cannot be carried out on this drive."""
@@ -169,11 +186,11 @@ def measured(case: RunCase, script: EditScript, shown: Shown | None = None) -> d
         (old, stood), (new, stands) = usual.add(frame.view), edited.add(frame.view)
         touched, freed = _regions(drive.plan, frame.view, stood, stands)
         if weather:
-            structure = view_metrics.gradient_correlation(new.rgb, old.rgb)
+            structure = gradient_correlation(new.rgb, old.rgb)
             sums.structure += [] if structure is None else [structure]
         else:
             sums.away += int((~touched).sum())
-            sums.changed += int((view_metrics.changed_pixels(new.rgb, old.rgb) & ~touched).sum())
+            sums.changed += int((changed_pixels(new.rgb, old.rgb) & ~touched).sum())
         _add_points(case, drive.plan, frame, old, new, touched, freed, sums)
         if shown is not None:
             shown(number, old, new)

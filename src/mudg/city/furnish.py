@@ -9,7 +9,6 @@ from mudg.city.config import CityConfig
 from mudg.city.layout import LEAF_COLORS, RENDER_COLORS, Color, Furnisher, Size, colors
 
 # overhead ------------------------------------------------------------------------------------------
-#
 # What stands above a LiDAR's field of view: crowns over the road, bare trees, bridges, gantries, wires, arms, taller
 # buildings.
 #

@@ -252,7 +252,6 @@ def _crosswalks(rng: np.random.Generator, kerbs: tuple[float, float], crossing: 
 
 
 # paint ---------------------------------------------------------------------------------------------
-#
 # Where paint lies on the streets of the generated city, exactly: at any point of the ground, and as lines for scores
 # that want a map.
 #
@@ -362,12 +361,10 @@ def _street_line(line: Centreline, s: Array, u: Array) -> Array:
 
 
 # objects -------------------------------------------------------------------------------------------
-#
 # Collects the static objects along the streets and keeps the corridor of the shifted cameras free.
 
 
 # records ------------------------------------------------------------------------------------------
-#
 # Records: one row of numbers per object of the city. The native library makes shapes and materials from them.
 
 

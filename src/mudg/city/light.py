@@ -19,11 +19,11 @@ from mudg.base.errors import InputError
 from mudg.city import layout as rec
 from mudg.city.config import CityConfig
 from mudg.core.weather.air import patch_threshold
-from mudg.core.weather.gbuffer import Surroundings
 from mudg.core.weather.ground import noise_seed
-from mudg.core.weather.light import LAMP_POWER, FilmicResponse
 
 Numbers = NDArray[np.float64]
+LAMP_POWER: Final = 64.0
+"""50 lux at 8 m below a street lamp."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +129,6 @@ def light_numbers(config: CityConfig) -> tuple[str, NDArray[np.float64]]:
 
 
 # weather ------------------------------------------------------------------------------------------
-#
 # Wet ground, snow and street lamps of a generated city: the numbers its ray caster needs, by the same rules as
 # ``mudg.core.weather``.
 
@@ -157,35 +156,7 @@ def lamp_places(rows: Sequence[Sequence[float]]) -> NDArray[np.float64]:
     return np.array(places, np.float64).reshape(-1, 3)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CityLight:
-    """Exact light and camera of a generated city: what an edit of its images could know at best.
-
-    Args:
-        surroundings: sun, sky, airlight and lamps, the road at height 0.
-        response: the camera.
-        visibility_m: in the haze.
-    """
-
-    surroundings: Surroundings
-    response: FilmicResponse
-    visibility_m: float
-
-
-def city_light(config: CityConfig, lamps: NDArray[np.float64] | None = None) -> CityLight:
-    """The light of a city with a plain sky and no photographs; ``lamps`` are those of ``CityWorld.lamps``."""
-    _, n = light_numbers(config)
-    direction, sun, zenith, horizon, ambient, _cloud, white = n[:21].reshape(7, 3)
-    haze_m, _night, exposure, contrast, saturation, _noise, vignette = n[22:29]
-    airlight = 0.875 * horizon + 0.075 * ambient
-    around = Surroundings(horizon, zenith, ambient, sun, direction, airlight, 0.0, lamps)
-    r, g, b = (float(w) for w in white)
-    response = FilmicResponse(float(exposure), (r, g, b), float(saturation), float(contrast), float(vignette))
-    return CityLight(around, response, 3.0 * float(haze_m))
-
-
 # photos --------------------------------------------------------------------------------------------
-#
 # Photographic surfaces and skies for a city, from a folder of the user's: `textures/*.jpg` or `.png` and `sky/*.hdr`.
 #
 # A surface's photograph multiplies its drawn colour, so only its variation around its own mean is used. Which surface a

@@ -1,6 +1,6 @@
 """Whole generated logs for scoring scenes off the recorded path, in two lists; no model was ever trained on them.
 
-A list is not picked by eye: `choose` walks the seeds upwards and keeps what satisfies `LogChoice`. In 2.3 s the
+A list is not picked by eye: the seeds are walked upwards, and what has moving vehicles (`facts`) is kept. In 2.3 s the
 generator's streets turn little (half of 220 cities by less than 1.1 degrees, one in twenty by 4.7, the most by 9.6), so
 that "curved" means 5 degrees here, and half of each list is curved.
 """
@@ -126,7 +126,7 @@ this share of the frames. Half of the list turns by at least this angle."""
 VEHICLES: Final = frozenset({"car", "truck", "bus", "cyclist"})
 
 DEVELOPMENT: tuple[int, ...] = (2100000, 2100001, 2100004, 2100007)
-"""Logs to look at while choosing: the first that `choose` finds from the first of them on."""
+"""Logs to look at while choosing: the first of them on that qualify."""
 REPORTED: tuple[int, ...] = (2100100, 2100101, 2100102, 2100103, 2100151, 2100154, 2100157, 2100242)
 """Logs whose scores are reported and on which nothing is chosen; found in the same way."""
 LISTS: dict[str, tuple[int, ...]] = {"development": DEVELOPMENT, "reported": REPORTED}
@@ -164,22 +164,3 @@ def turn_deg(config: CityConfig) -> float:
     driven = (times >= 0) & (times <= (config.n_frames - 1) / config.rate_hz)
     heading = np.unwrap(np.arctan2(poses[driven, 1, 0], poses[driven, 0, 0]))
     return float(np.rad2deg(heading.max() - heading.min()))
-
-
-def choose(first_seed: int, count: int, rules: LogRules = STANDARD) -> tuple[int, ...]:
-    """The first seeds from `first_seed` on that qualify: half of `count` curved, the others not, in
-    ascending order.
-
-    Raises:
-        UsageError: `count` is odd or not positive.
-    """
-    if count <= 0 or count % 2:
-        raise UsageError("half of a list of logs is curved", expected="an even, positive number", got=str(count))
-    kept: dict[bool, list[int]] = {True: [], False: []}
-    seed = first_seed
-    while min(map(len, kept.values())) < count // 2:
-        curved = turn_deg(log_config(seed, rules)) >= CURVED_DEG
-        if len(kept[curved]) < count // 2 and facts(seed, rules).moving >= MOVING:
-            kept[curved].append(seed)
-        seed += 1
-    return tuple(sorted(kept[True] + kept[False]))

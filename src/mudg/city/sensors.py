@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 from mudg.base import geometry, seeds
 from mudg.base.types import Camera, SweepPoints, Track
 from mudg.city.config import CityConfig
+from mudg.core.weather.light import srgb_decode, srgb_encode
 
 # sensors of the recording vehicle: three cameras and a spinning LiDAR on the roof -----------------
 
@@ -248,14 +249,6 @@ class SensorFaults:
     boxes: BoxFaults = field(default_factory=BoxFaults)
     second_lidar: LidarMount | None = None
 
-    def look_of(self, camera: str) -> CameraLook:
-        """The look of a camera."""
-        return self.looks.get(camera, CameraLook())
-
-    def faults_of(self, camera: str) -> CameraFaults:
-        """The faults of a camera."""
-        return self.cameras.get(camera, CameraFaults())
-
 
 # --- images ---------------------------------------------------------------------------------------
 
@@ -268,24 +261,13 @@ def with_look(rgb: Rgb, look: CameraLook, time_s: float) -> Rgb:
         y, x = np.mgrid[0:height, 0:width].astype(np.float32) + 0.5
         r2 = ((2 * x / width - 1) ** 2 * width**2 + (2 * y / height - 1) ** 2 * height**2) / (width**2 + height**2)
         factors = factors * (1 - look.vignette * r2)[..., None].astype(np.float32)
-    shown = to_display(to_light(rgb) * factors)
+    shown = srgb_encode(srgb_decode(rgb) * factors)
     return shown if look.contrast == 1 else np.clip(0.5 + (shown - 0.5) * look.contrast, 0, 1).astype(np.float32)
-
-
-def to_light(rgb: Rgb) -> Rgb:
-    """Linear light of sRGB display values."""
-    return np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def to_display(light: Rgb) -> Rgb:
-    """sRGB display values of linear light, clipped to [0, 1] as a sensor saturates."""
-    x = np.clip(light, 0, 1)
-    return np.where(x <= 0.0031308, x * 12.92, 1.055 * x ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
 def recorded(rgb: Rgb, faults: CameraFaults, key: int) -> NDArray[np.uint8]:
     """A recorded image u8[H, W, 3]: bloom and blur in linear light, then noise and compression of display values."""
-    light = to_light(rgb)
+    light = srgb_decode(rgb)
     if faults.bloom or faults.veil:
         bright = np.clip(light.max(-1, keepdims=True) - 0.75, 0, None) * 4 * light
         spread = np.stack([ndimage.gaussian_filter(bright[..., c], faults.bloom_px) for c in range(3)], -1)
@@ -297,7 +279,7 @@ def recorded(rgb: Rgb, faults: CameraFaults, key: int) -> NDArray[np.uint8]:
         along = np.linspace(-0.5, 0.5, steps) * faults.motion_px
         moves = [(a * math.sin(faults.motion_rad), a * math.cos(faults.motion_rad), 0) for a in along]
         light = np.mean([ndimage.shift(light, move, order=1, mode="nearest") for move in moves], 0)
-    out = to_display(light)
+    out = srgb_encode(light)
     if faults.noise:
         rng = seeds.numpy_rng(key, 0, "image noise")
         grain = rng.standard_normal(out.shape).astype(np.float32)

@@ -32,7 +32,6 @@ from mudg.city.light import draw_photos, lamp_places, light_numbers, weather_num
 from mudg.city.traffic import PosedObject, ego_keys, key_times, plan_traffic
 
 # native --------------------------------------------------------------------------------------------
-#
 # Thin ctypes layer over the city's ray caster in the native library.
 
 
@@ -102,21 +101,6 @@ class CityHandle:
         values, places = _f64(numbers), _f64(lamps).reshape(-1, 3)
         if self._lib.mudg_city_set_weather(self._handle, values, places, len(places)):
             raise ResourceError("not enough memory for the lamps of the city")
-
-    def planes(
-        self,
-        poses: NDArray[np.float64],
-        phases: NDArray[np.float64],
-        camera: Camera,
-        world_from_cam: NDArray[np.float64],
-    ) -> NDArray[np.float32]:
-        """Normal, albedo, open sky, sun, snow and water f32[H, W, 10] of what the rays through pixel centres meet."""
-        out = np.empty((camera.height, camera.width, 10), np.float32)
-        poses, phases, numbers, pose = map(_f64, (poses, phases, camera.intrinsics, world_from_cam))
-        size = (camera.width, camera.height)
-        if self._lib.mudg_city_planes(self._handle, poses, phases, numbers, *size, pose, out):
-            raise ResourceError("not enough memory to render the city")
-        return out
 
     def __del__(self) -> None:
         if getattr(self, "_handle", None):
@@ -214,20 +198,6 @@ class CityTruth:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CitySurfaces:
-    """Exact surfaces behind pixel centres, 0 in the sky: unit normals f32[H, W, 3] in the world and albedo f32[H, W,
-    3]; and f32[H, W] in [0, 1]: share of the sky that is seen, whether the sun shines on it, snow cover, standing
-    water."""
-
-    normal: NDArray[np.float32]
-    albedo: NDArray[np.float32]
-    openness: NDArray[np.float32]
-    sunlit: NDArray[np.float32]
-    snow: NDArray[np.float32]
-    water: NDArray[np.float32]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class CitySweep:
     """One turn of the LiDAR with its truth. ``points`` are in the LiDAR frame at ``time_s``, compensated for the motion
     of the recording vehicle (each point was measured at ``time_s + dt_s``; moving objects are where they were then).
@@ -253,10 +223,11 @@ class CityWorld:
         self.light_name, self._light = light_numbers(config)
         self._ego_times, self._ego_poses = ego_keys(config, self.plan)
         self.objects: tuple[PosedObject, ...] = tuple(plan_traffic(config, self.plan, self._ego_times, self._ego_poses))
-        self._key_times = key_times(config)
+        self.key_times_s = key_times(config)
+        """Times f64[K] of the keys of all objects."""
         self._furniture = furnish(config, self.plan)
         self.lamps: NDArray[np.float64] = lamp_places(self._furniture + [m.row for m in self.objects])
-        no_keys = np.zeros((len(self._key_times), 0, 4))
+        no_keys = np.zeros((len(self.key_times_s), 0, 4))
         self._keys = np.stack([m.keys for m in self.objects], 1) if self.objects else no_keys
         self._gaits = np.array([m.gait_rad_per_s for m in self.objects], np.float64)
         self._gait_starts = seeds.numpy_rng(config.seed, 0, "city gait").uniform(0, 2 * np.pi, len(self.objects))
@@ -343,11 +314,6 @@ class CityWorld:
         other._handle = other._native_world()
         return other
 
-    @property
-    def key_times_s(self) -> NDArray[np.float64]:
-        """Times f64[K] of the keys of all objects."""
-        return self._key_times
-
     def source(self) -> Source:
         """What a scene of this world records about its origin."""
         recipe: Mapping[str, Any] = {"city": to_dict(self.config), "generator_version": GENERATOR_VERSION}
@@ -364,18 +330,13 @@ class CityWorld:
         moving = sum(m.moving for m in self.objects)
         return (
             f"{quarter}, {self.light_name}, {lanes}, {crossing}, {plan.drive_length:.0f} m of drive, {moving} moving"
-            f" and {len(self.objects) - moving} standing objects, {self.shape_count} shapes"
+            f" and {len(self.objects) - moving} standing objects, {self._handle.shape_count} shapes"
         )
-
-    @property
-    def shape_count(self) -> int:
-        """Number of primitive shapes in the world."""
-        return self._handle.shape_count
 
     @property
     def span_s(self) -> tuple[float, float]:
         """First and last time that can be rendered."""
-        return float(self._key_times[0]), float(self._key_times[-1])
+        return float(self.key_times_s[0]), float(self.key_times_s[-1])
 
     def frame_time(self, index: int) -> float:
         """Time of a frame in seconds."""
@@ -398,7 +359,7 @@ class CityWorld:
             label = rec.LABELS[int(posed.row[0])]
             half = posed.size[2] / 2
             poses = np.stack([geometry.yaw_matrix(float(yaw), (x, y, z + half)) for x, y, z, yaw in posed.keys])
-            tracks.append(Track(f"{label}-{index + 1:03d}", label, np.array(posed.size), self._key_times, poses))
+            tracks.append(Track(f"{label}-{index + 1:03d}", label, np.array(posed.size), self.key_times_s, poses))
         return tuple(tracks)
 
     def instance_of(self, track_id: str) -> int:
@@ -425,7 +386,7 @@ class CityWorld:
 
     def _object_keys_at(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """x, y, z, yaw f64[T, objects, 4] between the keys, as Track.pose_at interpolates."""
-        times, keys = self._key_times, self._keys
+        times, keys = self.key_times_s, self._keys
         first, last = self.span_s
         if times_s.min() < first - 1e-6 or times_s.max() > last + 1e-6:
             what = "time lies outside the log"
@@ -484,12 +445,6 @@ class CityWorld:
         poses = self._object_keys_at(np.array([view.time_s]))[0]
         frame = (intrinsics, camera.width, camera.height, view.world_from_cam)
         return CityTruth(*self._handle.render(poses, self._phases(view.time_s), *frame, per_axis, noise_key))
-
-    def surfaces(self, view: View) -> CitySurfaces:
-        """Exact surfaces behind the pixel centres of a view, as ``render`` sees them."""
-        poses = self._object_keys_at(np.array([view.time_s]))[0]
-        planes = self._handle.planes(poses, self._phases(view.time_s), view.camera, view.world_from_cam)
-        return CitySurfaces(planes[..., :3], planes[..., 3:6], *(planes[..., i] for i in range(6, 10)))
 
     def observation(self, view: View, truth: CityTruth | None = None) -> Observation:
         """Noise-free truth as torch tensors; depth is 0 (= none) in the sky, everything may be used. ``truth``: what

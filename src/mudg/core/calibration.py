@@ -26,7 +26,6 @@ from mudg.base.geometry import transform_points
 from mudg.base.types import View
 
 # color match --------------------------------------------------------------------------------------
-#
 # Finding the maps between the colours of a log's cameras, from points that two of them saw.
 #
 # Cameras of a rig overlap little at one moment, but the front camera sees what the side cameras pass a little later. So

@@ -19,7 +19,7 @@ upright, and an upright surface has one depth along an image column.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 import torch
@@ -28,12 +28,11 @@ from scipy import ndimage, sparse
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import InputError
 from mudg.base.geometry import pixel_rays
-from mudg.base.types import View
+from mudg.base.types import View, check_shape
 
 # align --------------------------------------------------------------------------------------------
-#
 # Bringing generated depth to the scale of what was measured: one scale and one shift per frame, robustly.
 #
 # ``fit_depth`` starts from metres that are nearly right; ``fit_affine`` from any numbers that grow with depth, or with
@@ -77,11 +76,8 @@ def fit_depth(depth: Tensor, measured: Tensor, valid: Tensor, rounds: int = 12) 
     Raises:
         InputError: shapes differ.
     """
-    if depth.shape != measured.shape or depth.shape != valid.shape:
-        raise InputError(
-            "depth, measured depth and its mask differ in shape",
-            got=f"{tuple(depth.shape)}, {tuple(measured.shape)}, {tuple(valid.shape)}",
-        )
+    check_shape(measured, "fit_depth: measured depth", tuple(depth.shape))
+    check_shape(valid, "fit_depth: mask", tuple(depth.shape))
     known = valid & torch.isfinite(depth) & torch.isfinite(measured) & (measured > 0)
     x, y = _exactly(depth[known]), _exactly(measured[known])
     if len(x) == 0:
@@ -151,13 +147,8 @@ def fit_affine(values: Tensor, measured: Tensor, space: Space, rounds: int = 12)
     Raises:
         InputError: shapes differ, or there is no such space.
     """
-    if values.shape != measured.shape or values.ndim != 1:
-        raise InputError(
-            "values and measured depth differ in shape",
-            where="fit_affine",
-            expected="[N] and [N]",
-            got=f"{tuple(values.shape)}, {tuple(measured.shape)}",
-        )
+    check_shape(values, "fit_affine: values", (None,))
+    check_shape(measured, "fit_affine: measured depth", tuple(values.shape))
     if space not in ("depth", "disparity"):
         raise InputError("there is no such space", where="fit_affine", expected="depth or disparity", got=str(space))
     known = torch.isfinite(values) & torch.isfinite(measured) & (measured > 0)
@@ -207,50 +198,26 @@ def align_depth(depth: Tensor, measured: Tensor, valid: Tensor) -> tuple[Tensor,
 # complete -----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class CompletionRules:
-    """Numbers of the completion.
-
-    Args:
-        data_weight: pull of a measurement, beside 1 for a difference of two pixels of one colour.
-        color_scale: colour difference (root of the summed squares, 0..255) that lowers the weight of a pair to 1/e.
-        edge_floor: weight that the strongest image edge leaves.
-        step_scale: deviation from the expected difference, in the logarithm, from which a pair counts half.
-        rounds: solves; each but the first reweights.
-        iterations: conjugate-gradient steps per solve.
-        neighbours: measurements that a plane is fitted to.
-        plane_fade_px: distance from its measurement over which a plane fades to constant depth.
-        outlier_scale: distance of the solution from a measurement, in the logarithm, from which the measurement counts
-            half.
-        sky_m: depth given to the sky, and aimed at beyond the scanner's reach, metres.
-        beyond_weight: pull towards ``sky_m`` beyond the scanner's reach.
-        near_m, far_m: limits of the result, metres.
-    """
-
-    data_weight: float = 0.3
-    color_scale: float = 8.0
-    edge_floor: float = 0.002
-    step_scale: float = 0.02
-    rounds: int = 3
-    iterations: int = 60
-    neighbours: int = 10
-    plane_fade_px: float = 12.0
-    sky_m: float = 100.0
-    outlier_scale: float = 0.03
-    beyond_weight: float = 0.02
-    near_m: float = 0.5
-    far_m: float = 200.0
-
-    def __post_init__(self) -> None:
-        if not 0 < self.near_m < self.far_m:
-            raise UsageError(
-                "depth limits are out of order", expected="0 < near_m < far_m", got=f"{self.near_m}, {self.far_m}"
-            )
-        if self.rounds < 1 or self.iterations < 1 or self.neighbours < 3:
-            raise UsageError(
-                "completion needs at least 1 round, 1 iteration and 3 neighbours",
-                got=f"{self.rounds}, {self.iterations}, {self.neighbours}",
-            )
+SKY_M: Final = 100.0
+"""Depth given to the sky, and aimed at beyond the scanner's reach, metres."""
+NEAR_M, FAR_M = 0.5, 200.0
+"""Limits of the result, metres."""
+_DATA_WEIGHT, _BEYOND_WEIGHT = 0.3, 0.02
+"""Pull of a measurement, and towards the sky beyond the scanner's reach, beside 1 for two pixels of one colour."""
+_COLOR_SCALE: Final = 8.0
+"""Colour difference (root of the summed squares, 0..255) that lowers the weight of a pair to 1/e."""
+_EDGE_FLOOR: Final = 0.002
+"""Weight that the strongest image edge leaves."""
+_STEP_SCALE, _OUTLIER_SCALE = 0.02, 0.03
+"""Deviations in the logarithm from which a pair, and a measurement, count half."""
+_ROUNDS, _ITERATIONS = 3, 60
+"""Solves, each but the first reweighted, and conjugate-gradient steps of each."""
+_NEIGHBOURS: Final = 10
+"""Measurements that a plane is fitted to."""
+_PLANE_FADE_PX: Final = 12.0
+"""Distance from its measurement over which a plane fades to constant depth."""
+_STRETCH: Final = 3.0
+"""Beams of a scanner lie farther apart than the points of one beam: neighbours shall come from several beams."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -260,11 +227,6 @@ class DenseDepth:
 
     depth: NDArray[np.float32]
     confidence: NDArray[np.float32]
-
-
-DEFAULT_RULES = CompletionRules()
-_STRETCH = 3.0
-"""Beams of a scanner lie farther apart than the points of one beam: neighbours shall come from several beams."""
 
 
 def beyond_reach(
@@ -305,7 +267,6 @@ def complete_depth(
     measured: NDArray[np.float32],
     sky: NDArray[np.bool_] | None = None,
     beyond: NDArray[np.bool_] | None = None,
-    rules: CompletionRules = DEFAULT_RULES,
 ) -> DenseDepth:
     """Fill a sparse depth map, guided by its image; see the module text.
 
@@ -321,49 +282,42 @@ def complete_depth(
     shape = measured.shape
     sky = np.zeros(shape, bool) if sky is None else sky
     beyond = np.zeros(shape, bool) if beyond is None else beyond & ~sky
-    if rgb.shape != (*shape, 3) or sky.shape != shape or beyond.shape != shape:
-        raise InputError(
-            "image, depth and sky differ in size",
-            where="complete_depth",
-            expected=f"{shape} and 3 channels",
-            got=f"{rgb.shape}, {sky.shape}",
-        )
+    check_shape(rgb, "complete_depth: image", (*shape, 3))
+    check_shape(sky, "complete_depth: sky", shape)
+    check_shape(beyond, "complete_depth: beyond", shape)
     known = np.isfinite(measured) & ~sky
     if (measured[known] <= 0).any():
-        raise InputError(
-            "measured depth is not positive", where="complete_depth", got=str(float(measured[known].min()))
-        )
+        got = str(float(measured[known].min()))
+        raise InputError("measured depth is not positive", where="complete_depth", got=got)
     depth = np.full(shape, np.nan, np.float32)
     confidence = np.zeros(shape, np.float32)
-    depth[sky], confidence[sky] = rules.sky_m, 0.8
+    depth[sky], confidence[sky] = SKY_M, 0.8
     if not known.any():
         return DenseDepth(depth, confidence)
     found: Any = ndimage.distance_transform_edt(~known, return_indices=True)
     away_px, owner = found
-    planes = _fit_planes(known, measured, rules)
-    start, right, down = _expected(planes, owner, away_px, rules)
+    planes = _fit_planes(known, measured)
+    start, right, down = _expected(planes, owner, away_px)
     beyond &= ~known
-    start[beyond] = np.log(rules.sky_m)
-    goal = np.full(shape, np.log(rules.sky_m), np.float32)
+    start[beyond] = np.log(SKY_M)
+    goal = np.full(shape, np.log(SKY_M), np.float32)
     goal[known] = np.log(measured[known])
-    pull = np.where(
-        known, np.float32(rules.data_weight), np.where(beyond, np.float32(rules.beyond_weight), np.float32(0))
-    )
-    solved = _solve(start, (right, down), _color_weights(rgb, rules), pull, goal, sky, rules)
-    solved = np.clip(solved, np.log(rules.near_m), np.log(rules.far_m))
+    pull = np.where(known, np.float32(_DATA_WEIGHT), np.where(beyond, np.float32(_BEYOND_WEIGHT), np.float32(0)))
+    solved = _solve(start, (right, down), _color_weights(rgb), pull, goal, sky)
+    solved = np.clip(solved, np.log(NEAR_M), np.log(FAR_M))
     depth[~sky] = np.exp(solved)[~sky]
-    confidence[~sky] = _confidence(solved, goal[owner[0], owner[1]], away_px, sky, rules.sky_m)[~sky]
+    confidence[~sky] = _confidence(solved, goal[owner[0], owner[1]], away_px, sky)[~sky]
     return DenseDepth(depth, confidence)
 
 
-def _fit_planes(known: NDArray[np.bool_], measured: NDArray[np.float32], rules: CompletionRules) -> NDArray[np.float32]:
+def _fit_planes(known: NDArray[np.bool_], measured: NDArray[np.float32]) -> NDArray[np.float32]:
     """Plane of each measurement in inverse depth: f32[3, H, W] with inverse depth, and its change per pixel to the
     right and downwards relative to it; zero outside ``known``."""
     row, column = np.nonzero(known)
     planes = np.zeros((3, *known.shape), np.float32)
     inverse = 1 / measured[known].astype(np.float64)
     planes[0, row, column] = inverse
-    count = min(rules.neighbours + 1, len(row))
+    count = min(_NEIGHBOURS + 1, len(row))
     if count < 4:
         return planes
     at = np.c_[column, row].astype(np.float64)
@@ -386,7 +340,7 @@ def _fit_planes(known: NDArray[np.bool_], measured: NDArray[np.float32], rules: 
 
 
 def _expected(
-    planes: NDArray[np.float32], owner: NDArray[np.intp], away_px: NDArray[np.float64], rules: CompletionRules
+    planes: NDArray[np.float32], owner: NDArray[np.intp], away_px: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Start of the solve and the differences to expect to the right [H, W-1] and below [H-1, W], in the logarithm of
     depth."""
@@ -395,7 +349,7 @@ def _expected(
     du, dv = (columns - owner[1]).astype(np.float32), (rows - owner[0]).astype(np.float32)
     rows_measured = np.flatnonzero((away_px == 0).any(1))
     usual_px = float(np.quantile(away_px[rows_measured[0] : rows_measured[-1] + 1], 0.9))
-    fade = np.exp(-np.maximum(away_px - max(6.0, 1.5 * usual_px), 0) / rules.plane_fade_px).astype(np.float32)
+    fade = np.exp(-np.maximum(away_px - max(6.0, 1.5 * usual_px), 0) / _PLANE_FADE_PX).astype(np.float32)
     slope_v = slope_v * fade
     ratio = np.clip(1 + slope_u * du + slope_v * dv, 0.7, 1.4)
     start = (-np.log(inverse * ratio)).astype(np.float32)
@@ -405,13 +359,13 @@ def _expected(
     return start, right, down
 
 
-def _color_weights(rgb: NDArray[np.uint8], rules: CompletionRules) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _color_weights(rgb: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Weights of the pairs to the right [H, W-1] and below [H-1, W]."""
     colors = rgb.astype(np.float32)
     weights = []
     for axis in (1, 0):
         step = np.sqrt((np.diff(colors, axis=axis) ** 2).sum(2))
-        weights.append(np.maximum(np.exp(-step / rules.color_scale), rules.edge_floor).astype(np.float32))
+        weights.append(np.maximum(np.exp(-step / _COLOR_SCALE), _EDGE_FLOOR).astype(np.float32))
     return weights[0], weights[1]
 
 
@@ -422,7 +376,6 @@ def _solve(
     pull: NDArray[np.float32],
     goal: NDArray[np.float32],
     sky: NDArray[np.bool_],
-    rules: CompletionRules,
 ) -> NDArray[np.float32]:
     """Logarithm of depth f32[H, W]: reweighted least squares over all pixels but the sky."""
     number = np.cumsum(~sky.ravel()).reshape(sky.shape) - 1
@@ -435,13 +388,13 @@ def _solve(
         pairs.append((number[here][both], number[there][both], g[both], w[both]))
     first, second, g, w0 = (np.concatenate(part) for part in zip(*pairs, strict=True))
     data0, goal, x, size = pull[~sky], goal[~sky], start[~sky].copy(), int((~sky).sum())
-    for turn in range(rules.rounds):
+    for turn in range(_ROUNDS):
         w, data = w0, data0
         if turn:
             off = np.abs(x - goal)
-            scale = max(rules.outlier_scale, 4 * float(np.median(off[data0 > 0])))  # not all can be outliers
+            scale = max(_OUTLIER_SCALE, 4 * float(np.median(off[data0 > 0])))  # not all can be outliers
             data = data0 / (1 + (off / scale) ** 2)
-            w = w0 / (1 + ((x[second] - x[first] - g) / rules.step_scale) ** 2)
+            w = w0 / (1 + ((x[second] - x[first] - g) / _STEP_SCALE) ** 2)
         diagonal = (
             data
             + np.bincount(first, w, size).astype(np.float32)
@@ -453,7 +406,7 @@ def _solve(
         upper = sparse.csr_matrix((-w, (first, second)), shape=(size, size), dtype=np.float32)
         matrix = (upper + upper.T + sparse.diags(diagonal, dtype=np.float32)).tocsr()
         x = conjugate_gradients(
-            matrix, right_side.astype(np.float32), x, (1 / diagonal).astype(np.float32), rules.iterations
+            matrix, right_side.astype(np.float32), x, (1 / diagonal).astype(np.float32), _ITERATIONS
         )
     out = np.zeros(sky.shape, np.float32)
     out[~sky] = x
@@ -495,11 +448,7 @@ def conjugate_gradients(
 
 
 def _confidence(
-    solved: NDArray[np.float32],
-    nearest: NDArray[np.float32],
-    away_px: NDArray[np.float64],
-    sky: NDArray[np.bool_],
-    sky_m: float,
+    solved: NDArray[np.float32], nearest: NDArray[np.float32], away_px: NDArray[np.float64], sky: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
     """exp(-e / 0.05) of the expected relative error e.
 
@@ -507,7 +456,7 @@ def _confidence(
     around the pixel (where depth is steep, half a pixel is much). Its four numbers are a least-squares fit on generated
     cities.
     """
-    around = np.where(sky, np.float32(np.log(sky_m)), solved)
+    around = np.where(sky, np.float32(np.log(SKY_M)), solved)
     steps = ndimage.maximum_filter(around, 5) - ndimage.minimum_filter(around, 5)
     error = 0.002 + 0.0009 * np.minimum(away_px, 100) + 0.13 * np.abs(solved - nearest) + 0.05 * np.minimum(steps, 1)
     return np.exp(-error / 0.05).astype(np.float32)

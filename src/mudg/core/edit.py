@@ -23,7 +23,6 @@ from mudg.base import geometry
 from mudg.base.errors import InputError
 
 # boxes --------------------------------------------------------------------------------------------
-#
 # Boxes of road users against each other and against cameras: do they collide, and which sides were ever seen?
 
 
@@ -72,7 +71,6 @@ def angle_to_nearest(asked: Array, seen: Array) -> Array:
 
 
 # ground -------------------------------------------------------------------------------------------
-#
 # A height map of the ground, from points that lie on it: what a vehicle stands on that is put somewhere else.
 
 
@@ -111,10 +109,8 @@ class HeightMap:
         points = np.asarray(xyz, np.float64)
         points = points[np.isfinite(points).all(1)]
         if not len(points):
-            raise InputError(
-                "there is no ground: no point is of class road, sidewalk or terrain",
-                remedy="fuse a scene with labels, or leave ground out (ground: false)",
-            )
+            what = "there is no ground: no point is of class road, sidewalk or terrain"
+            raise InputError(what, remedy="fuse a scene with labels, or leave ground out (ground: false)")
         cells = np.floor(points[:, :2] / cell_m).astype(np.int64)
         first = cells.min(0) - int(np.ceil(REACH_M / cell_m))
         shape = cells.max(0) - first + 1 + int(np.ceil(REACH_M / cell_m))
@@ -136,15 +132,10 @@ class HeightMap:
 
     def normal(self, xy: Array) -> Array:
         """Unit normals f64[N, 3] of the ground at places f64[N, 2], upwards; vertical where it is not known."""
-        slopes = np.stack([self._slope(xy, axis) for axis in (0, 1)], 1)
+        rises = [self.height(xy + step) - self.height(xy - step) for step in TILT_M * np.eye(2)]
+        slopes = np.nan_to_num(np.stack(rises, 1) / (2 * TILT_M))
         normals = np.column_stack([-slopes, np.ones(len(slopes))])
         return normals / np.linalg.norm(normals, axis=1, keepdims=True)
-
-    def _slope(self, xy: Array, axis: int) -> Array:
-        """Rise per metre along an axis over `TILT_M` to either side, f64[N]; 0 where not known."""
-        step = np.zeros(2)
-        step[axis] = TILT_M
-        return np.nan_to_num((self.height(xy + step) - self.height(xy - step)) / (2 * TILT_M))
 
     def _at(self, xy: Array) -> Array:
         return (np.asarray(xy, np.float64) - self.origin) / self.cell_m
@@ -278,21 +269,13 @@ def lane_changed(
     """
     first, last = float(motion.times_s[0]), float(motion.times_s[-1])
     if not first <= start_s < last:
-        raise InputError(
-            "the lane change begins outside the path",
-            where="start_s",
-            expected=f"{first:.2f}..{last:.2f} s",
-            got=f"{start_s} s",
-        )
+        what = "the lane change begins outside the path"
+        raise InputError(what, where="start_s", expected=f"{first:.2f}..{last:.2f} s", got=f"{start_s} s")
     speed = motion.speed_at(start_s)
     if speed < STANDING_M_S:
-        raise InputError(
-            "only what drives can change lanes",
-            where="start_s",
-            expected=f"at least {STANDING_M_S} m/s",
-            got=f"{speed:.2f} m/s at {start_s} s",
-            remedy="use move to displace what stands",
-        )
+        what, expected = "only what drives can change lanes", f"at least {STANDING_M_S} m/s"
+        got = f"{speed:.2f} m/s at {start_s} s"
+        raise InputError(what, where="start_s", expected=expected, got=got, remedy="use move to displace what stands")
     keyed = motion.with_keys_between(start_s, start_s + duration_s)
     s = (keyed.times_s - start_s) / duration_s
     u = np.clip(s, 0, 1)
@@ -313,26 +296,23 @@ def grounded(motion: Motion, before: Motion, ground: HeightMap) -> Motion:
 
     Keys of both belong together. Where the ground is unknown at either place, a key stays as it is.
     """
-    new_xy, old_xy = motion.poses[:, :2, 3], before.poses[:, :2, 3]
-    rise = ground.height(new_xy) - ground.height(old_xy)
-    poses = motion.poses.copy()
-    for i, (up, new, old) in enumerate(zip(rise, ground.normal(new_xy), ground.normal(old_xy), strict=True)):
-        if np.isfinite(up):
-            poses[i, 2, 3] += up
-            poses[i, :3, :3] = _turn_between(old, new) @ poses[i, :3, :3]
-    return replace(motion, poses=poses)
+    new, old = motion.poses[:, :2, 3], before.poses[:, :2, 3]
+    return _set_on(motion, ground.height(new) - ground.height(old), ground.normal(old), ground.normal(new))
 
 
 def regrounded(motion: Motion, old: HeightMap, new: HeightMap) -> Motion:
     """A path on other ground below the same places: the height above it and the tilt against it stay. Unknown ground
     changes nothing."""
     xy = motion.poses[:, :2, 3]
+    return _set_on(motion, new.height(xy) - old.height(xy), old.normal(xy), new.normal(xy))
+
+
+def _set_on(motion: Motion, rise: Array, before: Array, after: Array) -> Motion:
+    """A path whose ground rises, and turns from one normal to another, at every key; NaN: stays."""
     poses = motion.poses.copy()
-    rise = new.height(xy) - old.height(xy)
-    for i, (up, below, above) in enumerate(zip(rise, old.normal(xy), new.normal(xy), strict=True)):
-        if np.isfinite(up):
-            poses[i, 2, 3] += up
-            poses[i, :3, :3] = _turn_between(below, above) @ poses[i, :3, :3]
+    for i in np.flatnonzero(np.isfinite(rise)):
+        poses[i, 2, 3] += rise[i]
+        poses[i, :3, :3] = _turn_between(before[i], after[i]) @ poses[i, :3, :3]
     return replace(motion, poses=poses)
 
 

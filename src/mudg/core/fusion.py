@@ -43,6 +43,10 @@ Matrix = NDArray[np.float64]
 STATIC: Final = -1
 GAP_SPREAD: Final = 1.4
 """Largest usual angle between beams as a multiple of the median one."""
+NEAR_M, FAR_M = 0.5, 200.0
+"""Camera depth limits of colouring, metres."""
+MOVING_TURN_DEG: Final = 15.0
+"""Turn from which a long box moves (half turns, a habit of annotators, do not count)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,27 +56,18 @@ class FusionRules:
     Args:
         voxel_m: keep one point per voxel of this side, the one seen from nearest by; 0 keeps all.
         occlusion_test: leave out colours from behind nearer surfaces.
-        beam_gap_deg: vertical angle between LiDAR beams; 0 = measured per sweep.
-        near_m, far_m: camera depth limits of colouring, metres.
         box_growth_m: moving boxes are grown by this on each side and on top.
         floor_margin_m: points this close above the box's floor stay static.
         moving_distance_m: dead-banded displacement or path length from which a track moves.
-        moving_turn_deg: turn from which a long box moves (half turns, a habit of annotators, do not count).
         min_object_points: dynamic objects with fewer coloured points are left out.
-        point_times: take the object's motion during the sweep (``dt_s``) into account.
     """
 
     voxel_m: float = 0.0
     occlusion_test: bool = True
-    beam_gap_deg: float = 0.0
-    near_m: float = 0.5
-    far_m: float = 200.0
     box_growth_m: float = 0.1
     floor_margin_m: float = 0.1
     moving_distance_m: float = 0.5
-    moving_turn_deg: float = 15.0
     min_object_points: int = 100
-    point_times: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +124,7 @@ def judge_track(track: Track, rules: FusionRules) -> TrackVerdict:
         reasons.append(f"centre moved {displacement:.2f} m away from its start")
     if path > rules.moving_distance_m:
         reasons.append(f"centre travelled {path:.2f} m")
-    if turn > rules.moving_turn_deg:
+    if turn > MOVING_TURN_DEG:
         reasons.append(f"heading turned {turn:.0f} degrees")
     words = (
         "; ".join(reasons) or f"static: displacement {displacement:.2f} m, path {path:.2f} m, turn {turn:.0f} degrees"
@@ -184,7 +179,7 @@ def separate(
     owned: dict[int, NDArray[np.float32]] = {}
     if len(xyz) == 0:
         return owner, owned
-    dt_s = sweep.points.dt_s if rules.point_times and np.any(sweep.points.dt_s) else None
+    dt_s = sweep.points.dt_s if np.any(sweep.points.dt_s) else None
     reach_s = float(np.abs(dt_s).max()) if dt_s is not None else 0.0
     for index in sorted(range(len(dynamic)), key=lambda i: float(np.prod(dynamic[i].size_m))):
         track = dynamic[index]
@@ -256,15 +251,13 @@ def color_points(
     in_image = np.zeros(count, bool)
     votes: list[tuple[NDArray[np.intp], NDArray[np.uint8], NDArray[np.float32]]] = []
     members = {index: np.flatnonzero(owner == index) for index in owned}
-    gap_deg = rules.beam_gap_deg or measure_beam_gap(sweep.points.xyz)
-    stands = standing_points(_apply(_turn_only(sweep.world_from_lidar), sweep.points.xyz))
+    stands = _standing(sweep, rules)
     for shot in sweep.shots:
         xyz_cam, known = _points_in_camera(sweep, shot.view, members, owned, dynamic)
-        ids, column, row, z = _pixels(xyz_cam, known, shot.view, rules)
+        ids, column, row, z = _pixels(xyz_cam, known, shot.view)
         in_image[ids] = True
-        if rules.occlusion_test and len(ids):
-            visible = ~hidden_points(xyz_cam[ids], stands[ids], shot.view, gap_deg)
-            ids, column, row, z = ids[visible], column[visible], row[visible], z[visible]
+        visible = _unhidden(xyz_cam[ids], ids, stands, shot.view)
+        ids, column, row, z = ids[visible], column[visible], row[visible], z[visible]
         cosine = z / np.linalg.norm(xyz_cam[ids], axis=1)
         better = cosine > best[ids]
         chosen = ids[better]
@@ -285,11 +278,8 @@ def points_in_image(
     owner, owned = separate(sweep, dynamic, rules)
     members = {index: np.flatnonzero(owner == index) for index in owned}
     xyz_cam, known = _points_in_camera(sweep, view, members, owned, dynamic)
-    ids, column, row, z = _pixels(xyz_cam, known, view, rules)
-    if not rules.occlusion_test or len(ids) == 0:
-        return ids, column, row, z
-    stands = standing_points(_apply(_turn_only(sweep.world_from_lidar), sweep.points.xyz))[ids]
-    visible = ~hidden_points(xyz_cam[ids], stands, view, rules.beam_gap_deg or measure_beam_gap(sweep.points.xyz))
+    ids, column, row, z = _pixels(xyz_cam, known, view)
+    visible = _unhidden(xyz_cam[ids], ids, _standing(sweep, rules), view)
     return ids[visible], column[visible], row[visible], z[visible]
 
 
@@ -316,15 +306,32 @@ def _points_in_camera(
 
 
 def _pixels(
-    xyz_cam: NDArray[np.float32], known: NDArray[np.bool_], view: View, rules: FusionRules
+    xyz_cam: NDArray[np.float32], known: NDArray[np.bool_], view: View
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
     """Points that fall into the image: indices, column, row (integers) and depth."""
     camera = view.camera
-    ids = np.flatnonzero((xyz_cam[:, 2] > rules.near_m) & (xyz_cam[:, 2] < rules.far_m) & known)
+    ids = np.flatnonzero((xyz_cam[:, 2] > NEAR_M) & (xyz_cam[:, 2] < FAR_M) & known)
     x, y, z = xyz_cam[ids].T
     column, row = (np.floor(place) for place in pinhole(camera.intrinsics, x, y, z))
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     return ids[inside], column[inside].astype(np.intp), row[inside].astype(np.intp), z[inside]
+
+
+def _standing(sweep: SweepShots, rules: FusionRules) -> tuple[NDArray[np.bool_], float] | None:
+    """Which points of a sweep stand, and the angle between its beams in degrees; None: nothing hides a point."""
+    if not rules.occlusion_test:
+        return None
+    upright = sweep.points.xyz @ sweep.world_from_lidar[:3, :3].T.astype(np.float32)
+    return standing_points(upright), measure_beam_gap(sweep.points.xyz)
+
+
+def _unhidden(
+    xyz_cam: NDArray[np.float32], ids: NDArray[np.intp], standing: tuple[NDArray[np.bool_], float] | None, view: View
+) -> NDArray[np.bool_]:
+    """Which points ``ids`` of a sweep, in the frame of a camera, nothing hides; bool[n]."""
+    if standing is None or not len(ids):
+        return np.ones(len(ids), bool)
+    return ~hidden_points(xyz_cam, standing[0][ids], view, standing[1])
 
 
 def standing_points(xyz: NDArray[np.floating], cell_m: float = 2.0, margin_m: float = 0.35) -> NDArray[np.bool_]:
@@ -394,17 +401,6 @@ def _count_votes(
     winner = tally.argmax(1).astype(np.uint8)
     winner[tally.max(1, initial=0.0) <= 0] = palette.UNLABELLED
     return winner
-
-
-def _classes_first(classes: NDArray[np.uint8] | None, voted: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Classes given to the points u8[N]; where they have none, those that the images ``voted`` for."""
-    return voted if classes is None else np.where(classes == palette.UNLABELLED, voted, classes)
-
-
-def _turn_only(a_from_b: Matrix) -> Matrix:
-    turn = a_from_b.copy()
-    turn[:3, 3] = 0
-    return turn
 
 
 def largest_beam_gap(xyz_lidar: NDArray[np.floating]) -> float:
@@ -488,13 +484,9 @@ def voxel_keys(xyz: NDArray[np.floating], voxel_m: float) -> NDArray[np.int64]:
     cells = np.floor(np.asarray(xyz, np.float64) / voxel_m).astype(np.int64)
     limit = 1 << 20
     if len(cells) and (np.abs(cells) >= limit).any():
-        raise InputError(
-            "points lie too far away for this voxel size",
-            where="voxel filter",
-            expected=f"within {limit * voxel_m:g} m",
-            got=f"{float(np.abs(xyz).max()):g} m",
-            remedy="use larger voxels, or check the poses",
-        )
+        what, got = "points lie too far away for this voxel size", f"{float(np.abs(xyz).max()):g} m"
+        remedy = "use larger voxels, or check the poses"
+        raise InputError(what, where="voxel filter", expected=f"within {limit * voxel_m:g} m", got=got, remedy=remedy)
     cells += limit
     return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
 
@@ -555,7 +547,9 @@ def fuse_sweeps(
         labelled |= sweep.points.classes is not None or any(shot.semantics is not None for shot in sweep.shots)
         owner, owned = separate(sweep, dynamic, rules)
         colors = color_points(sweep, owner, owned, dynamic, rules, cameras)
-        semantics = _classes_first(sweep.points.classes, colors.semantics)
+        semantics, given = colors.semantics, sweep.points.classes
+        if given is not None:  # images vote for points that people gave no class
+            semantics = np.where(given == palette.UNLABELLED, semantics, given)
         keep = colors.seen & (owner == STATIC)
         static.add(
             _apply(sweep.world_from_lidar, sweep.points.xyz[keep]),

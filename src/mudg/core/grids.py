@@ -12,9 +12,9 @@ reach the table and, where they are asked for, the points. They do not depend on
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Final
 
 import torch
@@ -25,9 +25,10 @@ from torch.autograd.function import once_differentiable
 from mudg import native
 from mudg.base import log
 from mudg.base.errors import InputError, UsageError
+from mudg.base.types import check_shape
+from mudg.core.native_ops import address
 
 # hex planes ---------------------------------------------------------------------------------------
-#
 # Six planes of several sizes (HexPlane, Cao and Johnson 2023; K-Planes, Fridovich-Keil et al. 2023): learnt features of
 # places and times.
 #
@@ -93,12 +94,8 @@ def look_up(places: Tensor, numbers: Tensor, sizes: PlaneSizes) -> Tensor:
     Raises:
         InputError: shapes do not fit.
     """
-    if places.ndim != 2 or places.shape[1] != 4 or tuple(numbers.shape) != (sizes.numbers,):
-        raise InputError(
-            "planes of place and time: shapes do not fit",
-            expected=f"places [N, 4], planes ({sizes.numbers},)",
-            got=f"{tuple(places.shape)}, {tuple(numbers.shape)}",
-        )
+    check_shape(places, "planes of place and time: places", (None, 4))
+    check_shape(numbers, "planes of place and time: numbers", (sizes.numbers,))
     library = native.library()
     known = sizes.features in NATIVE_FEATURES and sizes.levels <= NATIVE_LEVELS and sizes.space > 1 and sizes.time > 1
     fits = known and all(t.dtype == torch.float32 and t.device.type == "cpu" for t in (places, numbers))
@@ -106,7 +103,8 @@ def look_up(places: Tensor, numbers: Tensor, sizes: PlaneSizes) -> Tensor:
         why = native.status() if library is None else f"{places.dtype} on {places.device}, {sizes.features} features"
         log.info_once(f"planes of place and time: plain torch ({why})")
         return torch_look_up(places, numbers, sizes)
-    return _LookUp.apply(places, numbers, sizes, library)
+    width = sizes.features * sizes.levels
+    return _Native.apply(places, numbers, width, partial(_call_hex_planes, library, sizes))
 
 
 def torch_look_up(places: Tensor, numbers: Tensor, sizes: PlaneSizes) -> Tensor:
@@ -123,42 +121,18 @@ def torch_look_up(places: Tensor, numbers: Tensor, sizes: PlaneSizes) -> Tensor:
     return torch.cat(levels, 1)
 
 
-class _LookUp(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, places: Tensor, numbers: Tensor, sizes: PlaneSizes, library: ctypes.CDLL) -> Tensor:
-        given = places.detach().contiguous(), numbers.detach().contiguous()
-        out = torch.empty(len(places), sizes.features * sizes.levels)
-        _call_hex_planes(library, sizes, given, (out, None, None, None))
-        ctx.save_for_backward(*given)
-        ctx.sizes, ctx.library = sizes, library
-        return out
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        places, numbers = ctx.saved_tensors
-        of_places = torch.zeros_like(places) if ctx.needs_input_grad[0] else None
-        of_numbers = torch.zeros_like(numbers) if ctx.needs_input_grad[1] else None
-        _call_hex_planes(
-            ctx.library, ctx.sizes, (places, numbers), (None, upstream.contiguous(), of_numbers, of_places)
-        )
-        return of_places, of_numbers, None, None
-
-
-def _call_hex_planes(
-    library: ctypes.CDLL, sizes: PlaneSizes, given: tuple[Tensor, Tensor], rest: tuple[Tensor | None, ...]
-) -> None:
-    places, numbers = given
+def _call_hex_planes(library: ctypes.CDLL, sizes: PlaneSizes, *tensors: Tensor | None) -> None:
+    places, numbers = tensors[:2]
     flat = [count for cells in sizes.cells for count in cells]
     library.mudg_hex_planes.restype = ctypes.c_int
     status = library.mudg_hex_planes(
-        _address_hex_planes(places),
-        ctypes.c_int64(len(places)),
-        _address_hex_planes(numbers),
+        address(places),
+        ctypes.c_int64(0 if places is None else len(places)),
+        address(numbers),
         sizes.features,
         sizes.levels,
         (ctypes.c_int32 * len(flat))(*flat),
-        *map(_address_hex_planes, rest),
+        *map(address, tensors[2:]),
     )
     if status == 2:
         raise MemoryError("the look-up in planes of place and time needs more memory than there is")
@@ -166,8 +140,26 @@ def _call_hex_planes(
         raise InputError("the native library does not know such planes", got=str(sizes))
 
 
-def _address_hex_planes(tensor: Tensor | None) -> ctypes.c_void_p:
-    return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
+class _Native(torch.autograd.Function):
+    """A look-up of points in learnt values. ``call(points, values, out, upstream, of_values, of_points)`` fills the
+    features ``[N, width]``, or the gradients that are asked for."""
+
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, values: Tensor, width: int, call: Callable[..., None]) -> Tensor:
+        given = points.detach().contiguous(), values.detach().contiguous()
+        out = torch.empty(len(points), width)
+        call(*given, out, None, None, None)
+        ctx.save_for_backward(*given)
+        ctx.call = call
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        asked = zip(ctx.saved_tensors, ctx.needs_input_grad)
+        of_points, of_values = (torch.zeros_like(one) if needed else None for one, needed in asked)
+        ctx.call(*ctx.saved_tensors, None, upstream.contiguous(), of_values, of_points)
+        return of_points, of_values, None, None
 
 
 # hash grid ----------------------------------------------------------------------------------------
@@ -260,19 +252,15 @@ def encode(points: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
     Raises:
         InputError: shapes do not fit the grid.
     """
-    if points.ndim != 2 or points.shape[1] != grid.dimensions or tuple(table.shape) != grid.table_shape:
-        raise InputError(
-            "hash grid: shapes do not fit",
-            expected=f"points [N, {grid.dimensions}], table {grid.table_shape}",
-            got=f"{tuple(points.shape)}, {tuple(table.shape)}",
-        )
+    check_shape(points, "hash grid: points", (None, grid.dimensions))
+    check_shape(table, "hash grid: table", grid.table_shape)
     library = native.library()
     fits = all(t.dtype == torch.float32 and t.device.type == "cpu" for t in (points, table))
     if library is None or not fits or not len(points):
         why = native.status() if library is None else f"{points.dtype} on {points.device}"
         log.info_once(f"hash grids: plain torch ({why})")
         return torch_encode(points, table, grid)
-    return _Encode.apply(points, table, grid, library)
+    return _Native.apply(points, table, grid.width, partial(_call_hash_grid, library, grid))
 
 
 def torch_encode(points: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
@@ -298,44 +286,19 @@ def torch_encode(points: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
     return torch.cat(made, 1)
 
 
-class _Encode(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, points: Tensor, table: Tensor, grid: HashGrid, library: ctypes.CDLL) -> Tensor:
-        places, values = points.detach().contiguous(), table.detach().contiguous()
-        out = torch.empty(len(places), grid.width)
-        _call(library, grid, (places, values), (out, None, None, None))
-        ctx.save_for_backward(places, values)
-        ctx.grid, ctx.library = grid, library
-        return out
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        places, values = ctx.saved_tensors
-        of_points = torch.empty_like(places) if ctx.needs_input_grad[0] else None
-        of_table = torch.empty_like(values) if ctx.needs_input_grad[1] else None
-        _call(ctx.library, ctx.grid, (places, values), (None, upstream.contiguous(), of_table, of_points))
-        return of_points, of_table, None, None
-
-
-def _call(library: ctypes.CDLL, grid: HashGrid, given: tuple[Tensor, Tensor], rest: tuple[Tensor | None, ...]) -> None:
-    places, values = given
+def _call_hash_grid(library: ctypes.CDLL, grid: HashGrid, *tensors: Tensor | None) -> None:
+    points, values = tensors[:2]
     levels = grid.levels
-    sizes = (ctypes.c_int * 3)(grid.dimensions, levels, grid.features)
     library.mudg_hash_grid.restype = ctypes.c_int
     status = library.mudg_hash_grid(
-        _address(places),
-        ctypes.c_int64(len(places)),
-        _address(values),
-        sizes,
+        address(points),
+        ctypes.c_int64(0 if points is None else len(points)),
+        address(values),
+        (ctypes.c_int * 3)(grid.dimensions, levels, grid.features),
         (ctypes.c_int32 * levels)(*grid.resolutions),
         (ctypes.c_int64 * levels)(*grid.entries),
         (ctypes.c_uint8 * levels)(*grid.hashed),
-        *map(_address, rest),
+        *map(address, tensors[2:]),
     )
     if status != 0:
         raise InputError("the native library does not know such a hash grid", got=str(grid))
-
-
-def _address(tensor: Tensor | None) -> ctypes.c_void_p:
-    return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())

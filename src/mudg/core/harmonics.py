@@ -26,20 +26,18 @@ def left_product_matrix(quat: Tensor) -> Tensor:
 
 def rotation_matrix(quat: Tensor) -> Tensor:
     """Rotation ``[3, 3]`` of a quaternion ``[4]``, normalised here."""
-    w, x, y, z = (quat / quat.norm()).unbind()
-    return torch.stack(
-        [
-            1 - 2 * (y * y + z * z),
-            2 * (x * y - w * z),
-            2 * (x * z + w * y),
-            2 * (x * y + w * z),
-            1 - 2 * (x * x + z * z),
-            2 * (y * z - w * x),
-            2 * (x * z - w * y),
-            2 * (y * z + w * x),
-            1 - 2 * (x * x + y * y),
-        ]
-    ).view(3, 3)
+    return rotation_of_unit(quat / quat.norm())
+
+
+def rotation_of_unit(quat: Tensor) -> Tensor:
+    """Rotations ``[..., 3, 3]`` of unit quaternions ``[..., 4]``."""
+    w, x, y, z = quat.unbind(-1)
+    rows = (
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
 def slerp(quat0: Tensor, quat1: Tensor, u: float) -> Tensor:
@@ -151,7 +149,6 @@ def spiral(count: int) -> Array:
 
 
 # harmonics ----------------------------------------------------------------------------------------
-#
 # Spherical harmonics of colours in a turned frame.
 #
 # A colour is the sum of harmonics of the direction from the camera to a Gaussian. Where the harmonics belong to a frame

@@ -23,7 +23,6 @@ from mudg.core.fusion import STATIC
 from mudg.core.project import RULES, DrawLimits, PointLayer, draw_points, hidden_pixels
 
 # beams --------------------------------------------------------------------------------------------
-#
 # What laser beams meet: surfaces of points, boxes, the ground. All in the frame of the sensor, beams from its origin.
 
 

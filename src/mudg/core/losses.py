@@ -23,11 +23,10 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mudg.base.errors import InputError
 from mudg.base.palette import UNLABELLED
+from mudg.base.types import check_shape
 
 # perceptual ---------------------------------------------------------------------------------------
-#
 # Distances of two images in the features of a network or a filter bank: losses of a fit, and rows of the scores.
 
 
@@ -88,13 +87,7 @@ def lpips_distance(
     """
     total = prediction[0].new_zeros(())
     for stage, (features, target) in enumerate(zip(prediction, target_units, strict=True)):
-        if features.shape != target.shape:
-            raise InputError(
-                "features of two images differ in shape",
-                where=f"stage {stage}",
-                expected=str(tuple(target.shape)),
-                got=str(tuple(features.shape)),
-            )
+        check_shape(features, f"features of an image, stage {stage}", tuple(target.shape))
         places = distance_places(features, target, None if channel_weights is None else channel_weights[stage])
         if weight is None:
             total = total + places.mean()
@@ -137,7 +130,7 @@ def confident_mean(values: Tensor, weight: Tensor) -> Tensor:
 
 def l1_map(prediction: Tensor, target: Tensor) -> Tensor:
     """Absolute difference, same shape as the inputs."""
-    _same_shape(prediction, target, "l1_map")
+    check_shape(target, "l1_map", tuple(prediction.shape))
     return (prediction - target).abs()
 
 
@@ -157,7 +150,7 @@ def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
 
     11x11 Gaussian window with sigma 1.5 px, zero padding, C1 = 0.01^2, C2 = 0.03^2, for values in [0, 1].
     """
-    _same_shape(prediction, target, "ssim_map")
+    check_shape(target, "ssim_map", tuple(prediction.shape))
     channels = prediction.shape[0]
     row, column = _window(5 * channels, prediction.dtype, prediction.device)
     stack = torch.cat([prediction, target, prediction**2, target**2, prediction * target])[None]
@@ -230,7 +223,7 @@ def dense_depth_map(depth_m: Tensor, target_m: Tensor, delta: float = 0.1) -> Te
     A generated depth map errs in proportion to distance and has gross outliers at edges; both inputs in metres,
     ``[1, H, W]``, positive (clamped to 0.1 m). Huber is divided by ``delta``, so that far from zero it is |log ratio|.
     """
-    _same_shape(depth_m, target_m, "dense_depth_map")
+    check_shape(target_m, "dense_depth_map", tuple(depth_m.shape))
     difference = torch.log(depth_m.clamp_min(0.1)) - torch.log(target_m.clamp_min(0.1))
     return F.huber_loss(difference, torch.zeros_like(difference), reduction="none", delta=delta) / delta
 
@@ -277,14 +270,14 @@ def sky_map(alpha: Tensor, sky: Tensor, floor: float = 1e-3) -> Tensor:
     ``-log(1 - alpha)`` where ``sky`` (bool), ``-log(alpha)`` elsewhere; ``alpha`` ``[1, H, W]`` in [0, 1] is kept
     ``floor`` away from 0 and 1, so the loss and its gradient stay bounded.
     """
-    _same_shape(alpha, sky, "sky_map")
+    check_shape(sky, "sky_map", tuple(alpha.shape))
     opaque = alpha.clamp(floor, 1 - floor)
     return -torch.log(torch.where(sky, 1 - opaque, opaque))
 
 
 def empty_sky(alpha: Tensor, sky: Tensor, floor: float = 1e-3) -> Tensor:
     """Mean over all pixels of ``-log(1 - alpha)`` where ``sky`` (bool), 0 elsewhere; ``[1, H, W]`` each."""
-    _same_shape(alpha, sky, "empty_sky")
+    check_shape(sky, "empty_sky", tuple(alpha.shape))
     return torch.where(sky, -torch.log(1 - alpha.clamp(max=1 - floor)), 0.0).mean()
 
 
@@ -303,10 +296,7 @@ def semantic_map(logits: Tensor, target: Tensor) -> Tensor:
     Returns:
         ``[H, W]``.
     """
-    if logits.shape[1:] != target.shape:
-        raise InputError(
-            "semantic loss: sizes differ", expected=str(tuple(logits.shape[1:])), got=str(tuple(target.shape))
-        )
+    check_shape(target, "semantic loss: target", tuple(logits.shape[1:]))
     return F.cross_entropy(logits[None], target[None], ignore_index=UNLABELLED, reduction="none")[0]
 
 
@@ -333,7 +323,7 @@ def object_map(object_alpha: Tensor, inside_boxes: Tensor, floor: float = 1e-3) 
     Entropy of the opacity inside the projected boxes (be there or not, but decide), ``-log(1 - alpha)`` outside
     (objects leave no haze outside their boxes). ``[1, H, W]`` each; ``inside_boxes`` bool.
     """
-    _same_shape(object_alpha, inside_boxes, "object_map")
+    check_shape(inside_boxes, "object_map", tuple(object_alpha.shape))
     alpha = object_alpha.clamp(floor, 1 - floor)
     entropy = -(alpha * torch.log(alpha) + (1 - alpha) * torch.log(1 - alpha))
     return torch.where(inside_boxes, entropy, -torch.log(1 - alpha))
@@ -360,7 +350,7 @@ def feature_distance(prediction: list[Tensor], target: list[Tensor], weight: Ten
     """
     total = prediction[0].new_zeros(())
     for mine, theirs in zip(prediction, target):
-        _same_shape(mine, theirs, "feature_distance")
+        check_shape(theirs, "feature_distance", tuple(mine.shape))
         scale_weight = F.adaptive_avg_pool2d(weight.to(mine.dtype), (mine.shape[-2], mine.shape[-1]))
         total = total + _ConfidentDifference.apply(mine, theirs.detach(), scale_weight.detach())
     return total / len(prediction)
@@ -443,8 +433,3 @@ def stated_error(log_error: Tensor, error: Tensor) -> Tensor:
     size = error.detach().abs().mean(1, keepdim=True)
     scale = log_error.clamp(-6.0, 1.0)
     return (size * torch.exp(-scale) + scale).mean()
-
-
-def _same_shape(a: Tensor, b: Tensor, what: str) -> None:
-    if a.shape != b.shape:
-        raise InputError(f"{what}: shapes differ", expected=str(tuple(a.shape)), got=str(tuple(b.shape)))

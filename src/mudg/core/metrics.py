@@ -21,7 +21,7 @@ from torch import Tensor
 from mudg.base import geometry, palette
 from mudg.base.errors import InputError
 from mudg.base.palette import CLASSES
-from mudg.base.types import View
+from mudg.base.types import Track, View
 from mudg.core import native_ops
 from mudg.core.lidar import PointTruth
 from mudg.core.losses import ssim_map
@@ -64,7 +64,6 @@ class ViewFacts:
 
 
 # flicker ------------------------------------------------------------------------------------------
-#
 # How restless a video is: what static surfaces change from frame to frame, against what they change in the truth.
 
 
@@ -92,11 +91,11 @@ def changes(generated: Tensor, truth: Tensor, frames: Sequence[TrueFrame]) -> li
     Every pixel of a class that cannot move is carried by its true depth into the next frame and compared with what is
     there (bilinear), if the same surface is seen there (depths within 3 %).
     """
-    pairs = []
-    for t in range(len(truth) - 1):
-        where = pixel_motion(frames[t], frames[t + 1])
-        pairs.append((change(generated[t], generated[t + 1], where), change(truth[t], truth[t + 1], where)))
-    return pairs
+    motions = map(pixel_motion, frames[:-1], frames[1:])
+    return [
+        (change(generated[t], generated[t + 1], where), change(truth[t], truth[t + 1], where))
+        for t, where in enumerate(motions)
+    ]
 
 
 @dataclass(frozen=True)
@@ -382,55 +381,75 @@ def measure(
     return {name: found[metric.source] for name, metric in metrics.items()}
 
 
-class FrameMean:
-    """Mean over views of a per-view number; views without the modality do not count."""
+class Pooled:
+    """A number over all views: the sum of what they add, over what they count for.
 
-    def __init__(self, source: Callable[[Pair], float | None]) -> None:
-        self.source = source
-        self._sum = 0.0
-        self._views = 0
+    Args:
+        source: what is measured of a view. share: sum and count that a measurement adds (None: it is both). finish:
+            the number from their ratio.
+    """
 
-    def add(self, measured: float | None) -> None:
-        """Add one view; a view whose number is None or NaN (nothing to compare) is left out."""
-        if measured is not None and not math.isnan(measured):
-            self._sum += min(measured, 100.0)  # equal images give infinite dB; 100 keeps the mean readable
-            self._views += 1
+    def __init__(
+        self,
+        source: Callable[[Pair], Any],
+        share: Callable[[Any], tuple[float, float]] | None = None,
+        finish: Callable[[float], float] = float,
+    ) -> None:
+        self.source, self._share, self._finish = source, share, finish
+        self._sum, self._count = 0.0, 0.0
 
-    def value(self) -> float | None:
-        """Mean over the counted views, or None."""
-        return self._sum / self._views if self._views else None
-
-
-class DepthError:
-    """Depth errors pooled over all pixels of the trajectory."""
-
-    def __init__(self, field: Literal["abs_rel", "rmse_m", "delta1"]) -> None:
-        self._field: Literal["abs_rel", "rmse_m", "delta1"] = field
-        self.source = _depth_errors_of
-        self._sum = 0.0
-        self._pixels = 0
-
-    def add(self, measured: DepthErrors | None) -> None:
-        """Add the errors of one view; None and no pixels do not count."""
-        if measured is not None and measured.pixels:
-            number = {"abs_rel": measured.abs_rel, "rmse_m": measured.rmse_m**2, "delta1": measured.delta1}[self._field]
-            self._sum += number * measured.pixels
-            self._pixels += measured.pixels
+    def add(self, measured: Any) -> None:
+        """Add one view; None does not count."""
+        if measured is not None:
+            total, count = measured if self._share is None else self._share(measured)
+            self._sum += total
+            self._count += count
 
     def value(self) -> float | None:
-        """Pooled error, or None."""
-        if not self._pixels:
-            return None
-        mean = self._sum / self._pixels
-        return math.sqrt(mean) if self._field == "rmse_m" else mean
+        """The number, or None where nothing counted."""
+        return self._finish(self._sum / self._count) if self._count > 0 else None
+
+
+def frame_mean(source: Callable[[Pair], float | None]) -> Pooled:
+    """Mean over views of a number of each; None and NaN (nothing to compare) do not count. Equal images give infinite
+    dB, taken as 100: that keeps the mean readable."""
+    return Pooled(source, lambda number: (0.0, 0) if math.isnan(number) else (min(number, 100.0), 1))
+
+
+def depth_error(
+    field: Literal["abs_rel", "rmse_m", "delta1"], source: Callable[[Pair], DepthErrors | None] | None = None
+) -> Pooled:
+    """A depth error pooled over all pixels of the trajectory. source: None: of whole views."""
+
+    def share(errors: DepthErrors) -> tuple[float, float]:
+        number = errors.rmse_m**2 if field == "rmse_m" else getattr(errors, field)
+        return (number * errors.pixels, errors.pixels) if errors.pixels else (0.0, 0)
+
+    return Pooled(source or _depth_errors_of, share, math.sqrt if field == "rmse_m" else float)
+
+
+class Neighbours(Pooled):
+    """A number over all pairs of neighbouring views. Wants every view of a trajectory in order; ``share`` takes two."""
+
+    def __init__(self, source: Callable[[Pair], Any], share: Callable[[Any], tuple[float, float]]) -> None:
+        super().__init__(source, share)
+        self._before: Any = None
+
+    def add(self, measured: Any) -> None:
+        """Add the next view."""
+        before, self._before = self._before, measured
+        super().add(None if before is None or measured is None else (before, measured))
 
 
 class Segmentation:
-    """Mean IoU over the classes present in the truth, or pixel accuracy, from one pooled confusion matrix."""
+    """Mean IoU over the classes present in the truth, or pixel accuracy, from one pooled confusion matrix. source:
+    None: of whole views."""
 
-    def __init__(self, field: Literal["miou", "accuracy"]) -> None:
+    def __init__(
+        self, field: Literal["miou", "accuracy"], source: Callable[[Pair], Tensor | None] | None = None
+    ) -> None:
         self._field = field
-        self.source = _confusion_of
+        self.source = source or _confusion_of
         self.counts = torch.zeros(CLASS_COUNT, CLASS_COUNT + 1, dtype=torch.int64)
 
     def add(self, measured: Tensor | None) -> None:
@@ -449,62 +468,75 @@ class Segmentation:
         return sum(iou.values()) / len(iou)
 
 
-class StaticMotion:
-    """Where static surfaces of one true frame are in the next, and what they change there (see ``core.flicker``).
+class ExactMotion:
+    """Where surfaces of one view are in the next: by true depth and poses, vehicles by their boxes. The last answer is
+    kept: method after method is held against the same two views.
 
-    The last answer is kept: method after method is held against the same two frames.
+    Args:
+        tracks: number in the instance map and track of every vehicle that is followed; others do not count.
     """
 
-    def __init__(self) -> None:
-        self._frames: tuple[Tensor, Tensor] | None = None
-        self._found: tuple[PixelMotion, float] | None = None
+    def __init__(self, tracks: Sequence[tuple[int, Track]] = ()) -> None:
+        self._tracks = tracks
+        self._of: tuple[Tensor | None, Tensor | None] = (None, None)
+        self._motion: PixelMotion | None = None
+        self._true_change: float | None = None
 
-    def between(self, before: Pair, pair: Pair) -> tuple[PixelMotion, float]:
-        """For two neighbouring pairs that hold exact colour, depth, classes and the view."""
-        if before.truth_rgb is None or pair.truth_rgb is None:
-            raise InputError("flicker needs true colours")
-        same = self._frames is not None and self._frames[0] is before.truth_rgb and self._frames[1] is pair.truth_rgb
-        if self._found is None or not same:
-            motion = pixel_motion(_true_frame(before), _true_frame(pair))
-            self._found = motion, change(before.truth_rgb, pair.truth_rgb, motion)
-            self._frames = before.truth_rgb, pair.truth_rgb
-        return self._found
+    def between(self, before: Pair, pair: Pair) -> PixelMotion | None:
+        """For two neighbouring views with exact depth and classes; else None."""
+        if self._of[0] is not before.truth_depth or self._of[1] is not pair.truth_depth:
+            self._of, self._true_change = (before.truth_depth, pair.truth_depth), None
+            self._motion = self._found(before, pair)
+        return self._motion
+
+    def true_change(self, before: Pair, pair: Pair) -> float:
+        """Summed absolute change of these surfaces in the truth; 0 where it is not known."""
+        motion = self.between(before, pair)
+        if motion is None or before.truth_rgb is None or pair.truth_rgb is None:
+            return 0.0
+        if self._true_change is None:
+            self._true_change = change(before.truth_rgb, pair.truth_rgb, motion)
+        return self._true_change
+
+    def _found(self, before: Pair, pair: Pair) -> PixelMotion | None:
+        frames, instance = [_true_frame(one) for one in (before, pair)], before.facts and before.facts.instance
+        if frames[0] is None or frames[1] is None or before.view is None or pair.view is None:
+            return None
+        if instance is None:
+            return pixel_motion(frames[0], frames[1])
+        moved: dict[int, Tensor] = {}
+        for number, track in self._tracks:
+            first, last = track.pose_at(before.view.time_s), track.pose_at(pair.view.time_s)
+            if first is not None and last is not None:
+                moved[number] = torch.from_numpy(last @ geometry.invert(first))
+        return pixel_motion(frames[0], frames[1], moved, torch.from_numpy(instance.astype(np.int64)))
 
 
-def _true_frame(pair: Pair) -> TrueFrame:
+def _true_frame(pair: Pair) -> TrueFrame | None:
     view, depth, ids = pair.view, pair.truth_depth, pair.truth_semantics
     if view is None or depth is None or ids is None:
-        raise InputError("flicker needs exact depth, classes and the view")
+        return None
     return TrueFrame.of(view, torch.where(torch.isfinite(depth) & (depth > 0), depth, 1000.0), ids)
 
 
-class Flicker:
-    """Change of static surfaces from each frame to the next, over that in the truth, pooled over the trajectory (see
-    ``core.flicker``). Wants every frame of a trajectory in order, with exact colour, depth and classes.
+def change_of(motion: ExactMotion, per: Callable[[Pair, Pair, PixelMotion], float]) -> Neighbours:
+    """Summed absolute change of surfaces from each view to the next, over ``per``, pooled over the trajectory."""
 
-    Args:
-        motion: shared by the metrics of several methods on the same trajectory.
-    """
+    def share(pairs: tuple[Pair, Pair]) -> tuple[float, float]:
+        before, pair = pairs
+        where = motion.between(before, pair)
+        if before.rgb is None or pair.rgb is None or where is None:
+            return 0.0, 0
+        return change(before.rgb.clamp(0, 1), pair.rgb.clamp(0, 1), where), per(before, pair, where)
 
-    def __init__(self, motion: StaticMotion | None = None) -> None:
-        self.source = neighbour_of
-        self._motion = motion or StaticMotion()
-        self._before: Pair | None = None
-        self._made = 0.0
-        self._true = 0.0
+    return Neighbours(neighbour_of, share)
 
-    def add(self, measured: Pair) -> None:
-        """Add the next frame."""
-        before, self._before = self._before, measured
-        if before is None or before.rgb is None or measured.rgb is None or not (_exact(before) and _exact(measured)):
-            return
-        motion, true_change = self._motion.between(before, measured)
-        self._made += change(before.rgb.clamp(0, 1), measured.rgb.clamp(0, 1), motion)
-        self._true += true_change
 
-    def value(self) -> float | None:
-        """1 = as steady as the truth; None without two neighbouring frames or without static surfaces."""
-        return self._made / self._true if self._true > 0 else None
+def flicker_over_truth(motion: ExactMotion | None = None) -> Neighbours:
+    """Change of static surfaces over that in the truth: 1 = as steady as the truth. motion: shared by the metrics of
+    several methods on the same trajectory."""
+    known = motion or ExactMotion()
+    return change_of(known, lambda before, pair, _: known.true_change(before, pair))
 
 
 def neighbour_of(pair: Pair) -> Pair:
@@ -512,10 +544,6 @@ def neighbour_of(pair: Pair) -> Pair:
     true depth and classes, and the instances. The rest would fill the memory at large sizes."""
     facts = None if pair.facts is None else ViewFacts(instance=pair.facts.instance)
     return replace(pair, depth=None, semantics=None, truth_depth_valid=None, mask=None, moving=None, facts=facts)
-
-
-def _exact(pair: Pair) -> bool:
-    return all(x is not None for x in (pair.truth_rgb, pair.truth_depth, pair.truth_semantics, pair.view))
 
 
 def _depth_errors_of(pair: Pair) -> DepthErrors | None:
@@ -533,11 +561,11 @@ def _confusion_of(pair: Pair) -> Tensor | None:
     return confusion(pair.semantics, pair.truth_semantics, pair.mask)
 
 
-def _of_colors(compare: Callable[[Tensor, Tensor, Tensor | None], float]) -> FrameMean:
+def _of_colors(compare: Callable[[Tensor, Tensor, Tensor | None], float]) -> Pooled:
     def source(pair: Pair) -> float | None:
         return None if pair.rgb is None or pair.truth_rgb is None else compare(pair.rgb, pair.truth_rgb, pair.mask)
 
-    return FrameMean(source)
+    return frame_mean(source)
 
 
 def _psnr_of_dynamic(pair: Pair) -> float | None:
@@ -563,10 +591,10 @@ METRICS: Final[dict[str, MetricRow]] = {
     "psnr": MetricRow("PSNR", "dB", ("rgb",), "higher", lambda: _of_colors(psnr)),
     "ssim": MetricRow("SSIM", "", ("rgb",), "higher", lambda: _of_colors(ssim)),
     "psnr_movers": MetricRow(
-        "PSNR of dynamic objects", "dB", ("dynamic objects", "rgb"), "higher", lambda: FrameMean(_psnr_of_dynamic)
+        "PSNR of dynamic objects", "dB", ("dynamic objects", "rgb"), "higher", lambda: frame_mean(_psnr_of_dynamic)
     ),
     "perceptual": MetricRow("perceptual", "", ("rgb", "features of the shipped codec"), "lower", None),
-    "flicker": MetricRow("flicker", "", ("every frame", "rgb"), "one", Flicker),
+    "flicker": MetricRow("flicker", "", ("every frame", "rgb"), "one", flicker_over_truth),
     "warp_error": MetricRow("warp error", "", ("every frame", "rgb"), "lower", None),
     "temporal_flickering": MetricRow("temporal flickering", "", ("views",), "higher", None),
     "lpips": MetricRow("LPIPS", "", ("rgb", "LPIPS weights"), "lower", None),
@@ -582,9 +610,9 @@ METRICS: Final[dict[str, MetricRow]] = {
     "fvd": MetricRow("FVD", "", ("rgb", "I3D weights"), "lower", None),
     "video_frechet": MetricRow("video Frechet", "", ("rgb", "video features"), "lower", None),
     "video_mmd": MetricRow("video MMD", "", ("rgb", "video features"), "lower", None),
-    "abs_rel": MetricRow("AbsRel", "", ("depth",), "lower", lambda: DepthError("abs_rel")),
-    "rmse_m": MetricRow("RMSE", "m", ("depth",), "lower", lambda: DepthError("rmse_m")),
-    "delta1": MetricRow("delta < 1.25", "", ("depth",), "higher", lambda: DepthError("delta1")),
+    "abs_rel": MetricRow("AbsRel", "", ("depth",), "lower", lambda: depth_error("abs_rel")),
+    "rmse_m": MetricRow("RMSE", "m", ("depth",), "lower", lambda: depth_error("rmse_m")),
+    "delta1": MetricRow("delta < 1.25", "", ("depth",), "higher", lambda: depth_error("delta1")),
     "lidar_abs_rel": MetricRow("AbsRel at points", "", ("LiDAR points",), "lower", None),
     "lidar_rmse_m": MetricRow("RMSE at points", "m", ("LiDAR points",), "lower", None),
     "lidar_delta1": MetricRow("delta < 1.25 at points", "", ("LiDAR points",), "higher", None),
@@ -603,19 +631,19 @@ METRICS: Final[dict[str, MetricRow]] = {
 
 def build_all(
     distances: Mapping[str, Callable[[Pair], float | None]] | None = None,
-    motion: StaticMotion | None = None,
+    motion: ExactMotion | None = None,
     more: Mapping[str, Metric] | None = None,
 ) -> dict[str, Metric]:
     """A fresh accumulator for every metric that can be computed.
 
     Args:
         distances: what computes a row that needs weights.
-        motion: shared by several methods on one trajectory (see ``Flicker``).
+        motion: shared by several methods on one trajectory (see ``flicker_over_truth``).
         more: further accumulators, such as those of ``core/view_metrics.py``.
     """
     own = {name: row.build() for name, row in METRICS.items() if row.build is not None}
-    compared = {name: FrameMean(of) for name, of in (distances or {}).items()}
-    return {**own, "flicker": Flicker(motion), **(more or {}), **compared}
+    compared = {name: frame_mean(of) for name, of in (distances or {}).items()}
+    return {**own, "flicker": flicker_over_truth(motion), **(more or {}), **compared}
 
 
 def results(metrics: Mapping[str, Metric]) -> dict[str, float | str]:

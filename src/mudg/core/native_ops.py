@@ -20,6 +20,7 @@ from torch.nn import functional
 from mudg import native
 from mudg.base import log
 from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.types import check_shape
 from mudg.core import losses
 from mudg.core.table import BETA1, BETA2, EPSILON, AdamColumn, torch_adam_columns
 
@@ -35,21 +36,13 @@ def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, we
         InputError: shapes differ or are not [C, H, W].
         UsageError: the weight is outside [0, 1].
     """
-    if prediction.shape != target.shape or prediction.ndim != 3:
-        raise InputError(
-            "photometric: images must be [C, H, W] of one shape",
-            expected=str(tuple(prediction.shape)),
-            got=str(tuple(target.shape)),
-        )
+    check_shape(prediction, "photometric: prediction", (None, None, None))
+    check_shape(target, "photometric: target", tuple(prediction.shape))
     if not 0 <= ssim_weight <= 1:
         raise UsageError("the weight of SSIM must lie in [0, 1]", got=str(ssim_weight))
-    if weight is not None and weight.shape != prediction.shape[1:]:
-        raise InputError(
-            "photometric: one weight for every pixel",
-            expected=str(tuple(prediction.shape[1:])),
-            got=str(tuple(weight.shape)),
-        )
-    weight = None if weight is None else weight.detach().to(prediction.dtype).contiguous()
+    if weight is not None:
+        check_shape(weight, "photometric: weight", tuple(prediction.shape[1:]))
+        weight = weight.detach().to(prediction.dtype).contiguous()
     library = _library_for((prediction, target))
     if library is None or prediction.numel() == 0:
         return losses.photometric(prediction, target, ssim_weight, weight)
@@ -57,10 +50,10 @@ def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, we
     gradient, status = torch.empty_like(image), ctypes.c_int(0)
     library.mudg_photometric.restype = ctypes.c_double
     value = library.mudg_photometric(
-        *map(_address, (image, wanted, weight)),
+        *map(address, (image, wanted, weight)),
         *map(ctypes.c_int, image.shape),
         ctypes.c_float(ssim_weight),
-        _address(gradient),
+        address(gradient),
         ctypes.byref(status),
     )
     if status.value != 0:
@@ -85,19 +78,12 @@ def class_loss(
     Raises:
         InputError: sizes differ, or there is no channel.
     """
-    size = logits.shape[1:]
-    if logits.ndim != 3 or not len(logits) or target.shape != size or weight.shape != size:
-        raise InputError(
-            "class loss: logits must be [C, H, W], target and weight [H, W]",
-            expected=str(tuple(size)),
-            got=str([tuple(t.shape) for t in (logits, target, weight)]),
-        )
-    if lift is not None and (lift[1].shape != size or not 0 <= lift[0] < len(logits)):
-        raise InputError(
-            "class loss: the lift must be of one channel and [H, W]",
-            expected=f"0..{len(logits) - 1}, {tuple(size)}",
-            got=f"{lift[0]}, {tuple(lift[1].shape)}",
-        )
+    check_shape(logits, "class loss: logits", (None, None, None))
+    planes = {"target": target, "weight": weight, "lift": weight if lift is None else lift[1]}
+    for name, plane in planes.items():
+        check_shape(plane, f"class loss: {name}", tuple(logits.shape[1:]))
+    if not 0 <= (0 if lift is None else lift[0]) < len(logits):
+        raise InputError("class loss: there is no such channel to lift", got=f"{lift} of {len(logits)} channels"[:80])
     library = _library_for((logits, weight))
     if library is None or logits.numel() == 0 or target.dtype != torch.int64:
         return losses.class_loss(logits, target, weight, total, lift)
@@ -106,12 +92,12 @@ def class_loss(
     gradient, status = torch.empty_like(values), ctypes.c_int(0)
     library.mudg_class_loss.restype = ctypes.c_double
     value = library.mudg_class_loss(
-        *map(_address, (values, ids, weight, added)),
+        *map(address, (values, ids, weight, added)),
         ctypes.c_int(channel),
         ctypes.c_int(len(values)),
         ctypes.c_int64(ids.numel()),
         ctypes.c_float(1.0 / float(total)),
-        _address(gradient),
+        address(gradient),
         ctypes.byref(status),
     )
     if status.value != 0:
@@ -131,11 +117,9 @@ def over(rgb: Tensor, alpha: Tensor, coarse: Tensor) -> Tensor:
     Raises:
         InputError: shapes do not fit.
     """
-    if rgb.ndim != 3 or coarse.ndim != 3 or len(rgb) != len(coarse) or alpha.shape != (1, *rgb.shape[1:]):
-        raise InputError(
-            "over: pictures must be [C, H, W] and [C, h, w], alpha [1, H, W]",
-            got=str([tuple(t.shape) for t in (rgb, coarse, alpha)]),
-        )
+    check_shape(rgb, "over: rgb", (None, None, None))
+    check_shape(coarse, "over: coarse", (len(rgb), None, None))
+    check_shape(alpha, "over: alpha", (1, *rgb.shape[1:]))
     library = _library_for((rgb, alpha, coarse))
     if library is None or rgb.numel() == 0 or coarse.numel() == 0:
         return torch_over(rgb, alpha, coarse)
@@ -220,7 +204,7 @@ def adam_columns(columns: Sequence[AdamColumn], step: int, chosen: Tensor | None
         table,
         ctypes.c_int(len(columns)),
         integer(rows),
-        ctypes.c_void_p(None if mask is None else mask.data_ptr()),
+        address(mask),
         real(BETA1),
         real(BETA2),
         real(EPSILON),
@@ -242,19 +226,14 @@ class _Column(ctypes.Structure):
 
 
 def _check_column(column: AdamColumn, first: Tensor, chosen: Tensor | None) -> None:
-    parameter = column.parameter
-    tensors = (parameter, column.gradient, column.moment1, column.moment2)
-    if any(t.shape != parameter.shape for t in tensors) or parameter.ndim == 0 or parameter.shape[0] != first.shape[0]:
-        raise InputError(
-            "adam: parameter, gradient and moments must share one shape [N, ...], all columns one N",
-            got=str([tuple(t.shape) for t in (*tensors, first)]),
-        )
-    if chosen is not None and (chosen.shape != parameter.shape[:1] or chosen.dtype != torch.bool):
-        raise InputError(
-            "adam: the chosen rows must be bool, one per row",
-            expected=f"bool[{parameter.shape[0]}]",
-            got=f"{chosen.dtype}{list(chosen.shape)}",
-        )
+    shape = tuple(column.parameter.shape)
+    check_shape(column.parameter, "adam: parameter", (*first.shape[:1], *shape[1:]))
+    for name in ("gradient", "moment1", "moment2"):
+        check_shape(getattr(column, name), f"adam: {name}", shape)
+    if chosen is not None:
+        check_shape(chosen, "adam: chosen rows", shape[:1])
+        if chosen.dtype != torch.bool:
+            raise InputError("adam: the chosen rows must be bool", got=str(chosen.dtype))
 
 
 class _WithGradient(torch.autograd.Function):
@@ -279,11 +258,7 @@ class _Over(torch.autograd.Function):
         picture, cover, small = (t.detach().contiguous() for t in (rgb, alpha, coarse))
         out = torch.empty_like(picture)
         ctx.library, ctx.sizes = library, (ctypes.c_int * 5)(*picture.shape, *small.shape[1:])
-        _done(
-            library.mudg_over(
-                *map(_address, (picture, cover, small)), ctx.sizes, *map(_address, (out, None, None, None))
-            )
-        )
+        _call_over(ctx, (picture, cover, small), (out, None, None, None))
         ctx.save_for_backward(cover, small)
         return out
 
@@ -292,12 +267,13 @@ class _Over(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         cover, small = ctx.saved_tensors
         of_alpha, of_coarse, gradient = torch.empty_like(cover), torch.empty_like(small), upstream.contiguous()
-        _done(
-            ctx.library.mudg_over(
-                *map(_address, (None, cover, small)), ctx.sizes, *map(_address, (None, gradient, of_alpha, of_coarse))
-            )
-        )
+        _call_over(ctx, (None, cover, small), (None, gradient, of_alpha, of_coarse))
         return upstream, of_alpha, of_coarse, None
+
+
+def _call_over(ctx: Any, given: tuple[Tensor | None, ...], rest: tuple[Tensor | None, ...]) -> None:
+    if ctx.library.mudg_over(*map(address, given), ctx.sizes, *map(address, rest)) != 0:
+        raise ResourceError("not enough memory to put a picture over the sky")
 
 
 class _BoxMean(torch.autograd.Function):
@@ -316,18 +292,14 @@ def _boxes(values: Tensor, radius: int, transposed: bool, library: ctypes.CDLL) 
     values = values.contiguous()
     out, (height, width) = torch.empty_like(values), values.shape[-2:]
     sizes = map(ctypes.c_int, (values.numel() // (height * width), height, width, radius, transposed))
-    if library.mudg_box_mean(_address(values), *sizes, _address(out)) != 0:
+    if library.mudg_box_mean(address(values), *sizes, address(out)) != 0:
         raise ResourceError("not enough memory for means over boxes of pixels")
     return out
 
 
-def _address(tensor: Tensor | None) -> ctypes.c_void_p:
+def address(tensor: Tensor | None) -> ctypes.c_void_p:
+    """Address of a contiguous tensor's first element, for the native library."""
     return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
-
-
-def _done(status: int) -> None:
-    if status != 0:
-        raise ResourceError("not enough memory to put a picture over the sky")
 
 
 def _library_for(tensors: tuple[Tensor, ...]) -> ctypes.CDLL | None:

@@ -57,11 +57,8 @@ class Schedule:
         if config.steps < 2:
             raise UsageError("a noise schedule needs at least two steps", expected=">= 2", got=str(config.steps))
         if not 0 < config.beta_start <= config.beta_end < 1:
-            raise UsageError(
-                "betas of the noise schedule are out of order",
-                expected="0 < beta_start <= beta_end < 1",
-                got=f"{config.beta_start}, {config.beta_end}",
-            )
+            what, expected = "betas of the noise schedule are out of order", "0 < beta_start <= beta_end < 1"
+            raise UsageError(what, expected=expected, got=f"{config.beta_start}, {config.beta_end}")
         self.config = config
         betas = np.linspace(math.sqrt(config.beta_start), math.sqrt(config.beta_end), config.steps) ** 2
         root = np.sqrt(np.cumprod(1.0 - betas))
@@ -268,10 +265,7 @@ def check_sampler(sampler: str, settings: Iterable[str] = ()) -> None:
     for name in settings:
         if name not in SAMPLER_SETTINGS[sampler]:
             takers = ", ".join(other for other, taken in SAMPLER_SETTINGS.items() if name in taken)
-            raise UsageError(
-                f"the sampler {sampler} does not take the setting {name}",
-                where=f"sampler {sampler}",
-                expected=f"{name} with {takers}" if takers else ", ".join(SAMPLER_SETTINGS[sampler]) or "no settings",
-                got=name,
-                remedy=f"leave {name} out, or choose a sampler that takes it",
-            )
+            what = f"the sampler {sampler} does not take the setting {name}"
+            expected = f"{name} with {takers}" if takers else ", ".join(SAMPLER_SETTINGS[sampler]) or "no settings"
+            remedy = f"leave {name} out, or choose a sampler that takes it"
+            raise UsageError(what, where=f"sampler {sampler}", expected=expected, got=name, remedy=remedy)

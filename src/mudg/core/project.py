@@ -25,10 +25,9 @@ from mudg import native
 from mudg.base import log
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import UNLABELLED
-from mudg.base.types import Camera, FusedCloud, PointCloud, Track, View
+from mudg.base.types import Camera, FusedCloud, PointCloud, Track, View, check_shape
 
 # zbuffer ------------------------------------------------------------------------------------------
-#
 # The z-buffer of points: the nearest point of every pixel, native or, operation for operation the same, in numpy.
 
 
@@ -68,29 +67,33 @@ def draw_points(
 
     Equal depths go to the lower index.
     """
-    keys = np.full((view.camera.height, view.camera.width), _EMPTY)
+    camera, first = view.camera, 0
+    keys = np.full((camera.height, camera.width), _EMPTY)
     library = native.library()
     if library is None:
         log.info_once(f"projecting points with numpy, slowly: {native.status()}")
-    first = 0
     for layer in layers:
-        if len(layer.xyz):
-            cam_from_points = (view.cam_from_world @ layer.world_from_points)[:3].astype(np.float32)
-            limit = max(limits.most_px, layer.splat_px)
-            arguments = (
-                np.ascontiguousarray(layer.xyz, np.float32),
-                first,
-                cam_from_points,
-                view.camera,
-                (layer.splat_px, limits.splat_m, limit),
-                (limits.near_m, limits.far_m),
-                keys,
+        if not len(layer.xyz):
+            continue
+        xyz = np.ascontiguousarray(layer.xyz, np.float32)
+        cam_from_points = np.ascontiguousarray((view.cam_from_world @ layer.world_from_points)[:3], np.float32)
+        splat = layer.splat_px, limits.splat_m, max(limits.most_px, layer.splat_px)
+        if library is None:
+            _draw_numpy(xyz, first, cam_from_points, camera, splat, (limits.near_m, limits.far_m), keys)
+        else:
+            intrinsics = np.array(camera.intrinsics, np.float32)
+            library.mudg_zbuffer_draw(
+                pointer(xyz),
+                ctypes.c_int64(len(xyz)),
+                ctypes.c_uint32(first),
+                pointer(cam_from_points),
+                pointer(intrinsics),
+                ctypes.c_int(camera.width),
+                ctypes.c_int(camera.height),
+                *map(ctypes.c_float, (*splat, limits.near_m, limits.far_m)),
+                pointer(keys),
             )
-            if library is None:
-                _draw_numpy(*arguments)
-            else:
-                _draw_native(library, *arguments)
-            first += len(layer.xyz)
+        first += len(xyz)
     if library is not None:
         depth, index = np.empty(keys.shape, np.float32), np.empty(keys.shape, np.int32)
         library.mudg_zbuffer_resolve(pointer(keys), ctypes.c_int64(keys.size), pointer(depth), pointer(index))
@@ -103,36 +106,6 @@ def draw_points(
 def pointer(array: NDArray[np.generic]) -> ctypes.c_void_p:
     """Address of an array's first element, for the native library."""
     return ctypes.c_void_p(array.ctypes.data)
-
-
-def _draw_native(
-    library: ctypes.CDLL,
-    xyz: NDArray[np.float32],
-    first: int,
-    cam_from_points: NDArray[np.float32],
-    camera: Camera,
-    splat: tuple[float, float, float],
-    limits_m: tuple[float, float],
-    keys: NDArray[np.uint64],
-) -> None:
-    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
-    matrix = np.ascontiguousarray(cam_from_points)
-    real = ctypes.c_float
-    library.mudg_zbuffer_draw(
-        pointer(xyz),
-        ctypes.c_int64(len(xyz)),
-        ctypes.c_uint32(first),
-        pointer(matrix),
-        pointer(intrinsics),
-        ctypes.c_int(camera.width),
-        ctypes.c_int(camera.height),
-        real(splat[0]),
-        real(splat[1]),
-        real(splat[2]),
-        real(limits_m[0]),
-        real(limits_m[1]),
-        pointer(keys),
-    )
 
 
 def _draw_numpy(
@@ -178,7 +151,6 @@ def _draw_numpy(
 
 
 # visible ------------------------------------------------------------------------------------------
-#
 # Which LiDAR points a camera sees: one z-buffer, one rule, and its settings for each use by name.
 #
 # A scanner stands elsewhere than the camera and sees past things that hide what lies behind them. A point is hidden if
@@ -268,10 +240,7 @@ def visible_depth(
     Raises:
         InputError: points have the wrong shape.
     """
-    if xyz_world.ndim != 2 or xyz_world.shape[1] != 3:
-        raise InputError(
-            "points have the wrong shape", where="visible_depth", expected="[N, 3]", got=str(xyz_world.shape)
-        )
+    check_shape(xyz_world, "visible_depth: points", (None, 3))
     layer = PointLayer(np.ascontiguousarray(xyz_world, np.float32), np.eye(4))
     depth, index = draw_points([layer], view, DrawLimits(near_m, far_m))
     depth[index < 0] = np.inf
@@ -387,8 +356,7 @@ def project_points(
         rgb: u8[N, 3], or None: colour stays 0.
         splat_px: side of the square of pixels that a point covers.
     """
-    if xyz.ndim != 2 or xyz.shape[1] != 3:
-        raise InputError("points have the wrong shape", expected="[N, 3]", got=str(xyz.shape))
+    check_shape(xyz, "project_points: points", (None, 3))
     config = ProjectConfig(static_splat_px=splat_px, near_m=near_m, far_m=far_m)
     return _draw([PointLayer(xyz, np.eye(4), splat_px)], None if rgb is None else [rgb], view, config)
 

@@ -19,9 +19,9 @@ from scipy import ndimage
 
 from mudg.base import geometry, palette
 from mudg.base.types import Track, View
+from mudg.core.pictures import resize_nearest
 
 # lane scores --------------------------------------------------------------------------------------
-#
 # How well road markings are where they should be: NTL-IoU from a detector's masks, and lane IoU and lane gradients from
 # the images.
 #
@@ -128,9 +128,7 @@ def _reduced(drawn: NDArray[np.uint8]) -> Mask:
 
 def at_lane_size(mask: NDArray[np.generic]) -> Mask:
     """A detector's mask ``[h, w]`` of any size as bool[360, 640], by the nearest pixel; what is not 0 is a lane."""
-    rows = ((np.arange(NTL_HEIGHT_PX) + 0.5) * mask.shape[0] / NTL_HEIGHT_PX).astype(int)
-    columns = ((np.arange(NTL_WIDTH_PX) + 0.5) * mask.shape[1] / NTL_WIDTH_PX).astype(int)
-    return np.asarray(mask)[rows][:, columns] != 0
+    return resize_nearest(np.asarray(mask), NTL_HEIGHT_PX, NTL_WIDTH_PX) != 0
 
 
 def ntl_iou(detected: Mask, true: Mask) -> float:

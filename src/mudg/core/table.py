@@ -61,12 +61,8 @@ class Table:
         rows = len(self)
         for name, value in {**self.columns, **self.labels}.items():
             if value.shape[:1] != (rows,):
-                raise InputError(
-                    "columns of a table differ in length",
-                    where=name,
-                    expected=f"{rows} rows",
-                    got=str(tuple(value.shape)),
-                )
+                what = "columns of a table differ in length"
+                raise InputError(what, where=name, expected=f"{rows} rows", got=str(tuple(value.shape)))
 
     # -- device ------------------------------------------------------------------------------------
 
@@ -101,11 +97,8 @@ class Table:
     def append(self, columns: Mapping[str, Tensor], labels: Mapping[str, Tensor]) -> None:
         """Add rows with zero moments. Every column and label of the table must be given."""
         if set(columns) != set(self.columns) or set(labels) != set(self.labels):
-            raise InputError(
-                "appended rows must fill every column",
-                expected=str(sorted(set(self.columns) | set(self.labels))),
-                got=str(sorted(set(columns) | set(labels))),
-            )
+            what, expected = "appended rows must fill every column", str(sorted(set(self.columns) | set(self.labels)))
+            raise InputError(what, expected=expected, got=str(sorted(set(columns) | set(labels))))
         fresh = {name: value.detach() for name, value in columns.items()}
         self.columns = {name: _leaf(torch.cat([value.detach(), fresh[name]])) for name, value in self.columns.items()}
         for moments in (self.moment1, self.moment2):
@@ -168,11 +161,8 @@ class Table:
         for key, value in flat.items():
             group, _, name = key.partition(".")
             if group == "partial":
-                raise InputError(
-                    "this scene's objects change colour over time, which is not supported any more",
-                    where=key,
-                    remedy="fit it again, or render it with the version that fitted it",
-                )
+                what = "this scene's objects change colour over time, which is not supported any more"
+                raise InputError(what, where=key, remedy="fit it again, or render it with the version that fitted it")
             if group not in groups or not name:
                 raise InputError("not a tensor of a parameter table", where=key)
             groups[group][name] = value

@@ -41,11 +41,9 @@ def ego_left_world(world_from_ego: NDArray[np.float64]) -> NDArray[np.float64]:
     left[2] = 0.0
     length = float(np.linalg.norm(left))
     if length < 1e-3:
-        raise InputError(
-            "the vehicle's left axis is vertical, so there is no lateral direction",
-            expected="ego poses with x forward, y left, z up",
-            got=f"left axis {world_from_ego[:3, 1].tolist()}",
-        )
+        what = "the vehicle's left axis is vertical, so there is no lateral direction"
+        expected = "ego poses with x forward, y left, z up"
+        raise InputError(what, expected=expected, got=f"left axis {world_from_ego[:3, 1].tolist()}")
     return left / length
 
 
@@ -159,11 +157,8 @@ def readout_poses(path: EgoPath, view: View) -> NDArray[np.float64]:
 
 def _frames(scene: Scene, camera: str) -> tuple:
     if camera not in scene.cameras:
-        raise UsageError(
-            f"the scene has no camera named {camera!r}",
-            where=f"scene {scene.id}",
-            expected=f"one of {', '.join(scene.cameras)}",
-        )
+        what = f"the scene has no camera named {camera!r}"
+        raise UsageError(what, where=f"scene {scene.id}", expected=f"one of {', '.join(scene.cameras)}")
     frames = tuple(scene.frames_of(camera))
     if not frames:
         raise UsageError(f"camera {camera!r} has no frames", where=f"scene {scene.id}")
@@ -178,9 +173,6 @@ def _ego_pose(path: EgoPath, view: View) -> NDArray[np.float64]:
     nearest = 0 if view.time_s < path.times_s[0] else -1
     if abs(path.times_s[nearest] - view.time_s) <= 0.2:
         return path.world_from_ego[nearest]
-    raise InputError(
-        "no ego pose at the time of a camera frame, so there is no left direction",
-        where=f"camera {view.camera.name}",
-        expected=f"a time within [{path.times_s[0]}, {path.times_s[-1]}] s",
-        got=f"{view.time_s} s",
-    )
+    what = "no ego pose at the time of a camera frame, so there is no left direction"
+    expected = f"a time within [{path.times_s[0]}, {path.times_s[-1]}] s"
+    raise InputError(what, where=f"camera {view.camera.name}", expected=expected, got=f"{view.time_s} s")

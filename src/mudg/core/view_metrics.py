@@ -1,74 +1,40 @@
 """Metrics of one view, or of neighbouring views, that need more than a true image: LiDAR points, exact boxes, markings
 and motion.
 
-``view_facts.ViewFacts`` is what is known of a view beside its true image. The metrics are accumulators as in
+``metrics.ViewFacts`` is what is known of a view beside its true image. The metrics are accumulators as in
 ``core/metrics.py``.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Final, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import ndimage
 from torch import Tensor
 
-from mudg.base import geometry
-from mudg.base.errors import InputError
-from mudg.base.types import Track
-from mudg.core import metrics as flicker
 from mudg.core import street_scores
 from mudg.core.lidar import PointTruth
-from mudg.core.metrics import CLASS_COUNT, FrameMean, Metric, Pair, confusion, depth_errors, iou_of, neighbour_of
+from mudg.core.metrics import (
+    ExactMotion,
+    Metric,
+    Neighbours,
+    Pair,
+    Pooled,
+    Segmentation,
+    change_of,
+    confusion,
+    depth_error,
+    depth_errors,
+    frame_mean,
+)
 from mudg.core.street_scores import agent_ious
-from mudg.core.weather.light import LUMA
-
-# edit scores --------------------------------------------------------------------------------------
-#
-# What an edit did to renders, where no truth of the edited drive exists: the edited render against the unedited one of
-# the same view.
-
-
-SAME: Final = 1.5 / 255
-"""Colours of 8 bits that differ by more than this differ by more than one step."""
-
-
-def changed_pixels(edited: Tensor, unedited: Tensor) -> NDArray[np.bool_]:
-    """Where colours f32[3, H, W] in [0, 1] differ by more than 1/255 in a channel, bool[H, W]."""
-    return ((edited - unedited).abs().amax(0) > SAME).numpy()
-
-
-def gradient_correlation(edited: Tensor, unedited: Tensor) -> float | None:
-    """Correlation of luminance gradients of two images f32[3, H, W]: [-1, 1], higher is better, 1 = every edge in its
-    place with the same relative strength; a change of brightness or contrast of the whole image leaves it at 1. None
-    where an image has no gradients.
-    """
-    pair = [_gradients(image.numpy()) for image in (edited, unedited)]
-    scale = math.sqrt(float((pair[0] ** 2).sum()) * float((pair[1] ** 2).sum()))
-    return float((pair[0] * pair[1]).sum()) / scale if scale > 0 else None
-
-
-def _gradients(rgb: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Sobel derivatives f64[2, H, W] of the brightness along columns and rows."""
-    luminance = np.tensordot(LUMA, rgb, 1)
-    return np.stack([ndimage.sobel(luminance, axis=axis, mode="nearest") for axis in (1, 0)])
-
-
-def mask_counts(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> tuple[int, int]:
-    """Pixels in both masks bool[H, W], and in either: intersection over union, to be pooled over views."""
-    return int((a & b).sum()), int((a | b).sum())
-
-
-# view metrics -------------------------------------------------------------------------------------
-
 
 POINT_PARTS: Final = ("", "static", "dynamic")
-PointField = Literal["abs_rel", "rmse_m", "delta1"]
 
 
 # ---- LiDAR points --------------------------------------------------------------------------------
@@ -77,31 +43,6 @@ PointField = Literal["abs_rel", "rmse_m", "delta1"]
 def _chosen(points: PointTruth, part: str) -> NDArray[np.bool_]:
     known = points.depth > 0
     return known & (points.dynamic if part == "dynamic" else ~points.dynamic) if part else known
-
-
-class PointDepth:
-    """Depth errors at the pixels that show a LiDAR point, pooled.
-
-    Args:
-        field: which error. part: all points, or the static or dynamic ones.
-    """
-
-    def __init__(self, field: PointField, part: str = "") -> None:
-        self._field, self._part = field, part
-        self.source = _POINT_DEPTHS[part]
-        self._sum, self._pixels = 0.0, 0
-
-    def add(self, measured: Any) -> None:
-        """Add the errors of one view."""
-        if measured is not None and measured.pixels:
-            number = {"abs_rel": measured.abs_rel, "rmse_m": measured.rmse_m**2, "delta1": measured.delta1}[self._field]
-            self._sum += number * measured.pixels
-            self._pixels += measured.pixels
-
-    def value(self) -> float | None:
-        """The error over all points so far, or None without any."""
-        mean = self._sum / self._pixels if self._pixels else None
-        return math.sqrt(mean) if mean is not None and self._field == "rmse_m" else mean
 
 
 def _point_depth(part: str) -> Callable[[Pair], Any]:
@@ -122,22 +63,9 @@ def _allowed(chosen: Tensor, mask: Tensor | None) -> Tensor:
 _POINT_DEPTHS: Final = {part: _point_depth(part) for part in POINT_PARTS}
 
 
-class Decibels:
-    """PSNR from squared errors pooled over all views: ``source`` gives their sum and number."""
-
-    def __init__(self, source: Callable[[Pair], tuple[float, int] | None]) -> None:
-        self.source = source
-        self._sum, self._count = 0.0, 0
-
-    def add(self, measured: tuple[float, int] | None) -> None:
-        """Add the squared errors of one view."""
-        if measured is not None:
-            self._sum += measured[0]
-            self._count += measured[1]
-
-    def value(self) -> float | None:
-        """dB, at most 100; None where nothing counted."""
-        return min(100.0, -10 * math.log10(max(self._sum / self._count, 1e-12))) if self._count else None
+def decibels(source: Callable[[Pair], tuple[float, int] | None]) -> Pooled:
+    """PSNR, at most 100 dB, from squared errors pooled over all views: ``source`` gives their sum and number."""
+    return Pooled(source, finish=lambda mean: min(100.0, -10 * math.log10(max(mean, 1e-12))))
 
 
 def _point_color(part: str) -> Callable[[Pair], tuple[float, int] | None]:
@@ -154,24 +82,6 @@ def _point_color(part: str) -> Callable[[Pair], tuple[float, int] | None]:
 
 
 _POINT_COLORS: Final = {part: _point_color(part) for part in POINT_PARTS}
-
-
-class Agreement:
-    """Mean IoU of a method's classes with those that LiDAR points carry from the recorded image."""
-
-    def __init__(self) -> None:
-        self.source = _carried_classes
-        self._counts = torch.zeros(CLASS_COUNT, CLASS_COUNT + 1, dtype=torch.int64)
-
-    def add(self, measured: Tensor | None) -> None:
-        """Add the confusion counts of one view."""
-        if measured is not None:
-            self._counts += measured
-
-    def value(self) -> float | None:
-        """Mean over the classes that occur, or None."""
-        ious = iou_of(self._counts)
-        return sum(ious.values()) / len(ious) if ious else None
 
 
 def _carried_classes(pair: Pair) -> Tensor | None:
@@ -206,16 +116,6 @@ def _agents_of(pair: Pair) -> list[float] | None:
     return None if agents is None or pair.semantics is None else agent_ious(agents, pair.semantics.numpy())
 
 
-@dataclass(frozen=True)
-class LaneCounts:
-    """Tolerant hits and union of markings, and the same of the rest of the road, in pixels."""
-
-    hits: float
-    union: float
-    rest_hits: float
-    rest_union: float
-
-
 class LaneIou:
     """IoU of the markings that a fixed rule finds with the exact ones, both on the true road within 40 m, 2 pixels of
     tolerance, pooled."""
@@ -224,10 +124,10 @@ class LaneIou:
         self.source = _lanes_of
         self._sums = np.zeros(4)
 
-    def add(self, measured: LaneCounts | None) -> None:
+    def add(self, measured: NDArray[np.float64] | None) -> None:
         """Add one view."""
         if measured is not None:
-            self._sums += (measured.hits, measured.union, measured.rest_hits, measured.rest_union)
+            self._sums += measured
 
     def value(self) -> float | None:
         """[0, 1], or None where no marking was to be seen or found."""
@@ -240,14 +140,15 @@ class LaneIou:
         return 50.0 * float(self._sums[0] / self._sums[1] + self._sums[2] / self._sums[3])
 
 
-def _lanes_of(pair: Pair) -> LaneCounts | None:
+def _lanes_of(pair: Pair) -> NDArray[np.float64] | None:
+    """Tolerant hits and union of markings, and the same of the rest of the road, f64[4] in pixels."""
     lanes = None if pair.facts is None else pair.facts.lanes
     if lanes is None or pair.rgb is None or not lanes.exact:
         return None
     found = street_scores.bright_stripes(pair.rgb.numpy(), lanes.road)
-    hits, union = street_scores.tolerant_iou(found, lanes.marking)
     rest, true_rest = lanes.road & ~found, lanes.road & ~lanes.marking
-    return LaneCounts(hits, union, float((rest & true_rest).sum()), float((rest | true_rest).sum()))
+    markings = street_scores.tolerant_iou(found, lanes.marking)
+    return np.array([*markings, (rest & true_rest).sum(), (rest | true_rest).sum()], np.float64)
 
 
 def _lane_edges(pair: Pair) -> float | None:
@@ -272,137 +173,63 @@ def _lane_colors(pair: Pair) -> tuple[float, int] | None:
 # ---- neighbouring views --------------------------------------------------------------------------
 
 
-class TemporalFlickering:
+def temporal_flickering() -> Neighbours:
     """(255 - mean |frame - next frame|) / 255 on 8 bits, mean over neighbouring frames: VBench's measure, meant for
     videos that stand still. A moving camera lowers it, also that of the truth; a blurred video has a high one."""
+    return Neighbours(_bytes_of, _steadiness)
 
-    def __init__(self) -> None:
-        self.source = _bytes_of
-        self._before: Tensor | None = None
-        self._sum, self._pairs = 0.0, 0
 
-    def add(self, measured: Tensor | None) -> None:
-        """Add the next frame."""
-        before, self._before = self._before, measured
-        if before is not None and measured is not None and before.shape == measured.shape:
-            total = sum(int((a.short() - b).abs().sum()) for a, b in zip(before, measured, strict=True))
-            self._sum += (255.0 - total / measured.numel()) / 255.0
-            self._pairs += 1
-
-    def value(self) -> float | None:
-        """(0, 1], 1 = all frames are equal; None with fewer than two."""
-        return self._sum / self._pairs if self._pairs else None
+def _steadiness(frames: tuple[Tensor, Tensor]) -> tuple[float, int]:
+    before, frame = frames
+    if before.shape != frame.shape:
+        return 0.0, 0
+    total = sum(int((a.short() - b).abs().sum()) for a, b in zip(before, frame, strict=True))
+    return (255.0 - total / frame.numel()) / 255.0, 1
 
 
 def _bytes_of(pair: Pair) -> Tensor | None:
     return None if pair.rgb is None else torch.stack([(c.clamp(0, 1) * 255).round().byte() for c in pair.rgb])
 
 
-class ExactMotion:
-    """Where surfaces of one view are in the next: by true depth and poses, vehicles by their boxes. The last answer is
-    kept.
-
-    Args:
-        tracks: number in the instance map and track of every vehicle.
-    """
-
-    def __init__(self, tracks: Sequence[tuple[int, Track]]) -> None:
-        self._tracks = tracks
-        self._known: tuple[Tensor, Tensor, flicker.PixelMotion] | None = None
-
-    def between(self, before: Pair, pair: Pair) -> flicker.PixelMotion | None:
-        """For two neighbouring views with exact depth, classes and instances; else None."""
-        if before.truth_depth is None or pair.truth_depth is None or before.view is None or pair.view is None:
-            return None
-        known = self._known
-        if known is not None and known[0] is before.truth_depth and known[1] is pair.truth_depth:
-            return known[2]
-        ids, instance = before.truth_semantics, None if before.facts is None else before.facts.instance
-        if ids is None or pair.truth_semantics is None:
-            return None
-        frames = [_true_frame(p) for p in (before, pair)]
-        moved: dict[int, Tensor] = {}
-        if instance is not None:
-            for number, track in self._tracks:
-                first, last = track.pose_at(before.view.time_s), track.pose_at(pair.view.time_s)
-                if first is not None and last is not None:
-                    moved[number] = torch.from_numpy(last @ geometry.invert(first))
-        numbers = None if instance is None else torch.from_numpy(instance.astype(np.int64))
-        motion = flicker.pixel_motion(frames[0], frames[1], moved, numbers)
-        self._known = before.truth_depth, pair.truth_depth, motion
-        return motion
-
-
-def _true_frame(pair: Pair) -> flicker.TrueFrame:
-    depth, ids, view = pair.truth_depth, pair.truth_semantics, pair.view
-    if depth is None or ids is None or view is None:
-        raise InputError("exact motion needs depth, classes and the view")
-    return flicker.TrueFrame.of(view, torch.where(torch.isfinite(depth) & (depth > 0), depth, 1000.0), ids)
-
-
-class WarpError:
+def warp_error(motion: ExactMotion) -> Neighbours:
     """Mean absolute difference of colour, of 1, between a surface in one frame and the same surface in the next,
-    pooled. Surfaces are followed by exact motion; those that are hidden in either frame do not count.
-
-    Args:
-        motion: shared by the methods on a trajectory.
-    """
-
-    def __init__(self, motion: ExactMotion) -> None:
-        self.source = neighbour_of
-        self._motion = motion
-        self._before: Pair | None = None
-        self._sum, self._pixels = 0.0, 0
-
-    def add(self, measured: Pair) -> None:
-        """Add the next frame."""
-        before, self._before = self._before, measured
-        if before is None or before.rgb is None or measured.rgb is None:
-            return
-        motion = self._motion.between(before, measured)
-        if motion is not None:
-            self._sum += flicker.change(before.rgb.clamp(0, 1), measured.rgb.clamp(0, 1), motion)
-            self._pixels += int(motion.same.sum())
-
-    def value(self) -> float | None:
-        """[0, 1], or None without two frames that show the same surface."""
-        return self._sum / self._pixels if self._pixels else None
+    pooled; surfaces that are hidden in either frame do not count. motion: shared by the methods on a trajectory."""
+    return change_of(motion, lambda _before, _pair, where: int(where.same.sum()))
 
 
 # ---- the table -----------------------------------------------------------------------------------
 
 EVERY_VIEW: Final = ("temporal_flickering", "warp_error")
 """Metrics that want all views of a trajectory, in order."""
+
+
+def _at_points(part: str) -> dict[str, Callable[[], Metric]]:
+    """What is computed at LiDAR points: all, or the static or dynamic ones."""
+    fields: tuple[Literal["abs_rel", "rmse_m", "delta1"], ...] = ("abs_rel", "rmse_m", "delta1")
+    errors = {f"lidar_{field}": partial(depth_error, field, _POINT_DEPTHS[part]) for field in fields}
+    return {**errors, "lidar_psnr": partial(decibels, _POINT_COLORS[part])}
+
+
 FACTS: Final[Mapping[str, Callable[[], Metric]]] = {
-    "lidar_abs_rel": lambda: PointDepth("abs_rel"),
-    "lidar_rmse_m": lambda: PointDepth("rmse_m"),
-    "lidar_delta1": lambda: PointDepth("delta1"),
-    "lidar_psnr": lambda: Decibels(_POINT_COLORS[""]),
-    "agreement": Agreement,
+    **_at_points(""),
+    "agreement": lambda: Segmentation("miou", _carried_classes),
     "agent_iou": AgentIou,
     "lane_iou": LaneIou,
-    "lane_correlation": lambda: FrameMean(_lane_edges),
-    "lane_psnr": lambda: Decibels(_lane_colors),
-    "temporal_flickering": TemporalFlickering,
+    "lane_correlation": lambda: frame_mean(_lane_edges),
+    "lane_psnr": lambda: decibels(_lane_colors),
+    "temporal_flickering": temporal_flickering,
 }
 """Rows of ``metrics.METRICS`` that are computed from ``ViewFacts`` or from neighbouring views; the warp error needs a
 motion besides."""
 PARTS: Final[Mapping[str, Callable[[], Metric]]] = {
-    f"{name}_{part}": build
-    for part in ("static", "dynamic")
-    for name, build in (
-        ("lidar_abs_rel", lambda part=part: PointDepth("abs_rel", part)),
-        ("lidar_rmse_m", lambda part=part: PointDepth("rmse_m", part)),
-        ("lidar_delta1", lambda part=part: PointDepth("delta1", part)),
-        ("lidar_psnr", lambda part=part: Decibels(_POINT_COLORS[part])),
-    )
+    f"{name}_{part}": build for part in ("static", "dynamic") for name, build in _at_points(part).items()
 }
 """The same for static points and for points of dynamic objects; beside the table, in ``points`` of a result."""
 
 
 def build_facts(motion: ExactMotion) -> dict[str, Metric]:
     """A fresh accumulator for every row of ``FACTS`` and ``PARTS``, and for the warp error."""
-    return {**{name: build() for name, build in (*FACTS.items(), *PARTS.items())}, "warp_error": WarpError(motion)}
+    return {**{name: build() for name, build in (*FACTS.items(), *PARTS.items())}, "warp_error": warp_error(motion)}
 
 
 def details(metrics: Mapping[str, Metric]) -> dict[str, Any]:

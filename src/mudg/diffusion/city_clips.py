@@ -277,7 +277,8 @@ def record_with_faults(config: CityConfig, sensors: SensorFaults, used: Sequence
 
 
 def _photos(world: CityWorld, sensors: SensorFaults, errors: NDArray[np.float64], name: str, key: int) -> list[Photo]:
-    faults, look, photos = sensors.faults_of(name), sensors.look_of(name), []
+    faults, look = sensors.cameras.get(name, CameraFaults()), sensors.looks.get(name, CameraLook())
+    photos = []
     for index, view in enumerate(world.frame_views(name)):
         truth = world.render_rolling(view, faults.readout_s) if faults.readout_s else world.render(view)
         image = recorded(with_look(truth.rgb, look, view.time_s), faults, seeds.key(key, index, f"image {name}"))

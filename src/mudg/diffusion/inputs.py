@@ -47,7 +47,7 @@ class InWeather:
         """Colours f32[3,H,W] in this weather, from depth f32[1,H,W] and classes u8[1,H,W]; sky has no depth."""
         metres = torch.where(ids == SKY, torch.zeros_like(depth), depth)[0].numpy().astype(np.float32)
         shown = ShownView(view, rgb.permute(1, 2, 0).numpy(), metres, ids[0].numpy())
-        made, _ = weather.edited_view(shown, self.settings, self.seed, self.drive, self.velocity_at(view.time_s))
+        made = weather.edited_view(shown, self.settings, self.seed, self.drive, self.velocity_at(view.time_s))
         return torch.from_numpy(np.ascontiguousarray(made.transpose(2, 0, 1), np.float32)).clamp(0, 1)
 
 

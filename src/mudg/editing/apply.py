@@ -37,7 +37,6 @@ from mudg.core.edit import HeightMap, Motion
 from mudg.core.harmonics import left_product_matrix
 from mudg.core.table import Table
 from mudg.core.weather import ShownView, drive_facts, edited_view
-from mudg.core.weather.light import curve_of
 from mudg.diffusion.inputs import InWeather
 from mudg.editing import model as edited
 from mudg.editing import plan as plans
@@ -623,7 +622,7 @@ def weather_of(draw: Drawer, conditions: Conditions, scene: Scene) -> InWeather:
     witnesses = [_shown(draw(frames[int(index)].view)) for index in chosen]
     poses = scene.ego.world_from_ego
     path = np.column_stack([poses[:, 0, 3], poses[:, 1, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])])  # x, y, yaw
-    drive = drive_facts(witnesses, curve_of(conditions.response), path)
+    drive = drive_facts(witnesses, path)
     return InWeather(conditions, drive, SEED, functools.partial(trajectory.velocity, scene.ego))
 
 
@@ -633,7 +632,7 @@ def in_weather(draw: Drawer, how: InWeather) -> Drawer:
 
     def drawn(view: View) -> Observation:
         seen = draw(view)
-        rgb, _ = edited_view(_shown(seen), how.settings, how.seed, how.drive, how.velocity_at(view.time_s))
+        rgb = edited_view(_shown(seen), how.settings, how.seed, how.drive, how.velocity_at(view.time_s))
         return replace(seen, rgb=torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1), np.float32)).clamp(0, 1))
 
     return drawn

@@ -15,7 +15,7 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from mudg.base import store
 from mudg.base.errors import InputError, nearest, short
-from mudg.base.plain_yaml import Lines, parse_with_lines
+from mudg.base.plain_yaml import Lines, parse_yaml
 from mudg.base.records import Number, StrictRecord, after, checked_by, first_problem, place
 from mudg.base.weather_settings import Conditions, LightSettings, SeasonSettings, WeatherSettings
 
@@ -372,7 +372,8 @@ def read_edits(path: Path | str) -> EditScript:
 
 def parse_edits(text: str | bytes, where: str, folder: Path = Path()) -> EditScript:
     """Check a script. ``where``: name of the file for messages. ``folder``: what its paths are relative to."""
-    entries, lines = parse_with_lines(text, where)
+    lines: Lines = {}
+    entries = parse_yaml(text, where, lines=lines)
     if not isinstance(entries, list) or not entries:
         got = "nothing" if entries in (None, []) else type(entries).__name__
         expected = "lines such as `- remove: {ids: [car-003]}`"

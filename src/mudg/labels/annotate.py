@@ -35,7 +35,7 @@ from mudg.core.pictures import class_colors, depth_colors, gray, resize_area
 from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import visible_depth
 from mudg.labels import street_net
-from mudg.labels.by_geometry import RULES, label_by_geometry, label_by_network
+from mudg.labels.by_geometry import label_by_geometry, label_by_network
 from mudg.labels.depth_networks import align_to_lidar, enough_returns, kind_of, load_depth_network
 from mudg.labels.ground import driven_path
 from mudg.labels.inputs import DepthInput, DepthNetwork, LabelInput, Labeller, Labels
@@ -128,7 +128,7 @@ def with_network(network: DepthNetwork, inputs: LabelInput, labels: Labels, fram
     asked = DepthInput(inputs.rgb, measured, labels.depth, labels.sky)
     reason = "too few LiDAR returns"
     if enough_returns(asked):
-        dense, fit = align_to_lidar(network(asked), asked, RULES)
+        dense, fit = align_to_lidar(network(asked), asked)
         if dense is not None:
             return replace(labels, depth=dense.depth, depth_confidence=dense.confidence)
         reason = "the network's depth does not increase with the LiDAR's"

@@ -24,7 +24,7 @@ from scipy import ndimage
 
 from mudg.base.palette import ID, UNLABELLED
 from mudg.base.types import View
-from mudg.core.depth import CompletionRules, beyond_reach, complete_depth, ray_elevation
+from mudg.core.depth import SKY_M, beyond_reach, complete_depth, ray_elevation
 from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import visible_depth
 from mudg.labels.ground import above_plane, beside_path, map_ground
@@ -40,7 +40,6 @@ LANE_M: Final = 2.5
 """Nearer to the path than this, ground beyond a step is still road: the step is an error."""
 NEAR_ROAD_M: Final = 4.0
 """Nearer to the path than this, flat ground is almost surely road."""
-RULES: Final = CompletionRules()
 GRASS: Final = 6.0
 """Ground greener than this (``greenness_of``) is terrain."""
 _THIN: Final = (ID["person"], ID["rider"], ID["bicycle"], ID["motorcycle"])
@@ -98,8 +97,8 @@ def label_by_network(inputs: LabelInput, semantics: Bytes, confidence: Floats) -
 
 def _with_surface(inputs: LabelInput, semantics: Bytes, confidence: Floats, sky: Mask, surface: _Surface) -> Labels:
     depth, depth_confidence = surface.depth.copy(), surface.confidence.copy()
-    depth[sky] = RULES.sky_m
-    painted_over = ~sky & (depth == RULES.sky_m)  # a box before the sky that nothing measured
+    depth[sky] = SKY_M
+    painted_over = ~sky & (depth == SKY_M)  # a box before the sky that nothing measured
     depth_confidence[painted_over] = 0
     return Labels(semantics, confidence, sky, find_dynamic(inputs, semantics, surface), depth, depth_confidence)
 
@@ -119,7 +118,7 @@ def _complete(inputs: LabelInput, measured: _Measured, sky: Mask) -> _Surface:
         outline = box.outline(inputs.view, 0.0)
         if outline is not None:
             beyond &= ~outline
-    dense = complete_depth(inputs.rgb, measured.depth_m, sky, beyond, RULES)
+    dense = complete_depth(inputs.rgb, measured.depth_m, sky, beyond)
     return _Surface(surface_points(inputs.view, dense.depth), dense.depth, dense.confidence)
 
 

@@ -27,7 +27,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from mudg.base.errors import InputError, ResourceError
-from mudg.core.depth import MIN_POINTS, AffineFit, CompletionRules, DenseDepth, Space, fit_affine
+from mudg.core.depth import FAR_M, MIN_POINTS, NEAR_M, SKY_M, AffineFit, DenseDepth, Space, fit_affine
 from mudg.core.pictures import resize_bicubic
 from mudg.labels.depthlab import DepthLab
 from mudg.labels.inputs import DepthInput, DepthNetwork, Prediction
@@ -180,10 +180,8 @@ def load_depth_network(folder: str | Path, compute: Compute = CPU, steps: int = 
 # --- alignment to LiDAR, for every network --------------------------------------------------------
 
 
-def align_to_lidar(
-    prediction: Prediction, inputs: DepthInput, rules: CompletionRules
-) -> tuple[DenseDepth | None, AffineFit]:
-    """A network's depth brought to the frame's LiDAR: one scale and shift, the sky at ``rules.sky_m``, a confidence;
+def align_to_lidar(prediction: Prediction, inputs: DepthInput) -> tuple[DenseDepth | None, AffineFit]:
+    """A network's depth brought to the frame's LiDAR: one scale and shift, the sky at ``SKY_M``, a confidence;
     and the fit. None where the fit is not to be believed.
 
     Raises:
@@ -197,11 +195,9 @@ def align_to_lidar(
     fit = fit_affine(torch.from_numpy(values), torch.from_numpy(measured), prediction.space)
     if not fit.used:
         return None, fit
-    depth = fit.depth(torch.from_numpy(prediction.values).double(), rules.near_m, rules.far_m).float().numpy()
-    confidence = residual_confidence(
-        depth, np.where(known, inputs.measured, np.float32(np.nan)), inputs.sky, rules.sky_m
-    )
-    depth[inputs.sky] = rules.sky_m
+    depth = fit.depth(torch.from_numpy(prediction.values).double(), NEAR_M, FAR_M).float().numpy()
+    confidence = residual_confidence(depth, np.where(known, inputs.measured, np.float32(np.nan)), inputs.sky, SKY_M)
+    depth[inputs.sky] = SKY_M
     return DenseDepth(depth, confidence), fit
 
 

@@ -62,7 +62,7 @@ class LabelInput:
 @dataclass(frozen=True, slots=True, eq=False)
 class Labels:
     """``semantics`` u8[H, W] train ids, 255 = cannot tell; ``confidence`` f32[H, W] in 0..1; ``sky`` and ``dynamic``
-    bool[H, W]; ``depth`` f32[H, W] metres, the sky at ``CompletionRules.sky_m``, NaN = unknown; ``depth_confidence``
+    bool[H, W]; ``depth`` f32[H, W] metres, the sky at ``core.depth.SKY_M``, NaN = unknown; ``depth_confidence``
     f32[H, W] in 0..1."""
 
     semantics: NDArray[np.uint8]

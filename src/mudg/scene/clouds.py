@@ -21,7 +21,6 @@ from mudg.base.geometry import invert
 from mudg.base.types import EgoPath, FusedCloud, PointCloud, SweepPoints
 
 # returns ------------------------------------------------------------------------------------------
-#
 # Beams without a return. Sensors and drivers write them among the points: as (0, 0, 0), as NaN, or with a range of
 # zero.
 #

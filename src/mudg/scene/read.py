@@ -23,7 +23,6 @@ from mudg.scene import schema
 from mudg.scene.schema import parse_object, ref_problem
 
 # files --------------------------------------------------------------------------------------------
-#
 # Nothing outside the scene can be reached: references are checked as text, and on disk as real paths. What this package
 # wrote carries a manifest of sha256 sums, and every file read is compared with it: a flipped bit is an error, not a
 # point somewhere else.

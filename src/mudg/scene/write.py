@@ -347,7 +347,6 @@ def write_photos(
 
 
 # a part of a scene, for measurements on held-out frames ---------------------------------------------------------------
-#
 # What is held out is not in the files: an image is replaced by a black one, labels and sweeps are left out, and so are
 # the classes of LiDAR points, which are truth that is scored, and the recipe by which a generated city could be drawn
 # again. Whatever reads the part cannot have seen more.

@@ -198,7 +198,7 @@ def _score(
 ) -> list[dict[str, Any]]:
     """Score all methods on one trajectory; writes its truth, its baseline and its error picture."""
     names = [*([BASELINE] if reference.baseline is not None else []), *trajectory.sets]
-    motion, exact_motion = metrics.StaticMotion(), view_metrics.ExactMotion(reference.vehicles)
+    motion, exact_motion = metrics.ExactMotion(), metrics.ExactMotion(reference.vehicles)
     build = lambda: metrics.build_all(reference.distances, motion, view_metrics.build_facts(exact_motion))
     sums = {name: build() for name in names} | {TRUTH: view_metrics.build_facts(exact_motion)}
     counted = trajectory.counted(reference.held_out)

@@ -42,7 +42,6 @@ FEWEST: Final = 2
 BLOCK_FRAMES: Final = 8
 """Neighbouring frames that the error of KID takes as one draw."""
 FEWEST_BLOCKS: Final = 4
-FEWEST_TO_EXTRAPOLATE: Final = 1000
 _BATCH: Final = 8
 
 
@@ -83,19 +82,6 @@ class TrajectorySets:
     height: int
     methods: Mapping[str, ImageSet]
     truth: ImageSet | None
-
-
-@dataclass(frozen=True)
-class SetDistances:
-    """FID and KID of ``n`` images against ``n_reference``, and what stands beside them."""
-
-    n: int
-    n_reference: int
-    fid: float
-    kid: float
-    kid_standard_error: float | None
-    mind: float
-    fid_at_infinity: float | None
 
 
 @dataclass
@@ -281,25 +267,25 @@ def distributions(scene: Scene, files: FeatureFiles) -> SetComparison:
     }
 
     def entry(generated: Rows, reference: Rows) -> Entry:
-        of = vars(distances(generated, reference)).items()
+        of = distances(generated, reference).items()
         rounded = {name: None if value is None else round(value, 6) for name, value in of}
         return {"values": {name: rounded.pop(name) for name in ("fid", "kid")}, **rounded}
 
     return SetComparison(scene, files, entry, facts)
 
 
-def distances(generated: NDArray[np.float32], reference: NDArray[np.float32]) -> SetDistances:
-    """All distances of two sets of features ``[n, d]``, at least two rows each; rows in order of time."""
+def distances(generated: NDArray[np.float32], reference: NDArray[np.float32]) -> dict[str, float | None]:
+    """FID and KID of two sets of features ``[n, d]``, at least two rows each, rows in order of time; ``n`` and
+    ``n_reference`` rows, and from enough of them on the standard error of KID."""
     blocks = tuple(np.arange(len(rows)) // BLOCK_FRAMES for rows in (generated, reference))
-    error, at_infinity, rng = None, None, lambda purpose: seeds.numpy_rng(0, 0, purpose)
+    error = None
     if all(len(set(numbers.tolist())) >= FEWEST_BLOCKS for numbers in blocks):
-        error = feature_distances.kernel_distance_error(generated, reference, blocks, rng("blocks of KID"))
-    if min(len(generated), len(reference)) >= FEWEST_TO_EXTRAPOLATE:
-        at_infinity = feature_distances.frechet_at_infinity(generated, reference, rng("sizes of FID"))
-    measures = feature_distances.frechet_distance, feature_distances.kernel_distance
-    fid, kid = (measure(generated, reference) for measure in measures)
-    mind = feature_distances.mind_distance(generated, reference, rng("directions of MIND"))
-    return SetDistances(len(generated), len(reference), fid, kid, error, mind, at_infinity)
+        rng = seeds.numpy_rng(0, 0, "blocks of KID")
+        error = feature_distances.kernel_distance_error(generated, reference, blocks, rng)
+    fid = feature_distances.frechet_distance(generated, reference)
+    kid = feature_distances.kernel_distance(generated, reference)
+    counts = {"n": len(generated), "n_reference": len(reference)}
+    return {**counts, "fid": fid, "kid": kid, "kid_standard_error": error}
 
 
 # -- videos ----------------------------------------------------------------------------------------

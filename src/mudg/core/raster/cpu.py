@@ -170,12 +170,9 @@ def render(request: Request) -> Render:
     gaussians = request.gaussians
     _library()
     if gaussians.means.dtype != torch.float32 or gaussians.means.device.type != "cpu":
-        raise InputError(
-            "the native rasteriser works on float32 CPU tensors",
-            where="gaussians.means",
-            expected="torch.float32 on cpu",
-            got=f"{gaussians.means.dtype} on {gaussians.means.device}",
-        )
+        what = "the native rasteriser works on float32 CPU tensors"
+        got = f"{gaussians.means.dtype} on {gaussians.means.device}"
+        raise InputError(what, where="gaussians.means", expected="torch.float32 on cpu", got=got)
     tensors = (*(getattr(gaussians, name) for name in _PARTS), *request.backgrounds, *request.poses)
     keeps_graph = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
     means2d, leaves = trace_leaves(request, gaussians.means, keeps_graph)
@@ -327,12 +324,9 @@ def _raise(status: int, context: _Context, parts: list[Tensor | None] | tuple[Te
         found = _statistics(context.library, context.handle)
         row = int(found["first_not_finite"])
         bad = [n for n, t in zip(_PARTS, parts, strict=True) if t is not None and not torch.isfinite(t[row]).all()]
-        raise NumericsError(
-            "a Gaussian is not finite",
-            where=f"Gaussian {row}: {', '.join(bad) or 'its colour overflows'}",
-            got=f"{int(found['not_finite'])} such Gaussians",
-            remedy="a loss or an optimiser step went wrong earlier; lower the learning rate or check the data",
-        )
+        what, where = "a Gaussian is not finite", f"Gaussian {row}: {', '.join(bad) or 'its colour overflows'}"
+        remedy = "a loss or an optimiser step went wrong earlier; lower the learning rate or check the data"
+        raise NumericsError(what, where=where, got=f"{int(found['not_finite'])} such Gaussians", remedy=remedy)
     what = {1: "the rasteriser ran out of memory", 2: "too many Gaussian-tile pairs for one image"}[status]
     raise ResourceError(what, remedy="use fewer or smaller Gaussians, or a smaller image")
 

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from mudg.base import log
-from mudg.base.errors import InputError, NumericsError, ResourceError, UsageError
+from mudg.base.errors import InputError, NumericsError, ResourceError
 from mudg.base.types import Gaussians, RasterTrace, Render
 from mudg.core.raster import torch_twin
 from mudg.core.raster.request import Request, harmonics
@@ -107,11 +107,8 @@ def load() -> ModuleType:
     """
     reason = problem()
     if reason:
-        raise ResourceError(
-            "raster backend 'gsplat' is not available",
-            got=reason,
-            remedy="see docs/gsplat.md; pip install 'mudg[gsplat]'",
-        )
+        what = "raster backend 'gsplat' is not available"
+        raise ResourceError(what, got=reason, remedy="see docs/gsplat.md; pip install 'mudg[gsplat]'")
     return importlib.import_module("gsplat")
 
 
@@ -127,39 +124,42 @@ _LARGEST_PX: Final = 1e9
 
 @dataclass(frozen=True, slots=True)
 class _Cameras:
-    """The views relative to ``origin`` [3]: viewmats [V, 4, 4] (cam from world; with a rolling shutter when the first
-    row is read, and ``last`` when the last one is), centers [V, 3], optical axes ``forward`` [V, 3], intrinsics [V, 3,
-    3]."""
+    """The views relative to ``origin`` [3]: viewmats [V, 4, 4] (cam from world), centers [V, 3], optical axes
+    ``forward`` [V, 3], intrinsics [V, 3, 3]."""
 
     origin: Tensor
     viewmats: Tensor
-    last: Tensor | None
     centers: Tensor
     forward: Tensor
     intrinsics: Tensor
 
 
-@dataclass(frozen=True, slots=True)
-class _Splats:
-    """What gsplat receives of the Gaussians; channels [V, N, 3 + features + 1]: colour, features, depth."""
-
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacity: Tensor
-    channels: Tensor
-
-
 def render(request: Request) -> Render:
     """Draw all views. See ``core.raster.rasterize``."""
-    _refuse(request)
+    if request.gaussians.means.dtype != torch.float32:
+        got = str(request.gaussians.means.dtype)
+        raise InputError("gsplat works on float32 tensors", where="gaussians.means", got=got)
     if not len(request.gaussians):  # gsplat divides by their number
         return torch_twin.render(replace(request, poses=(None,) * len(request.views)))
     gsplat, g, cameras = load(), request.gaussians, _cameras(request)
     if request.config.alpha_max != ALPHA_MAX:
         log.info_once(f"rasterizer: gsplat caps alpha at {ALPHA_MAX}, not at {request.config.alpha_max}")
     g, colorless = _finite(g)
-    image, alpha, meta = _draw(gsplat, request, cameras, _splats(gsplat, request, g, cameras))
+    image, alpha, meta = gsplat.rasterization(
+        **_splats(gsplat, request, g, cameras),
+        viewmats=cameras.viewmats,
+        Ks=cameras.intrinsics,
+        width=request.views[0].camera.width,
+        height=request.views[0].camera.height,
+        near_plane=request.config.near_m,
+        far_plane=request.config.far_m,
+        eps2d=request.config.blur_px2,
+        sh_degree=None,
+        render_mode="RGB",
+        packed=False,
+        rasterize_mode="antialiased" if request.config.antialias else "classic",
+        absgrad=request.absgrad,
+    )
     trace = _trace(meta, request)
     if colorless is not None and (trace.visible & colorless).any():
         raise NumericsError(
@@ -179,23 +179,6 @@ def render(request: Request) -> Render:
     )
 
 
-def _refuse(request: Request) -> None:
-    g, config = request.gaussians, request.config
-    if g.means.dtype != torch.float32:
-        raise InputError("gsplat works on float32 tensors", where="gaussians.means", got=str(g.means.dtype))
-    if request.absgrad and (config.projection, config.primitive) != ("linear", "ellipsoid"):
-        raise UsageError(
-            "gsplat gives absolute gradients of projected means only of linearly projected ellipsoids",
-            got=f"projection={config.projection!r}, primitive={config.primitive!r}",
-            remedy="draw linearly projected ellipsoids",
-        )
-    if config.projection == "unscented" and any(pose is not None and pose.requires_grad for pose in request.poses):
-        raise UsageError(
-            "gsplat gives no gradients of camera poses with projection='unscented'",
-            remedy="keep the poses fixed, or set projection='linear'",
-        )
-
-
 def _finite(g: Gaussians) -> tuple[Gaussians, Tensor | None]:
     """Refuse geometry that is not finite. Harmonics and features that are not are replaced by 0, since only those of
     drawn Gaussians count; the second value [N] says where. One transfer to the CPU."""
@@ -210,19 +193,7 @@ def _finite(g: Gaussians) -> tuple[Gaussians, Tensor | None]:
         return g, None
     bad = torch.stack([~torch.isfinite(tensor).flatten(1).all(1) for tensor in given.values()]).any(0)
     clean = {n: torch.where(bad.view(-1, *[1] * (t.ndim - 1)), 0, t) for n, t in given.items()}
-    return (
-        Gaussians(
-            means=g.means,
-            quats=g.quats,
-            scales=g.scales,
-            opacity=g.opacity,
-            sh=clean["sh"],
-            extra=clean.get("extra"),
-            node=g.node,
-            sh_rest=clean.get("sh_rest"),
-        ),
-        bad,
-    )
+    return replace(g, **clean), bad
 
 
 def _cameras(request: Request) -> _Cameras:
@@ -234,15 +205,12 @@ def _cameras(request: Request) -> _Cameras:
     rotation, centers = poses[..., :3, :3].transpose(-1, -2), poses[..., :3, 3] - origin.double()
     last_row = poses.new_tensor([0, 0, 0, 1.0]).expand(*poses.shape[:-2], 1, 4)
     viewmats = torch.cat([torch.cat([rotation, -rotation @ centers[..., None]], -1), last_row], -2).to(like.dtype)
-    last, forward = None, poses[..., :3, 2]
-    if poses.ndim == 4:
-        viewmats, last = viewmats.unbind(1)
-        centers, forward = centers.mean(1), torch.nn.functional.normalize(forward.mean(1), dim=1)
     intrinsics = torch.stack([torch.from_numpy(view.camera.matrix) for view in request.views]).to(like)
-    return _Cameras(origin, viewmats, last, centers.to(like.dtype), forward.to(like.dtype), intrinsics)
+    return _Cameras(origin, viewmats, centers.to(like.dtype), poses[..., :3, 2].to(like.dtype), intrinsics)
 
 
-def _splats(gsplat: Any, request: Request, g: Gaussians, cameras: _Cameras) -> _Splats:
+def _splats(gsplat: Any, request: Request, g: Gaussians, cameras: _Cameras) -> dict[str, Tensor]:
+    """What gsplat receives of the Gaussians; colors [V, N, 3 + features + 1]: colour, features, depth."""
     focal = max(max(view.camera.fx, view.camera.fy) for view in request.views)
     means = (g.means - cameras.origin).clamp(-_FARTHEST_M, _FARTHEST_M)
     scales = g.scales.clamp(_SMALLEST_M, _LARGEST_PX * request.config.near_m / focal)
@@ -258,90 +226,14 @@ def _splats(gsplat: Any, request: Request, g: Gaussians, cameras: _Cameras) -> _
         depth = offset @ forward[:, None]
         channels.append(torch.cat([rgb, depth] if g.extra is None else [rgb, g.extra, depth], 1))
     together = channels[0][None] if len(channels) == 1 else torch.stack(channels)
-    return _Splats(means, quats, scales, g.opacity, together)
-
-
-def _draw(gsplat: Any, request: Request, cameras: _Cameras, splats: _Splats) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Image [V, H, W, C or more], alpha [V, H, W, 1] and gsplat's intermediate results."""
-    config, camera = request.config, request.views[0].camera
-    common: dict[str, Any] = {
-        "means": splats.means,
-        "quats": splats.quats,
-        "scales": splats.scales,
-        "opacities": splats.opacity,
-        "width": camera.width,
-        "height": camera.height,
-        "near_plane": config.near_m,
-        "far_plane": config.far_m,
-        "eps2d": config.blur_px2,
-        "sh_degree": None,
-        "render_mode": "RGB",
-    }
-    if config.primitive == "disc":
-        return _draw_discs(gsplat, common, cameras, splats)
-    if config.projection == "unscented":
-        return _draw_unscented(gsplat, common, cameras, splats, config.shutter)
-    return gsplat.rasterization(
-        **common,
-        colors=splats.channels,
-        viewmats=cameras.viewmats,
-        Ks=cameras.intrinsics,
-        packed=config.packed,
-        rasterize_mode="antialiased" if config.antialias else "classic",
-        absgrad=request.absgrad,
-    )
-
-
-def _draw_discs(
-    gsplat: Any, common: dict[str, Any], cameras: _Cameras, splats: _Splats
-) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    # gsplat pads channels to a power of two with memory as it comes, which may hold NaN: padded here with zeros.
-    missing = (1 << (splats.channels.shape[2] - 1).bit_length()) - splats.channels.shape[2]
-    colors = torch.nn.functional.pad(splats.channels, (0, missing))
-    with torch.cuda.device_of(splats.means):  # gsplat makes tensors on the current device
-        image, alpha, *_, meta = gsplat.rasterization_2dgs(
-            **common, colors=colors, viewmats=cameras.viewmats, Ks=cameras.intrinsics, packed=False
-        )
-    return image, alpha, meta
-
-
-def _draw_unscented(
-    gsplat: Any, common: dict[str, Any], cameras: _Cameras, splats: _Splats, shutter: str
-) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """View by view: gsplat's kernel for responses in space is made for one camera."""
-    name = "GLOBAL" if shutter == "global" else f"ROLLING_{shutter.upper()}"
-    drawn = []
-    for index in range(len(cameras.viewmats)):
-        one = slice(index, index + 1)
-        drawn.append(
-            gsplat.rasterization(
-                **common,
-                rolling_shutter=gsplat.RollingShutterType[name],
-                colors=splats.channels[one],
-                viewmats=cameras.viewmats[one].detach(),
-                viewmats_rs=None if cameras.last is None else cameras.last[one].detach(),
-                Ks=cameras.intrinsics[one],
-                packed=False,
-                with_ut=True,
-                with_eval3d=True,
-            )
-        )
-    images, alphas, metas = zip(*drawn, strict=True)
-    meta = {name: torch.cat([one[name] for one in metas]) for name in ("means2d", "radii")}
-    return torch.cat(images), torch.cat(alphas), meta
+    return {"means": means, "quats": quats, "scales": scales, "opacities": g.opacity, "colors": together}
 
 
 def _trace(meta: dict[str, Any], request: Request) -> RasterTrace:
     """Trace whose means2d is a leaf: a hook copies the gradient of gsplat's own tensor to it. Rows that are not drawn
-    are 0: gsplat leaves them uninitialised, and out if it packs."""
+    are 0: gsplat leaves them uninitialised."""
     means2d, radii = meta["means2d"], meta["radii"]
-    shape = (len(request.views), len(request.gaussians), 2)
-    rows = None if meta.get("gaussian_ids") is None else (meta["camera_ids"], meta["gaussian_ids"])
-
-    def shaped(tensor: Tensor) -> Tensor:
-        full = tensor if rows is None else tensor.new_zeros(shape).index_put(rows, tensor)
-        return full if request.batched else full[0]
-
+    shaped = lambda tensor: tensor if request.batched else tensor[0]
     size = shaped(radii)
     visible = (size > 0).all(-1)
     leaf = torch.where(visible[..., None], shaped(means2d.detach()), 0).requires_grad_(means2d.requires_grad)
@@ -363,5 +255,5 @@ def _trace(meta: dict[str, Any], request: Request) -> RasterTrace:
             # set by gsplat in its backward
             absolute.add_(shaped(mine.drawn_by_gsplat.absgrad))  # type: ignore[attr-defined]
 
-    meta.get("gradient_2dgs", means2d).register_hook(keep)  # of discs gsplat keeps it beside
+    means2d.register_hook(keep)
     return trace

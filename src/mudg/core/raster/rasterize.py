@@ -7,9 +7,7 @@ its transmittance would fall to 1e-4; colours are spherical harmonics plus 0.5, 
 
 Pinhole cameras. ``Camera.distortion`` describes the lens before rectification; images in a scene are rectified, so a
 picture drawn here belongs to the rectified camera and the coefficients play no part. A camera with ``readout_s`` > 0 is
-drawn as a global shutter at the view's time (``core/shutter.py`` moves the Gaussians to where a rolling one sees them),
-unless ``RasterConfig.shutter`` names the direction of its shutter and ``world_from_cam`` holds its poses at the first
-and the last row.
+drawn as a global shutter at the view's time: ``core/shutter.py`` moves the Gaussians to where a rolling one sees them.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal, get_args
+from typing import Final, Literal
 
 import torch
 from torch import Tensor
@@ -26,19 +24,14 @@ from mudg import native
 from mudg.base import log
 from mudg.base.devices import choose_device
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.base.types import Gaussians, Render, Shutter, View
+from mudg.base.types import Gaussians, Render, View, check_shape
 from mudg.core.raster import cpu as raster_cpu
 from mudg.core.raster import gsplat_cuda, torch_twin
-from mudg.core.raster import gsplat_cuda as gsplat_package
 from mudg.core.raster.request import Request
 
 Backend = Literal["auto", "cpu", "torch", "gsplat"]
-Projection = Literal["linear", "unscented"]
-Primitive = Literal["ellipsoid", "disc"]
 MAX_EXTRA_CHANNELS: Final = 28
 MAX_SH_DEGREE: Final = 3
-ONLY_GSPLAT: Final = {"packed": False, "projection": "linear", "primitive": "ellipsoid", "shutter": "global"}
-"""Settings that only the backend gsplat has, each with the value that every backend draws."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,15 +45,6 @@ class RasterConfig:
         alpha_max: cap on the alpha of one Gaussian at one pixel, in (0, 1).
         antialias: scale opacity by sqrt(det(covariance) / det(covariance + blur)), so that blurring adds no light.
         sh_degree: degree of spherical harmonics in use, 0 to 3; None = what the coefficients allow.
-
-    Only gsplat (CUDA) has these; other backends refuse any value but the first:
-        packed: False, or True = keep working memory only for Gaussians that a view sees: less memory, slightly slower.
-        projection: "linear" = the image of a Gaussian is linearised at its mean; "unscented" = sigma points find where
-            it is seen and its response is evaluated along each pixel's ray (3DGUT, Wu et al. 2025). Without
-            ``blur_px2``, without gradients of projected means and of poses.
-        primitive: "ellipsoid", or "disc" = flat Gaussians, the third scale is not used (2DGS, Huang et al. 2024).
-        shutter: "global", or the direction in which a rolling shutter reads the image; needs projection="unscented" and
-            poses at the first and the last row (or column) in ``world_from_cam``.
     """
 
     backend: Backend = "auto"
@@ -70,10 +54,6 @@ class RasterConfig:
     alpha_max: float = 0.99
     antialias: bool = False
     sh_degree: int | None = None
-    packed: bool = False
-    projection: Projection = "linear"
-    primitive: Primitive = "ellipsoid"
-    shutter: Shutter = "global"
 
     def __post_init__(self) -> None:
         if self.backend not in ("auto", *BACKENDS):
@@ -86,30 +66,6 @@ class RasterConfig:
             )
         if self.sh_degree is not None and not 0 <= self.sh_degree <= MAX_SH_DEGREE:
             raise UsageError("sh_degree is out of range", expected=f"0 to {MAX_SH_DEGREE}", got=str(self.sh_degree))
-        for name, allowed in (("projection", Projection), ("primitive", Primitive), ("shutter", Shutter)):
-            if (value := getattr(self, name)) not in get_args(allowed):
-                raise UsageError(
-                    f"unknown {name} of the rasterizer", expected=", ".join(get_args(allowed)), got=repr(value)
-                )
-        for together, remedy in self._contradictions():
-            raise UsageError(f"the rasterizer cannot combine {together}", remedy=remedy)
-
-    def _contradictions(self) -> list[tuple[str, str]]:
-        """Settings that gsplat does not offer together, and what to do."""
-        unscented, disc = self.projection == "unscented", self.primitive == "disc"
-        rows = [
-            (
-                self.shutter != "global" and not unscented,
-                "a rolling shutter with projection='linear'",
-                "set projection='unscented'",
-            ),
-            (unscented and disc, "projection='unscented' with primitive='disc'", "choose one of them"),
-            (unscented and self.packed, "projection='unscented' with packed", "set packed=False"),
-            (disc and self.packed, "primitive='disc' with packed", "set packed=False"),
-            (unscented and self.antialias, "projection='unscented' with antialias", "set antialias=False"),
-            (disc and self.antialias, "primitive='disc' with antialias", "set antialias=False"),
-        ]
-        return [(together, remedy) for wrong, together, remedy in rows if wrong]
 
 
 # Each backend: Request -> Render. The only place where backends are listed.
@@ -139,8 +95,6 @@ def rasterize(
         background: colour behind everything, in [0, 1]: [3] or [3, H, W], or one per view: [V, 3] or [V, 3, H, W];
             None = black. Differentiable.
         world_from_cam: [4, 4] (with several views [V, 4, 4]) rigid, differentiable poses used instead of the views'.
-            With a rolling shutter [2, 4, 4] ([V, 2, 4, 4]): the poses when the first and the last row (or column) are
-            read.
         absgrad: also fill ``trace.abs_grad2d`` in backward (sum over pixels of |d loss / d mean2d|, pixels).
 
     Returns:
@@ -158,10 +112,9 @@ def rasterize(
     batched = not isinstance(view, View)
     views = (view,) if isinstance(view, View) else tuple(view)
     degree = _check(gaussians, config)
-    _check_views(views, config)
-    poses = _poses(world_from_cam, len(views), batched, config)
+    _check_views(views)
+    poses = _poses(world_from_cam, len(views), batched)
     name = _choose_backend(gaussians, config)
-    refuse_settings(name, config)
     flat, pixelwise = _backgrounds(background, views, batched)
     drawn = BACKENDS[name](Request(gaussians, views, batched, config, degree, flat, poses, absgrad))
     if pixelwise is None:
@@ -174,7 +127,7 @@ def available(backend: str) -> str:
     if backend == "cpu":
         return "" if native.library() is not None else native.status()
     if backend == "gsplat":
-        return gsplat_package.problem()
+        return gsplat_cuda.problem()
     return "" if backend == "torch" else f"unknown backend {backend!r}"
 
 
@@ -183,11 +136,8 @@ def _choose_backend(gaussians: Gaussians, config: RasterConfig) -> str:
     if config.backend != "auto":
         problem = available(config.backend)
         if problem:
-            raise ResourceError(
-                f"raster backend {config.backend!r} is not available",
-                got=problem,
-                remedy="install what is missing or use backend='auto'",
-            )
+            what = f"raster backend {config.backend!r} is not available"
+            raise ResourceError(what, got=problem, remedy="install what is missing or use backend='auto'")
         wanted = {"cpu": "cpu", "gsplat": "cuda"}.get(config.backend)
         if wanted is not None and device.type != wanted:
             raise ResourceError(f"raster backend {config.backend!r} works on {wanted} tensors", got=str(device))
@@ -195,11 +145,8 @@ def _choose_backend(gaussians: Gaussians, config: RasterConfig) -> str:
     if device.type == "cuda":
         problem = available("gsplat")
         if problem:
-            raise ResourceError(
-                "drawing on a GPU needs gsplat",
-                got=problem,
-                remedy="pip install 'mudg[gsplat]', or keep the Gaussians on the CPU",
-            )
+            what, got = "drawing on a GPU needs gsplat", problem
+            raise ResourceError(what, got=got, remedy="pip install 'mudg[gsplat]', or keep the Gaussians on the CPU")
         log.info_once("rasterizer: gsplat (CUDA)")
         return "gsplat"
     if device.type == "cpu" and dtype == torch.float32 and not available("cpu"):
@@ -210,34 +157,15 @@ def _choose_backend(gaussians: Gaussians, config: RasterConfig) -> str:
     return "torch"
 
 
-def refuse_settings(backend: str, config: RasterConfig) -> None:
-    """Refuse settings that a backend does not draw.
-
-    Raises:
-        UsageError: one of ``ONLY_GSPLAT`` with another backend.
-    """
-    for name, common in ONLY_GSPLAT.items():
-        value = getattr(config, name)
-        if backend != "gsplat" and value != common:
-            raise UsageError(
-                f"raster backend {backend!r} has no {name}={value!r}; only gsplat on a CUDA device has",
-                expected=f"{name}={common!r}",
-                remedy=f"leave {name} at {common!r}, or use backend='gsplat'",
-            )
-
-
 def _check(gaussians: Gaussians, config: RasterConfig) -> int:
     """Check what the dataclass does not; return the harmonics' degree."""
     coefficients = gaussians.sh.shape[1] + (0 if gaussians.sh_rest is None else gaussians.sh_rest.shape[1])
     allowed = math.isqrt(coefficients) - 1
     degree = allowed if config.sh_degree is None else config.sh_degree
     if not 0 <= degree <= min(allowed, MAX_SH_DEGREE):
-        raise InputError(
-            "spherical harmonics do not have enough coefficients for their degree",
-            where="gaussians.sh",
-            expected=f"[N, {(max(degree, 0) + 1) ** 2}, 3]",
-            got=f"[{len(gaussians)}, {coefficients}, 3]",
-        )
+        what = "spherical harmonics do not have enough coefficients for their degree"
+        expected = f"[N, {(max(degree, 0) + 1) ** 2}, 3]"
+        raise InputError(what, where="gaussians.sh", expected=expected, got=f"[{len(gaussians)}, {coefficients}, 3]")
     parts = {
         "means": gaussians.means,
         "quats": gaussians.quats,
@@ -250,60 +178,37 @@ def _check(gaussians: Gaussians, config: RasterConfig) -> int:
     if gaussians.extra is not None:
         parts["extra"] = gaussians.extra
         if gaussians.extra.shape[1] > MAX_EXTRA_CHANNELS:
-            raise InputError(
-                "too many feature channels",
-                where="gaussians.extra",
-                expected=f"at most {MAX_EXTRA_CHANNELS}",
-                got=str(gaussians.extra.shape[1]),
-            )
+            what, expected = "too many feature channels", f"at most {MAX_EXTRA_CHANNELS}"
+            raise InputError(what, where="gaussians.extra", expected=expected, got=str(gaussians.extra.shape[1]))
     for name, tensor in parts.items():
         if tensor.device != gaussians.means.device or tensor.dtype != gaussians.means.dtype:
-            raise InputError(
-                "all parameters must share device and type",
-                where=f"gaussians.{name}",
-                expected=f"{gaussians.means.dtype} on {gaussians.means.device}",
-                got=f"{tensor.dtype} on {tensor.device}",
-            )
+            what, where = "all parameters must share device and type", f"gaussians.{name}"
+            expected = f"{gaussians.means.dtype} on {gaussians.means.device}"
+            raise InputError(what, where=where, expected=expected, got=f"{tensor.dtype} on {tensor.device}")
     return degree
 
 
-def _check_views(views: tuple[View, ...], config: RasterConfig) -> None:
+def _check_views(views: tuple[View, ...]) -> None:
     if not views:
         raise InputError("there is no view to draw", expected="a View or a sequence of Views")
     size = (views[0].camera.width, views[0].camera.height)
     for index, view in enumerate(views):
         camera = view.camera
         if (camera.width, camera.height) != size:
-            raise InputError(
-                "views drawn together must share one image size",
-                where=f"view {index}, camera {camera.name!r}",
-                expected=f"{size[0]}x{size[1]}",
-                got=f"{camera.width}x{camera.height}",
-            )
-        if camera.readout_s > 0 and camera.shutter == config.shutter == "global":
+            what, where = "views drawn together must share one image size", f"view {index}, camera {camera.name!r}"
+            raise InputError(what, where=where, expected=f"{size[0]}x{size[1]}", got=f"{camera.width}x{camera.height}")
+        if camera.readout_s > 0 and camera.shutter == "global":
             log.info_once(
                 f"rasterizer: the rolling shutter of camera {camera.name!r} ({camera.readout_s} s) is not followed, "
                 "as its direction is unknown; drawn as a global shutter at the view's time"
             )
 
 
-def _poses(world_from_cam: Tensor | None, views: int, batched: bool, config: RasterConfig) -> tuple[Tensor | None, ...]:
-    rolling = config.shutter != "global"
-    wanted = (*((views,) if batched else ()), *((2,) if rolling else ()), 4, 4)
+def _poses(world_from_cam: Tensor | None, views: int, batched: bool) -> tuple[Tensor | None, ...]:
     if world_from_cam is None:
-        if rolling:
-            raise InputError(
-                "a rolling shutter needs the poses at its first and last row",
-                where="world_from_cam",
-                expected=str(list(wanted)),
-                got="None",
-                remedy="give both poses, or set shutter='global'",
-            )
         return (None,) * views
-    if tuple(world_from_cam.shape) != wanted:
-        raise InputError(
-            "world_from_cam has the wrong shape", expected=str(list(wanted)), got=str(list(world_from_cam.shape))
-        )
+    wanted = (views, 4, 4) if batched else (4, 4)
+    check_shape(world_from_cam, "world_from_cam", wanted)
     return world_from_cam.unbind(0) if batched else (world_from_cam,)
 
 
@@ -329,7 +234,6 @@ def _backgrounds(
 
 
 # place --------------------------------------------------------------------------------------------
-#
 # Which device Gaussians are drawn on, and so where everything that is learnt about them lives.
 
 
@@ -361,11 +265,6 @@ def drawing_device(wanted: str, purpose: str, backend: Backend = "auto") -> torc
         wanted = kinds[0] if len(kinds) == 1 else "cpu" if problem else "auto"
     chosen = choose_device(wanted, purpose)
     if chosen.type in ("cpu", "cuda") and chosen.type not in kinds:
-        raise UsageError(
-            f"raster backend {backend!r} does not draw on this device",
-            where="--raster",
-            expected=f"--device {kinds[0]}",
-            got=f"--device {wanted}",
-            remedy="leave --raster at auto",
-        )
+        what, where, got = f"raster backend {backend!r} does not draw on this device", "--raster", f"--device {wanted}"
+        raise UsageError(what, where=where, expected=f"--device {kinds[0]}", got=got, remedy="leave --raster at auto")
     return chosen

@@ -23,8 +23,7 @@ class Request:
         views: one or more, all of one image size.
         batched: whether the result has a leading view dimension (always so for more than one view).
         backgrounds: one colour [3] (or None, black) per view.
-        poses: world_from_cam [4, 4] per view, or None where the view's own is meant. With a rolling shutter [2, 4, 4]:
-            when the first and when the last row (or column) is read.
+        poses: world_from_cam [4, 4] per view, or None where the view's own is meant.
     """
 
     gaussians: Gaussians
@@ -37,7 +36,7 @@ class Request:
     absgrad: bool
 
     def pose(self, index: int) -> Tensor:
-        """world_from_cam of one view, [4, 4]; with a rolling shutter [2, 4, 4]."""
+        """world_from_cam of one view, [4, 4]."""
         given = self.poses[index]
         return torch.from_numpy(self.views[index].world_from_cam.copy()) if given is None else given
 

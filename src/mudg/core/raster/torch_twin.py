@@ -17,6 +17,7 @@ from torch import Tensor
 
 from mudg.base.errors import NumericsError
 from mudg.base.types import Camera, Gaussians, Render
+from mudg.core.harmonics import rotation_of_unit
 from mudg.core.raster.request import Drawn, Request, harmonics, joined, trace_leaves
 
 if TYPE_CHECKING:
@@ -135,19 +136,7 @@ def _project(
 
 def rotation_matrices(quats: Tensor) -> Tensor:
     """[N, 4] (w, x, y, z), any length, to rotations [N, 3, 3]. A zero quaternion gives the identity."""
-    w, x, y, z = (quats / quats.square().sum(1, keepdim=True).clamp_min(1e-24).sqrt()).unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    ]
-    return torch.stack(rows, 1).view(-1, 3, 3)
+    return rotation_of_unit(quats / quats.square().sum(1, keepdim=True).clamp_min(1e-24).sqrt())
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:

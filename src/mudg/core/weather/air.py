@@ -25,13 +25,13 @@ from mudg.base.types import View
 from mudg.base.weather_settings import FogSettings
 
 # noise --------------------------------------------------------------------------------------------
-#
 # Hashes and value noise of world places: the same numbers for every camera and frame.
 #
 # Twins of ``hash_bits``, ``hash01`` and ``noise2`` in native/city_math.h, so that the generated city can show the same
 # puddles and patches of snow.
 
 
+Array = NDArray[np.float64]
 Hashes = NDArray[np.uint32]
 _QUANTILE_SIDE = 192
 _QUANTILE_STEP = 0.73
@@ -96,11 +96,7 @@ def smoothstep(low: float, high: float, v: Any) -> Any:
     return t * t * (3 - 2 * t)
 
 
-# air ----------------------------------------------------------------------------------------------
-
-
 # fog ----------------------------------------------------------------------------------------------
-#
 # Fog and haze: Koschmieder's law in linear light, ``L = L0 t + A (1 - t)`` with transmittance t and airlight A.
 #
 # Extinction is 3.0 / visibility, as contrast falls to 5 % at the meteorological optical range. Distances are along the
@@ -165,8 +161,6 @@ def unveiled(color: NDArray[np.floating], share: Array, airlight: Array) -> NDAr
 # particles ----------------------------------------------------------------------------------------
 
 
-Array = NDArray[np.float64]
-
 DROP_LIGHT = 0.94
 RAIN_EDGES_MM = (1.0, 1.5, 2.0, 3.0, 5.0)
 FLAKE_EDGES_MM = (0.7, 1.2, 2.0, 3.5)
@@ -174,6 +168,8 @@ FLAKE_GROWTH = 10.0 ** (1 / 3)
 FLAKE_SPEED = 1.0
 FLAKE_SWAY_M = 0.1
 NEAREST_M = 0.25
+SHUTTER_S = 0.01
+"""Exposure time: length of the streaks."""
 _STEP_PX = 0.7
 _MOST_STEPS = 400
 
@@ -209,41 +205,26 @@ def _exponential(intercept: float, slope: float, edges_mm: tuple[float, ...]) ->
 
 
 def rain_sizes(mm_h: float) -> list[ParticleSize]:
-    """Drops of 1 to 5 mm at a rate in mm/h; smaller ones are part of the veil."""
-    if mm_h <= 0:
-        return []
+    """Drops of 1 to 5 mm at a rate in mm/h, above 0; smaller ones are part of the veil."""
     rows = _exponential(8000.0, 4.1 * mm_h**-0.21, RAIN_EDGES_MM)
     return [ParticleSize(n, d * 1e-3, 9.65 - 10.3 * math.exp(-0.6 * d)) for n, d in rows]
 
 
 def snow_sizes(mm_h: float) -> list[ParticleSize]:
-    """Flakes at a rate in mm/h of water, melted diameters of 0.7 to 3.5 mm."""
-    if mm_h <= 0:
-        return []
+    """Flakes at a rate in mm/h of water, above 0: melted diameters of 0.7 to 3.5 mm."""
     rows = _exponential(3800.0 * mm_h**-0.87, 2.55 * mm_h**-0.48, FLAKE_EDGES_MM)
     return [ParticleSize(n, d * 1e-3 * FLAKE_GROWTH, FLAKE_SPEED, FLAKE_SWAY_M) for n, d in rows]
 
 
 def rain_extinction(mm_h: float) -> float:
     """Extinction of rain per metre: 0.312 R^0.67 per km."""
-    return 0.312e-3 * mm_h**0.67 if mm_h > 0 else 0.0
+    return 0.312e-3 * mm_h**0.67
 
 
 def snow_extinction(mm_h: float) -> float:
-    """Extinction of falling snow per metre: twice the area of all flakes in a cubic metre."""
-    if mm_h <= 0:
-        return 0.0
+    """Extinction of falling snow per metre: twice the area of all flakes in a cubic metre. mm_h: above 0."""
     n0, slope = 3800.0 * mm_h**-0.87, 2.55 * mm_h**-0.48
     return 2 * n0 * math.pi / 4 * FLAKE_GROWTH**2 * 2 / slope**3 * 1e-6
-
-
-def area_per_m(sizes: list[ParticleSize]) -> float:
-    """Area of the particles in a cubic metre, m^2 per m^3: what a ray meets per metre."""
-    return sum(s.density * math.pi / 4 * s.diameter_m**2 for s in sizes)
-
-
-def _velocity(size: ParticleSize, wind: tuple[float, float]) -> Array:
-    return np.array([wind[0], wind[1], -size.fall_m_s])
 
 
 def _inside(view: View, xyz: Array, reach_m: float, margin_m: float) -> NDArray[np.bool_]:
@@ -311,18 +292,7 @@ def places(size: ParticleSize, velocity: Array, view: View, reach_m: float, key:
     return found
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Moving:
-    """Particles at the middle of an exposure: world places f64[N, 3], velocity f64[3] against the camera, diameter,
-    exposure time."""
-
-    xyz: Array
-    velocity: Array
-    diameter_m: float
-    shutter_s: float
-
-
-def covered(view: View, depth: NDArray[np.floating], moving: Moving) -> Array:
+def covered(view: View, depth: NDArray[np.floating], xyz: Array, velocity: Array, diameter_m: float) -> Array:
     """Optical depth f64[H, W] of particles before the surfaces.
 
     A ball of w pixels that moves during the exposure covers, summed over pixels, pi/4 w^2 of one pixel on the axis,
@@ -332,12 +302,12 @@ def covered(view: View, depth: NDArray[np.floating], moving: Moving) -> Array:
     Args:
         view: camera and pose.
         depth: camera z of the surfaces f[H, W], metres.
-        moving: the particles.
+        xyz: world places f64[N, 3] at the middle of the exposure. velocity: f64[3] against the camera, m/s.
     """
     camera = view.camera
     turn = view.world_from_cam[:3, :3]
-    middle = (moving.xyz - view.center_world) @ turn
-    half = (moving.velocity * moving.shutter_s / 2) @ turn
+    middle = (xyz - view.center_world) @ turn
+    half = (velocity * SHUTTER_S / 2) @ turn
     ends = [middle - half, middle + half]
     kept = (ends[0][:, 2] > NEAREST_M) & (ends[1][:, 2] > NEAREST_M)
     start, end = ends[0][kept], ends[1][kept]
@@ -346,7 +316,7 @@ def covered(view: View, depth: NDArray[np.floating], moving: Moving) -> Array:
         return np.stack([camera.fx * p[:, 0] / p[:, 2] + camera.cx, camera.fy * p[:, 1] / p[:, 2] + camera.cy], 1)
 
     a, b = pixel(start), pixel(end)
-    width = camera.fx * moving.diameter_m / middle[kept, 2]
+    width = camera.fx * diameter_m / middle[kept, 2]
     lengths = np.linalg.norm(b - a, axis=1)
     along = np.minimum(np.ceil(lengths / _STEP_PX).astype(np.int64) + 1, _MOST_STEPS)
     across = np.ceil(width / _STEP_PX).astype(np.int64)
@@ -384,13 +354,11 @@ def _splat(at: Array, mass: Array, z: Array, depth: NDArray[np.floating]) -> Arr
 
 @dataclass(frozen=True, slots=True)
 class Falling:
-    """What falls: sizes, wind along x and y in m/s, how near it is drawn, exposure time, and a name for the random
-    numbers."""
+    """What falls: sizes, wind along x and y in m/s, how near it is drawn, and a name for the random numbers."""
 
     sizes: list[ParticleSize]
     wind_m_s: tuple[float, float]
     reach_m: float
-    shutter_s: float
     purpose: str
 
 
@@ -400,10 +368,8 @@ def falling(
     """Optical depth f64[H, W] of all particles of a kind within their reach, at ``view.time_s``."""
     total = np.zeros(depth.shape)
     for index, size in enumerate(fall.sizes):
-        velocity = _velocity(size, fall.wind_m_s)
+        velocity = np.array([*fall.wind_m_s, -size.fall_m_s])
         xyz = places(size, velocity, view, fall.reach_m, seeds.key(seed, index, fall.purpose))
         xyz = xyz[np.linalg.norm(xyz - view.center_world, axis=1) < fall.reach_m]
-        total += covered(
-            view, depth, Moving(xyz, velocity - np.asarray(camera_velocity), size.diameter_m, fall.shutter_s)
-        )
+        total += covered(view, depth, xyz, velocity - np.asarray(camera_velocity), size.diameter_m)
     return total

@@ -21,7 +21,6 @@ from mudg.base.weather_settings import (
 from mudg.core.weather import air, ground
 from mudg.core.weather import light as relight
 from mudg.core.weather.gbuffer import (
-    BufferRules,
     GBuffer,
     OccluderMap,
     Surroundings,
@@ -32,28 +31,10 @@ from mudg.core.weather.gbuffer import (
     world_points,
     world_rays,
 )
-from mudg.core.weather.light import ToneCurve, curve_of, in_season, target_light
+from mudg.core.weather.light import in_season
 
 Array = NDArray[np.float64]
-Plane = NDArray[np.float32]
 Image = NDArray[np.float32]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Weathered:
-    """An edited view.
-
-    Args:
-        color: f32[H, W, 3] linear light.
-        confidence: f32[H, W] in [0, 1]: how far known physics and what was seen determine it.
-    """
-
-    color: Image
-    confidence: Plane
-
-    def display(self, tone: ToneCurve) -> Image:
-        """Display values f32[H, W, 3] in [0, 1]."""
-        return tone.encode(self.color)
 
 
 def apply(
@@ -63,12 +44,13 @@ def apply(
     time_s: float,
     seed: int,
     surroundings: Surroundings | None = None,
-) -> Weathered:
-    """Weather and light on one view. The same arguments give the same result; frames and cameras agree with each other.
+) -> Image:
+    """Weather and light on one view, linear light f32[H, W, 3]. The same arguments give the same result; frames and
+    cameras agree with each other.
 
     Args:
         gbuffer: what the view shows as recorded.
-        settings: weather, light and shutter. Defaults change nothing.
+        settings: weather, light and season. Defaults change nothing.
         view: camera and pose.
         time_s: moment of falling drops and flakes, on the scene's clock (``view.time_s`` is not used).
         seed: run seed; puddles, patches of snow and drops follow from it.
@@ -77,58 +59,44 @@ def apply(
     """
     view = View(view.camera, view.world_from_cam, time_s)
     light = surroundings if surroundings is not None else estimate_surroundings([(view, gbuffer)])
-    weather, confidence = settings.weather, np.ones(gbuffer.depth.shape, np.float32)
+    weather = settings.weather
     if weather.recorded_visibility_m > 0:
-        gbuffer, confidence = _without_haze(gbuffer, view, weather.recorded_visibility_m, light)
+        gbuffer = _without_haze(gbuffer, view, weather.recorded_visibility_m, light)
     if settings.season is not None:
         gbuffer = in_season(gbuffer, view, settings.season, seed)
     if settings.light.time != "as_recorded":
-        gbuffer, light, sure = _in_new_light(gbuffer, view, light, settings.light)
-        confidence = confidence * sure
+        gbuffer, light = _in_new_light(gbuffer, view, light, settings.light)
     if weather.wet > 0:
-        color, sure = ground.wet_ground(gbuffer, view, light, weather.wet, weather.puddles, seed)
-        gbuffer, confidence = replace(gbuffer, color=color), confidence * sure
+        color = ground.wet_ground(gbuffer, view, light, weather.wet, weather.puddles, seed)
+        gbuffer = replace(gbuffer, color=color)
     if weather.snow is not None and weather.snow.cover > 0:
-        gbuffer, sure = _snowed(gbuffer, view, light, weather.snow, seed)
-        confidence = confidence * sure
-    color, share = _through_air(gbuffer, view, light, weather)
-    confidence = confidence * share + (1 - share)
-    color = _with_particles(color, gbuffer, view, light, settings, seed)
+        gbuffer = _snowed(gbuffer, view, light, weather.snow, seed)
+    color = _with_particles(_through_air(gbuffer, view, light, weather), gbuffer, view, light, weather, seed)
     if settings.light.time == "night":
         color = relight.glow(color)
-    color = color * np.float32(2.0**settings.light.exposure_ev)
-    return Weathered(color.astype(np.float32), confidence.astype(np.float32))
+    return (color * np.float32(2.0**settings.light.exposure_ev)).astype(np.float32)
 
 
-def _air_path(gbuffer: GBuffer, view: View, ground_z_m: float) -> tuple[Array, Array, float]:
-    """Range f64[H, W], sine of elevation f64[H, W] and the camera's height above the ground."""
-    rays, length = world_rays(view)
-    return euclidean_range(view, gbuffer.depth), rays[..., 2] / length, float(view.center_world[2]) - ground_z_m
-
-
-def _without_haze(gbuffer: GBuffer, view: View, visibility_m: float, light: Surroundings) -> tuple[GBuffer, Plane]:
-    """Surfaces without the haze of the recording's day; the sky stays. Confidence is what had come through."""
+def _without_haze(gbuffer: GBuffer, view: View, visibility_m: float, light: Surroundings) -> GBuffer:
+    """Surfaces without the haze of the recording's day; the sky stays."""
     share = np.exp(-air.extinction(visibility_m) * euclidean_range(view, gbuffer.depth))
-    sky = gbuffer.sky
-    clear = np.where(sky[..., None], gbuffer.color, air.unveiled(gbuffer.color, share, light.airlight))
-    return replace(gbuffer, color=clear.astype(np.float32)), np.where(sky, 1, share).astype(np.float32)
+    clear = np.where(gbuffer.sky[..., None], gbuffer.color, air.unveiled(gbuffer.color, share, light.airlight))
+    return replace(gbuffer, color=clear.astype(np.float32))
 
 
 def _in_new_light(
     gbuffer: GBuffer, view: View, light: Surroundings, settings: LightSettings
-) -> tuple[GBuffer, Surroundings, Plane]:
-    target = relight.target_light(light, settings)
-    lamps, scale = None, relight.NIGHT_LEVEL * relight.ground_level(light)
-    if settings.time == "night":
-        lamps = scale * relight.night_lights(gbuffer, view, target, settings)
-    color, sure = relight.relit(gbuffer, view, light, target, lamps)
-    if settings.time == "night" and settings.lamps and light.lamps is not None:
-        color[relight.lamp_heads(gbuffer, view, light.lamps)] = scale * relight.LAMP_RADIANCE * relight.LAMP_COLOR
+) -> tuple[GBuffer, Surroundings]:
+    target, lamps = relight.target_light(light, settings), None
+    if settings.time == "night" and settings.headlights:
+        level = relight.NIGHT_LEVEL * relight.ground_level(light)
+        lamps = level * relight.headlights(gbuffer, view, target.ground_z_m)
+    color = relight.relit(gbuffer, view, light, target, lamps)
     # what was given for the recorded light is none for the new one
-    return replace(gbuffer, color=color, sunlit=gbuffer.new_sunlit, mirror=None), target, sure
+    return replace(gbuffer, color=color, sunlit=gbuffer.new_sunlit), target
 
 
-def _snowed(gbuffer: GBuffer, view: View, light: Surroundings, snow: SnowSettings, seed: int) -> tuple[GBuffer, Plane]:
+def _snowed(gbuffer: GBuffer, view: View, light: Surroundings, snow: SnowSettings, seed: int) -> GBuffer:
     cover = ground.snow_cover(gbuffer, view, snow.cover, seed)
     if light.path is not None and snow.tracks < 1:
         road = gbuffer.ground
@@ -136,13 +104,14 @@ def _snowed(gbuffer: GBuffer, view: View, light: Surroundings, snow: SnowSetting
         cover[road] *= (1 - (1 - snow.tracks) * tracks).astype(np.float32)
     white = ground.snow_light(gbuffer, light, relight.sunlit_of(gbuffer, light))
     color = gbuffer.color + (white - gbuffer.color) * cover[..., None]
-    return replace(gbuffer, color=color.astype(np.float32)), 1 - 0.3 * cover
+    return replace(gbuffer, color=color.astype(np.float32))
 
 
-def _through_air(gbuffer: GBuffer, view: View, light: Surroundings, weather: WeatherSettings) -> tuple[Image, Plane]:
-    """Fog, or the haze of the recording again, and the veil of distant rain and snow; and the share of light that comes
-    through."""
-    distance, rise, height = _air_path(gbuffer, view, light.ground_z_m)
+def _through_air(gbuffer: GBuffer, view: View, light: Surroundings, weather: WeatherSettings) -> Image:
+    """Light behind fog, or the haze of the recording again, and the veil of distant rain and snow."""
+    rays, length = world_rays(view)
+    distance, rise = euclidean_range(view, gbuffer.depth), rays[..., 2] / length
+    height = float(view.center_world[2]) - light.ground_z_m
     share = np.ones(distance.shape)
     if weather.fog is not None:
         share = air.transmittance(distance, rise, height, weather.fog)
@@ -153,24 +122,21 @@ def _through_air(gbuffer: GBuffer, view: View, light: Surroundings, weather: Wea
     for fall, extinction in ((weather.rain, air.rain_extinction), (weather.snow, air.snow_extinction)):
         if fall is not None and fall.mm_h > 0:  # level rays have no end
             share = share * np.exp(-extinction(fall.mm_h) * np.maximum(path - fall.reach_m, 0))
-    return air.veiled(gbuffer.color, share, light.airlight), share.astype(np.float32)
+    return air.veiled(gbuffer.color, share, light.airlight)
 
 
 def _with_particles(
-    color: Image, gbuffer: GBuffer, view: View, light: Surroundings, settings: Conditions, seed: int
+    color: Image, gbuffer: GBuffer, view: View, light: Surroundings, weather: WeatherSettings, seed: int
 ) -> Image:
     """Drops and flakes near the camera, one by one."""
     kinds: list[tuple[RainSettings | SnowSettings, list[air.ParticleSize], Array, str]] = []
-    if settings.weather.rain is not None:
-        rain = settings.weather.rain
-        kinds.append((rain, air.rain_sizes(rain.mm_h), air.DROP_LIGHT * light.ambient, "rain"))
-    if settings.weather.snow is not None:
-        snow = settings.weather.snow
-        kinds.append(
-            (snow, air.snow_sizes(snow.mm_h), ground.SNOW_COLOR * (light.ambient + 0.25 * light.sun), "flakes")
-        )
+    if weather.rain is not None and weather.rain.mm_h > 0:
+        kinds.append((weather.rain, air.rain_sizes(weather.rain.mm_h), air.DROP_LIGHT * light.ambient, "rain"))
+    if weather.snow is not None and weather.snow.mm_h > 0:
+        radiance = ground.SNOW_COLOR * (light.ambient + 0.25 * light.sun)
+        kinds.append((weather.snow, air.snow_sizes(weather.snow.mm_h), radiance, "flakes"))
     for fall, sizes, radiance, purpose in kinds:
-        what = air.Falling(sizes, fall.wind_m_s, fall.reach_m, settings.response.shutter_s, purpose)
+        what = air.Falling(sizes, fall.wind_m_s, fall.reach_m, purpose)
         depth = air.falling(view, gbuffer.depth, what, gbuffer.camera_velocity, seed)
         color = air.veiled(color, np.exp(-depth), radiance)
     return color
@@ -181,6 +147,10 @@ def _with_particles(
 
 LEAST_POINTS = 2
 """Pixels that a cell of the height map needs, so that single wrong depths do not stand in the air."""
+CELL_M = 0.4
+"""Side of the height map's cells."""
+SMOOTH_PX = 2
+"""Smoothing of the depth of a fitted scene, ``from_render``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -196,37 +166,25 @@ class ShownView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveFacts:
-    """What all frames of a drive share.
-
-    Args:
-        surroundings: its light.
-        heights: height map for shadows and snow; None = by class alone.
-        smooth_px: smoothing of normals, ``BufferRules.smooth_px``.
-    """
+    """What all frames of a drive share: its light, and a height map for shadows and snow (None: by class alone)."""
 
     surroundings: Surroundings
     heights: OccluderMap | None = None
-    smooth_px: int = 2
 
 
-def drive_facts(
-    shown: Iterable[ShownView], tone: ToneCurve, path: NDArray[np.float64] | None = None, cell_m: float = 0.4
-) -> DriveFacts:
+def drive_facts(shown: Iterable[ShownView], path: NDArray[np.float64] | None = None) -> DriveFacts:
     """Light and height map of a drive from some of its views; a few of each camera, spread over the drive, are enough.
 
     Args:
-        shown: views with depth and classes.
-        tone: the camera's response.
-        path: x, y, yaw of the recording vehicle f64[N, 3], for wheel tracks in snow.
-        cell_m: side of the height map's cells.
+        shown: views with depth and classes. path: x, y, yaw of the recording vehicle f64[N, 3], for wheel tracks in
+            snow.
     """
-    pairs = [(s.view, from_render(s.view, tone.decode(s.rgb), s.depth, s.classes)) for s in shown]
+    pairs = [(s.view, from_render(s.view, relight.srgb_decode(s.rgb), s.depth, s.classes)) for s in shown]
     if not pairs:
         raise InputError("light is estimated from views", where="shown", got="none")
-    points = [world_points(view, buffer.depth)[~buffer.sky] for view, buffer in pairs]
+    xyz = np.concatenate([world_points(view, buffer.depth)[~buffer.sky] for view, buffer in pairs])
     around = replace(estimate_surroundings(pairs), path=path)
-    xyz = np.concatenate(points)
-    return DriveFacts(around, OccluderMap.from_points(xyz, cell_m, least=LEAST_POINTS) if len(xyz) else None)
+    return DriveFacts(around, OccluderMap.from_points(xyz, CELL_M, least=LEAST_POINTS) if len(xyz) else None)
 
 
 def edited_view(
@@ -235,30 +193,25 @@ def edited_view(
     seed: int,
     drive: DriveFacts,
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> tuple[Image, Weathered]:
-    """One image in other weather or light.
+) -> Image:
+    """One image in other weather or light, display values f32[H, W, 3].
 
     Args:
         shown: the image, its depth and classes.
-        settings: weather, light and camera response.
+        settings: weather, light and season.
         seed: run seed.
         drive: from ``drive_facts``, the same for all images.
         velocity: of the camera, metres per second along the world's axes: it tilts the streaks of drops.
-
-    Returns:
-        Display values f32[H, W, 3] and the linear light with its confidence.
     """
-    tone, around, view = curve_of(settings.response), drive.surroundings, shown.view
-    gbuffer = from_render(
-        view, tone.decode(shown.rgb), shown.depth, shown.classes, BufferRules(drive.heights, drive.smooth_px)
-    )
+    around, view = drive.surroundings, shown.view
+    light = relight.srgb_decode(shown.rgb)
+    gbuffer = from_render(view, light, shown.depth, shown.classes, drive.heights, SMOOTH_PX)
     gbuffer = replace(gbuffer, camera_velocity=velocity)
     if drive.heights is not None:
-        goal = target_light(around, settings.light)
+        goal = relight.target_light(around, settings.light)
         gbuffer = replace(
             gbuffer,
             sunlit=sun_visibility(gbuffer, view, drive.heights, around.sun_direction),
             new_sunlit=sun_visibility(gbuffer, view, drive.heights, goal.sun_direction),
         )
-    result = apply(gbuffer, settings, view, view.time_s, seed, around)
-    return result.display(tone), result
+    return relight.srgb_encode(apply(gbuffer, settings, view, view.time_s, seed, around))

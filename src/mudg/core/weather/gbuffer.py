@@ -15,7 +15,7 @@ from scipy import ndimage
 from mudg.base import geometry
 from mudg.base.errors import InputError
 from mudg.base.palette import ID, UNLABELLED
-from mudg.base.types import Camera, View
+from mudg.base.types import View, check_shape
 
 Image = NDArray[np.float32]
 Plane = NDArray[np.float32]
@@ -39,8 +39,6 @@ class GBuffer:
         sunlit: f32[H, W] share of the recorded sun that reaches the surface, or None (then it is guessed from
             brightness).
         new_sunlit: the same for the sun of the light to change to, or None (then everything that faces it is lit).
-        mirror: f32[H, W, 3] linear light of the scene without ground, mirrored in the road (``mirror_view``), or None
-            (then it is found in the image itself).
         camera_velocity: f64[3] of the camera, metres per second along the world's axes.
     """
 
@@ -51,18 +49,13 @@ class GBuffer:
     openness: Plane
     sunlit: Plane | None = None
     new_sunlit: Plane | None = None
-    mirror: Image | None = None
     camera_velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         shape = self.depth.shape
-        for name in ("color", "classes", "normal", "openness", "sunlit", "new_sunlit", "mirror"):
-            value = getattr(self, name)
-            expected = (*shape, 3) if name in ("color", "normal", "mirror") else shape
-            if value is not None and value.shape != expected:
-                raise InputError(
-                    "planes differ in size", where=f"G-buffer: {name}", expected=str(expected), got=str(value.shape)
-                )
+        for name in ("color", "classes", "normal", "openness", "sunlit", "new_sunlit"):
+            if (value := getattr(self, name)) is not None:
+                check_shape(value, f"G-buffer: {name}", (*shape, 3) if name in ("color", "normal") else shape)
 
     @property
     def sky(self) -> NDArray[np.bool_]:
@@ -185,45 +178,37 @@ def steadied(normal: Image, classes: NDArray[np.uint8], radius: int) -> Image:
     return np.where(known & (size > 1e-9), mean / np.maximum(size, 1e-9), 0).astype(np.float32)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BufferRules:
-    """How surfaces are found in a render.
-
-    Args:
-        heights: height map of the drive; None = the sky's visibility is a guess by class.
-        smooth_px: radius in pixels over which inverse depth (median) and normals (mean, per class) are smoothed: 0 for
-            exact depth, about 2 for the depth of a fitted scene.
-    """
-
-    heights: OccluderMap | None = None
-    smooth_px: int = 0
-
-
 def from_render(
-    view: View, light: Image, depth: NDArray[np.floating], classes: NDArray[np.uint8], rules: BufferRules | None = None
+    view: View,
+    light: Image,
+    depth: NDArray[np.floating],
+    classes: NDArray[np.uint8],
+    heights: OccluderMap | None = None,
+    smooth_px: int = 0,
 ) -> GBuffer:
     """A G-buffer from the planes of a render.
 
     Args:
         view: of the render.
-        light: linear light f32[H, W, 3] (a ``ToneCurve`` decodes display values).
+        light: linear light f32[H, W, 3].
         depth: camera z; 0, negative or not finite = sky, as is everything of that class.
         classes: u8[H, W].
-        rules: how; None = for exact depth, without a height map.
+        heights: height map of the drive; None = the sky's visibility is a guess by class.
+        smooth_px: radius in pixels over which inverse depth (median) and normals (mean, per class) are smoothed: 0 for
+            exact depth, about 2 for the depth of a fitted scene.
     """
-    rules = rules or BufferRules()
     sky = ~np.isfinite(depth) | (depth <= 0) | (classes == ID["sky"])
     clean = np.where(sky, np.inf, depth).astype(np.float32)
     calm = clean
-    if rules.smooth_px:
-        inverse = ndimage.median_filter(1 / clean, 2 * rules.smooth_px + 1)
+    if smooth_px:
+        inverse = ndimage.median_filter(1 / clean, 2 * smooth_px + 1)
         calm = np.where(sky | (inverse <= 0), clean, 1 / np.maximum(inverse, 1e-6)).astype(np.float32)
-    normal = steadied(normals_from_depth(view, calm, classes), classes, rules.smooth_px)
+    normal = steadied(normals_from_depth(view, calm, classes), classes, smooth_px)
     openness = openness_by_class(classes, normal)
-    if rules.heights is not None:
+    if heights is not None:
         points = world_points(view, clean)
         openness = np.ones_like(openness)
-        openness[~sky] = rules.heights.openness(points[~sky] + rules.heights.clear_of(normal[~sky]))
+        openness[~sky] = heights.openness(points[~sky] + heights.clear_of(normal[~sky]))
     return GBuffer(np.maximum(light, 0).astype(np.float32), clean, classes, normal, openness)
 
 
@@ -346,7 +331,6 @@ class Surroundings:
         sun_direction: f64[3] towards the sun.
         airlight: radiance of thick fog.
         ground_z_m: height of the road below the camera.
-        lamps: street lamps f64[N, 3], world places of the lights.
         path: where the recording vehicle drove, f64[N, 3] x, y, yaw; None = no wheel tracks in the snow.
     """
 
@@ -357,7 +341,6 @@ class Surroundings:
     sun_direction: Array
     airlight: Array
     ground_z_m: float = 0.0
-    lamps: Array | None = None
     path: Array | None = None
 
 
@@ -406,18 +389,3 @@ def estimate_surroundings(views: Iterable[tuple[View, GBuffer]], ground_z_m: flo
     airlight = _quantile_color(lowest, 0.5, horizon)
     airlight = airlight * min(1.0, BRIGHTEST_FOG / max(float(airlight.max()), 1e-6))
     return Surroundings(horizon, zenith, ambient, sun, np.array([0.0, 0.0, 1.0]), airlight, ground_z)
-
-
-def mirror_view(view: View, ground_z_m: float) -> View:
-    """The view that sees what level ground at a height mirrors. Its image is upside down: flip the rows of what it
-    renders.
-
-    A mirrored camera is left-handed; turning its y axis over makes it a rotation again and the image a flipped one.
-    """
-    mirror = np.diag([1.0, 1.0, -1.0, 1.0])
-    mirror[2, 3] = 2 * ground_z_m
-    camera = view.camera
-    turned = Camera(
-        camera.name, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.height - camera.cy
-    )
-    return View(turned, mirror @ view.world_from_cam @ np.diag([1.0, -1.0, 1.0, 1.0]), view.time_s)

@@ -64,18 +64,14 @@ def sky_light(surroundings: Surroundings, rise: NDArray[np.floating]) -> Array:
     return surroundings.horizon + (surroundings.zenith - surroundings.horizon) * up[..., None]
 
 
-def screen_mirror(gbuffer: GBuffer, view: View, surroundings: Surroundings) -> tuple[Image, Plane]:
-    """What level ground mirrors, found in the image itself.
+def screen_mirror(gbuffer: GBuffer, view: View, surroundings: Surroundings) -> Image:
+    """What level ground mirrors, found in the image itself, linear light f32[H, W, 3]; 0 beside the ground.
 
     Rays are followed from the ground in steps that grow with distance, until they pass behind a surface by less than a
     step. Rays that leave the image see what stands at its edge there, or else the sky's gradient.
-
-    Returns:
-        Mirrored light f32[H, W, 3] on the ground pixels (0 elsewhere), and whether it was seen in the image f32[H, W],
-        0 or 1.
     """
     wet = np.isin(gbuffer.classes, _WET_IDS) & ~gbuffer.sky
-    mirror, found = np.zeros_like(gbuffer.color), np.zeros(wet.shape, np.float32)
+    mirror = np.zeros_like(gbuffer.color)
     rays, length = world_rays(view)
     direction = (rays / length[..., None])[wet] * np.array([1.0, 1.0, -1.0])
     start = world_points(view, gbuffer.depth)[wet]
@@ -111,7 +107,6 @@ def screen_mirror(gbuffer: GBuffer, view: View, surroundings: Surroundings) -> t
     u, v, z = project(
         np.where(np.isnan(hit)[:, None], direction, start + np.nan_to_num(hit)[:, None] * direction - view.center_world)
     )
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (z > 0)
     light = sky_light(surroundings, direction[:, 2])
     at = (np.clip(np.nan_to_num(v) - 0.5, 0, height - 1), np.clip(np.nan_to_num(u) - 0.5, 0, width - 1))
     shown = (z > 0) & ~gbuffer.ground[at[0].astype(np.int64), at[1].astype(np.int64)]
@@ -120,9 +115,8 @@ def screen_mirror(gbuffer: GBuffer, view: View, surroundings: Surroundings) -> t
             gbuffer.color[..., channel], (at[0][shown], at[1][shown]), order=1, mode="nearest"
         )
         light[shown, channel] = seen
-    inside &= shown
-    mirror[wet], found[wet] = light, inside
-    return mirror, found
+    mirror[wet] = light
+    return mirror
 
 
 def _upward_blur(mirror: Image, where: NDArray[np.bool_], focal_px: float) -> Image:
@@ -137,9 +131,8 @@ def _upward_blur(mirror: Image, where: NDArray[np.bool_], focal_px: float) -> Im
 
 def wet_ground(
     gbuffer: GBuffer, view: View, surroundings: Surroundings, wet: float, puddles: float, seed: int
-) -> tuple[Image, Plane]:
-    """Linear light f32[H, W, 3] with wet road and sidewalk, and confidence f32[H, W]: less where the mirror image was
-    not seen.
+) -> Image:
+    """Linear light f32[H, W, 3] with wet road and sidewalk.
 
     Args:
         gbuffer, view, surroundings: what is shown, dry.
@@ -151,10 +144,7 @@ def wet_ground(
     water = np.zeros(ground.shape)
     places = places_within_pixels(view, gbuffer, ground)
     water[ground] = wet * np.mean([puddle_mask(p[:, :2], puddles, seed) for p in places], axis=0)
-    if gbuffer.mirror is None:
-        mirror, found = screen_mirror(gbuffer, view, surroundings)
-    else:
-        mirror, found = gbuffer.mirror, np.ones(ground.shape, np.float32)
+    mirror = screen_mirror(gbuffer, view, surroundings)
     rays, length = world_rays(view)
     share = fresnel(-rays[..., 2] / length)
     film = (wet - water) * FILM_GLOSS * share * ground
@@ -162,7 +152,7 @@ def wet_ground(
     blurred = _upward_blur(mirror, ground, view.camera.fy)
     dark = np.where(ground, 1 - wet * (1 - WET_DARKENING), 1.0)
     light = gbuffer.color * (dark * (1 - film - pool))[..., None] + blurred * film[..., None] + mirror * pool[..., None]
-    return light.astype(np.float32), (1 - (film + pool) * (1 - found)).astype(np.float32)
+    return light.astype(np.float32)
 
 
 # --- snow -----------------------------------------------------------------------------------------

@@ -8,8 +8,7 @@ of one class mix. Glass, puddles and lamps of the recording keep their recorded 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -18,33 +17,17 @@ from scipy import ndimage
 
 from mudg.base.palette import ID
 from mudg.base.types import View
-from mudg.base.weather_settings import LightSettings, ResponseSettings, SeasonSettings
+from mudg.base.weather_settings import LightSettings, SeasonSettings
 from mudg.core.weather.air import patches, smoothstep
 from mudg.core.weather.gbuffer import GBuffer, Surroundings, sky_share, world_points, world_rays
 from mudg.core.weather.ground import noise_seed, sky_light
 
-# camera response: linear light to display values and back, as an explicit object that every caller chooses ------------
-
+# camera response ----------------------------------------------------------------------------------
 
 LUMA = np.array([0.299, 0.587, 0.114])
 """Brightness of display values."""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 """Brightness of linear light."""
-
-
-@dataclass(frozen=True, slots=True)
-class ToneCurve:
-    """A response and its inverse.
-
-    Args:
-        name: for messages.
-        encode: linear light f[..., 3] >= 0 to display values in [0, 1].
-        decode: display values to linear light. Values that the sensor clipped come back as the light at which it clips.
-    """
-
-    name: str
-    encode: Callable[[NDArray[np.floating]], Image]
-    decode: Callable[[NDArray[np.floating]], Image]
 
 
 def srgb_encode(light: NDArray[np.floating]) -> Image:
@@ -59,78 +42,7 @@ def srgb_decode(display: NDArray[np.floating]) -> Image:
     return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
-def gamma_curve(exponent: float = 2.2) -> ToneCurve:
-    """``display = light ** (1 / exponent)``."""
-    return ToneCurve(
-        f"gamma {exponent:g}",
-        lambda light: (np.clip(light, 0, 1) ** (1 / exponent)).astype(np.float32),
-        lambda display: (np.clip(display, 0, 1) ** exponent).astype(np.float32),
-    )
-
-
-SRGB = ToneCurve("srgb", srgb_encode, srgb_decode)
-LINEAR = ToneCurve(
-    "linear",
-    lambda light: np.clip(light, 0, 1).astype(np.float32),
-    lambda shown: np.clip(shown, 0, 1).astype(np.float32),
-)
-
-
-def curve_of(settings: ResponseSettings) -> ToneCurve:
-    """The curve that settings name."""
-    return {"srgb": SRGB, "linear": LINEAR, "gamma": gamma_curve(settings.gamma)}[settings.tone]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FilmicResponse:
-    """A camera with exposure, white balance, vignetting, a filmic shoulder, saturation and contrast (the generated
-    city's camera).
-
-    Args:
-        exposure: factor on linear light.
-        white: factors of red, green and blue, f64[3].
-        saturation: colour about its own grey, 1 = unchanged.
-        contrast: slope of display values about 0.5.
-        vignette: share of the light lost in the corners.
-    """
-
-    exposure: float = 1.0
-    white: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    saturation: float = 1.0
-    contrast: float = 1.0
-    vignette: float = 0.0
-
-    def curve(self) -> ToneCurve:
-        """Response and inverse for images f[H, W, 3]. The inverse is exact where nothing was clipped."""
-        return ToneCurve("filmic", self._encode, self._decode)
-
-    def _gains(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
-        height, width = shape[:2]
-        y, x = np.mgrid[0:height, 0:width] + 0.5
-        r2 = ((2 * x - width) ** 2 + (2 * y - height) ** 2) / (width**2 + height**2)
-        return self.exposure * (1 - self.vignette * r2)[..., None] * np.array(self.white)
-
-    def _encode(self, light: NDArray[np.floating]) -> Image:
-        v = np.maximum(light * self._gains(light.shape), 0)
-        shown = np.clip(v * (2.51 * v + 0.03) / (v * (2.43 * v + 0.59) + 0.14), 0, 1)
-        luma = (shown @ LUMA)[..., None]
-        mixed = luma + (shown - luma) * self.saturation
-        encoded = srgb_encode(mixed).astype(np.float64)
-        return np.clip(0.5 + (encoded - 0.5) * self.contrast, 0, 1).astype(np.float32)
-
-    def _decode(self, display: NDArray[np.floating]) -> Image:
-        encoded = 0.5 + (np.asarray(display, np.float64) - 0.5) / self.contrast
-        mixed = srgb_decode(encoded).astype(np.float64)
-        luma = (mixed @ LUMA)[..., None]
-        y = np.clip(luma + (mixed - luma) / self.saturation, 0, 1)
-        # the root of y (2.43 v^2 + 0.59 v + 0.14) = 2.51 v^2 + 0.03 v that grows with y
-        a, b, c = 2.51 - 2.43 * y, 0.03 - 0.59 * y, -0.14 * y
-        v = (-b + np.sqrt(b * b - 4 * a * c)) / (2 * a)
-        return (v / self._gains(display.shape)).astype(np.float32)
-
-
 # season -------------------------------------------------------------------------------------------
-#
 # Other seasons, as far as colours go: green leaves and grass take the colours of autumn or of winter.
 #
 # Luminance is kept but for one factor per season, so light, shadow and texture stay; only chromaticity changes, and
@@ -207,13 +119,6 @@ TYPICAL_ALBEDO = {
 """What decides whether all of a class is dark material in the sun or bright material in shadow."""
 
 # Night: irradiance 1 (times pi) stands for 50 lux.
-LAMP_COLOR = np.array([1.0, 0.82, 0.55])
-LAMP_POWER = 64.0
-"""50 lux at 8 m below the lamp."""
-LAMP_HALF_ANGLE_DEG = 75.0
-LAMP_HEAD_M = 0.5
-LAMP_RADIANCE = 2.5
-LAMP_REACH_M = 45.0
 BEAM_COLOR = np.array([1.0, 0.95, 0.85])
 BEAM_POWER = 400.0
 """20,000 candela."""
@@ -309,7 +214,7 @@ def ground_level(light: Surroundings) -> float:
 
 def target_light(recorded: Surroundings, settings: LightSettings) -> Surroundings:
     """The light that settings name, in the unit of the recorded one, as a camera with automatic exposure shows it:
-    ground as bright as recorded under an overcast sky, half as bright at dusk; at night a lamp's 50 lux stand for
+    ground as bright as recorded under an overcast sky, half as bright at dusk; at night 50 lux stand for
     ``NIGHT_LEVEL`` of the recorded light."""
     level = ground_level(recorded)
     azimuth, elevation = np.radians(settings.sun_azimuth_deg), np.radians(settings.sun_elevation_deg)
@@ -340,20 +245,6 @@ def target_light(recorded: Surroundings, settings: LightSettings) -> Surrounding
         dark = NIGHT_SKY * np.array([0.8, 0.85, 1.0])
         return light(NIGHT_LEVEL * level, (2.5 * dark * np.array([1.3, 1.0, 0.7]), 0.6 * dark, dark), zero, upright)
     return recorded
-
-
-def lamp_light(xyz: Array, normal: NDArray[np.floating], lamps: Array) -> Array:
-    """Irradiance over pi f64[N, 3] of street lamps at world places [M, 3] that shine down in a cone; nothing casts
-    shadows."""
-    total = np.zeros(len(xyz))
-    edge = np.cos(np.radians(LAMP_HALF_ANGLE_DEG))
-    for lamp in lamps:
-        rows = np.flatnonzero(np.linalg.norm(xyz - lamp, axis=1) < LAMP_REACH_M)
-        to = lamp - xyz[rows]
-        d = np.maximum(np.linalg.norm(to, axis=1), 0.5)
-        down, facing = to[:, 2] / d, np.maximum((normal[rows] * to).sum(1) / d, 0)
-        total[rows] += LAMP_POWER * facing * smoothstep(edge, edge + 0.25, down) / d**2
-    return total[:, None] * LAMP_COLOR
 
 
 def headlight(xyz: Array, normal: NDArray[np.floating], vehicle: Array) -> Array:
@@ -392,8 +283,8 @@ def vehicle_lights(view: View, ground_z_m: float) -> Array:
 
 def relit(
     gbuffer: GBuffer, view: View, recorded: Surroundings, target: Surroundings, point_lights: Array | None = None
-) -> tuple[Image, Plane]:
-    """The image under another light, and confidence f32[H, W].
+) -> Image:
+    """The image under another light.
 
     Args:
         gbuffer: the image under the recorded light; ``new_sunlit`` says where the new sun reaches.
@@ -403,12 +294,10 @@ def relit(
         point_lights: irradiance over pi f64[H, W, 3] of lamps, added to the target's.
 
     Returns:
-        Linear light f32[H, W, 3]; the sky is the target's gradient. Confidence is low where the recorded light was
-        little of what the new one needs (deep shadow made bright) and in the sky.
+        Linear light f32[H, W, 3]; the sky is the target's gradient.
     """
     sunlit = sunlit_of(gbuffer, recorded)
     new_sunlit = gbuffer.new_sunlit if gbuffer.new_sunlit is not None else np.ones_like(sunlit)
-    old = irradiance(gbuffer.normal, gbuffer.openness, sunlit, recorded)
     new = irradiance(gbuffer.normal, gbuffer.openness, new_sunlit, target)
     if point_lights is not None:
         new = new + point_lights
@@ -418,33 +307,18 @@ def relit(
     rays, length = world_rays(view)
     sky = gbuffer.sky
     light[sky] = sky_light(target, (rays[..., 2] / length)[sky])
-    gain = (new / np.maximum(old, 1e-4)).mean(-1)
-    certain = np.clip(2 / np.maximum(gain, 2), 0.2, 1) * (1 - 2 * np.minimum(sunlit, 1 - sunlit))
-    return light.astype(np.float32), np.where(sky, 0.3, np.clip(certain, 0.1, 1)).astype(np.float32)
+    return light.astype(np.float32)
 
 
-def night_lights(gbuffer: GBuffer, view: View, target: Surroundings, settings: LightSettings) -> Array:
-    """Irradiance over pi f64[H, W, 3] of street lamps and the recording vehicle's headlights."""
+def headlights(gbuffer: GBuffer, view: View, ground_z_m: float) -> Array:
+    """Irradiance over pi f64[H, W, 3] of the recording vehicle's headlights; nothing casts shadows."""
     out = np.zeros(gbuffer.color.shape)
     solid = ~gbuffer.sky
     xyz, normal = world_points(view, gbuffer.depth)[solid], gbuffer.normal[solid]
-    if settings.lamps and target.lamps is not None:
-        out[solid] += lamp_light(xyz, normal, np.asarray(target.lamps, np.float64))
-    if settings.headlights:
-        out[solid] += headlight(xyz, normal, vehicle_lights(view, target.ground_z_m))
+    out[solid] += headlight(xyz, normal, vehicle_lights(view, ground_z_m))
     # single normals at kerbs are wrong now and then, and a headlight shows every one
     calm = ndimage.median_filter(out, (3, 3, 1))
     return np.where(gbuffer.ground[..., None], calm, out)
-
-
-def lamp_heads(gbuffer: GBuffer, view: View, lamps: Array) -> NDArray[np.bool_]:
-    """bool[H, W]: what stands within ``LAMP_HEAD_M`` of a street lamp's place, and so shines."""
-    heads = np.zeros(gbuffer.depth.shape, bool)
-    solid = ~gbuffer.sky
-    xyz = world_points(view, gbuffer.depth)[solid]
-    for lamp in np.asarray(lamps, np.float64):
-        heads[solid] |= np.linalg.norm(xyz - lamp, axis=1) < LAMP_HEAD_M
-    return heads & (gbuffer.classes == ID["pole"])
 
 
 def glow(color: Image, share: float = 0.06, sigma_px: float = 4.0) -> Image:
