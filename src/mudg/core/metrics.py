@@ -370,12 +370,9 @@ class Metric(Protocol):
         ...
 
 
-def measure(
-    pair: Pair, metrics: Mapping[str, Metric], known: Mapping[Callable[[Pair], Any], Any] | None = None
-) -> dict[str, Any]:
-    """What the named metrics measure of one view, ready for ``Metric.add``; each source is asked once, those in
-    ``known`` not at all."""
-    found: dict[Callable[[Pair], Any], Any] = dict(known or {})
+def measure(pair: Pair, metrics: Mapping[str, Metric]) -> dict[str, Any]:
+    """What the named metrics measure of one view, ready for ``Metric.add``; each source is asked once."""
+    found: dict[Callable[[Pair], Any], Any] = {}
     for metric in metrics.values():
         if metric.source not in found:
             found[metric.source] = metric.source(pair)
