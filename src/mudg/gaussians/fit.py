@@ -11,7 +11,6 @@ goes on with a finished fit (``gaussians/storage.py``).
 
 from __future__ import annotations
 
-import contextlib
 import math
 import shutil
 import time
@@ -50,7 +49,7 @@ from mudg.gaussians.settings import METHODS, FitConfig
 from mudg.gaussians.storage import load_model as load_model
 from mudg.gaussians.storage import save_model as save_model
 from mudg.gaussians.trust import certainty_of, unseen_maps, unseen_rows
-from mudg.gaussians.views import StoredView, TrainView, ViewSet, load_recorded
+from mudg.gaussians.views import TrainView, ViewSet, load_recorded
 from mudg.scene.clouds import read_fused
 from mudg.scene.fuse import fused_without_boxes
 from mudg.scene.observations import ObservationSet
@@ -97,9 +96,8 @@ def write_fit(config: FitConfig, inputs: FitInputs, work: RunDir) -> dict[str, A
         config = storage.whole_run(config)
     with one_torch_thread(), memory_of(device, "fit"):
         state = _prepare(config, inputs, work.path).to(device)
-        with contextlib.closing(state.views):
-            optimise(state, config, work)
-            add_certainty(state, config)
+        optimise(state, config, work)
+        add_certainty(state, config)
     storage.save_model(state.model, work.path)
     storage.save_appearance(state.appearance, work.path)
     shutil.rmtree(work.path / "steps", ignore_errors=True)
@@ -172,14 +170,14 @@ def recorded_views(
     scratch: Path | None = None,
 ) -> tuple[ViewSet, tuple[int, ...]]:
     """The recorded views of a configuration, without virtual ones, and the train ids of the model's class channels
-    (those that ``virtual`` shows and ``start`` knows included). ``scratch``: keep them in a file in this folder, not in
+    (those that ``virtual`` shows and ``start`` knows included). ``scratch``: keep them in files in this folder, not in
     memory."""
     frames = views.training_frames(scene, config.cameras)
     classes = views.classes_of(scene, frames, virtual or {}) if config.semantics else ()
     classes = classes if start is None else storage.all_classes(start, classes)
     with_lidar = "lidar" in METHODS[config.method].supervision and config.loss.lidar_weight > 0
     loaded = load_recorded(scene, frames, classes, config.width_px, with_lidar)
-    return ViewSet(views.keep(loaded, len(frames), scratch), ()), classes
+    return ViewSet(views.keep(loaded, len(frames), scratch), filed=scratch is not None), classes
 
 
 def start_state(
@@ -208,7 +206,7 @@ def continued_state(config: FitConfig, start: storage.StartFit, shown: ViewSet, 
 
 
 def _nothing_corrected(config: FitConfig, shown: ViewSet) -> Appearance:
-    return Appearance.of_views([head.name for head in views.heads_of(shown.recorded)], config.appearance)
+    return Appearance.of_views([view.name for view in shown.recorded], config.appearance)
 
 
 def add_certainty(state: FitState, config: FitConfig) -> None:
@@ -233,23 +231,16 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
     virtual_from, pace = state.begun_at or virtual_from, checkpoint.Pace()
     sizes = views.HalvedViews(config.virtual.half_size * config.iterations, keep=not state.views.filed)
 
-    def choose(step: int) -> tuple[StoredView, ...]:
-        probability = config.virtual.probability if virtual_from < step <= virtual_to else 0.0
-        chosen = state.views.choose(config.seed, step, probability, config.virtual.beside)
-        return tuple(sizes.sized(view, step) for view in chosen)
-
-    with (
-        log.task(f"fit {config.method}", config.iterations, state.step) as bar,
-        Interruption() as interruption,
-        # The one way to the device; results come back in gaussians/rendering.py.
-        views.chosen_ahead(state.views, choose, range(state.step + 1, config.iterations + 1), state.device) as upcoming,
-    ):
+    with log.task(f"fit {config.method}", config.iterations, state.step) as bar, Interruption() as interruption:
         while state.step < config.iterations:
             began = time.perf_counter()
             step = state.step + 1
             if step - 1 <= virtual_from < step and state.views.virtual and config.virtual.gaussians:
                 start_unseen_gaussians(state, config, raster)
-            seen = next(upcoming)
+            probability = config.virtual.probability if virtual_from < step <= virtual_to else 0.0
+            chosen = state.views.choose(config.seed, step, probability, config.virtual.beside)
+            # The one way to the device; results come back in gaussians/rendering.py.
+            seen = [sizes.sized(view, step).as_tensors(state.device) for view in chosen]
             check = FiniteCheck(step, at_once=state.device.type == "cpu")
             how = [LearnStep(config, raster, perception, check, step, first=view is seen[0]) for view in seen]
             learnt = [_learn_from(state, view, of_view) for view, of_view in zip(seen, how)]

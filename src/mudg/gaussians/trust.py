@@ -27,7 +27,7 @@ from mudg.gaussians.appearance import Appearance
 from mudg.gaussians.model import SceneModel, compose, compose_as_read, composite_sky
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.start import StartPoints, voxel_filter
-from mudg.gaussians.views import StoredView, TrainView, heads_of
+from mudg.gaussians.views import StoredView, TrainView
 
 # certainty ----------------------------------------------------------------------------------------
 #
@@ -158,9 +158,8 @@ def unseen_maps(
 
     Pixels without depth count as sky, far away. Depends on the geometry the model has by now.
     """
-    heads = heads_of(recorded)
-    chosen = np.unique(np.linspace(0, len(heads) - 1, min(WITNESSES, len(heads))).round().astype(int))
-    witnesses = [_witness(model, heads[i].view, raster) for i in chosen]
+    chosen = np.unique(np.linspace(0, len(recorded) - 1, min(WITNESSES, len(recorded))).round().astype(int))
+    witnesses = [_witness(model, recorded[i].view, raster) for i in chosen]
     objects = [(node.size_m, cache(node.pose_matrix)) for node in model.nodes if isinstance(node, RigidNode)]
     for stored in log.progress(virtual, len(virtual), "finding unseen surfaces"):
         yield stored, _unseen(stored, witnesses, objects)
