@@ -16,7 +16,6 @@ from mudg.base.errors import InputError, UsageError
 from mudg.core import trajectory
 from mudg.diffusion import condition, model_files, synthesize
 from mudg.diffusion.model import MDM
-from mudg.diffusion.models import extended
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.diffusion.views import ViewMaker, add_detail, windows
 from mudg.gaussians import fit
@@ -223,9 +222,8 @@ def fitted(world, tmp_path_factory):
     folder = tmp_path_factory.mktemp("fitted")
     settings = fit_config(method="street_gaussians", iterations=4, start__gaussians=900)
     scene = Fit(scene=root / "scene", fused=root / "fused", out=folder / "fit", settings=settings).run()
-    before = model_files.load(root / "model")
-    grown = replace(before.config, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1))
-    model_files.save(extended(before, grown), folder / "model", "", {})
+    config = replace(model_files.load(root / "model").config, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1))
+    model_files.save(MDM(config), folder / "model", "", {})
     return scene, folder / "model"
 
 

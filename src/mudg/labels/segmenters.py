@@ -80,7 +80,7 @@ class Segmenter:
         if not folder or not (path / "config.json").is_file():
             expected = "a folder with config.json and model.safetensors"
             given = "give the folder of a segmentation network with Cityscapes classes as --weights"
-            remedy = f"{given}, or its name in the Hugging Face cache, or use --labeller geometry"
+            remedy = f"{given}, or its name in the Hugging Face cache, or use --labeller embedded"
             what, where = "the labeller's weights are missing", str(folder) or "weights"
             raise ResourceError(what, where=where, expected=expected, remedy=remedy)
         settings = folders.read_settings(path / "config.json")

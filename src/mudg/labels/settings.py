@@ -13,9 +13,9 @@ class AnnotateConfig:
     """Add the labels that a scene lacks: dense depth, semantic classes, sky and masks of dynamic objects, each with a
     confidence."""
 
-    labeller: Literal["embedded", "geometry", "network"] = "embedded"
-    """Source of classes and sky. embedded: the small shipped network, from image, heights and boxes. geometry: rules on
-    heights and boxes, without a network. network: a segmentation network from `weights`."""
+    labeller: Literal["embedded", "network"] = "embedded"
+    """Source of classes and sky. embedded: the small shipped network, from image, heights and boxes. network: a
+    segmentation network from `weights`."""
     weights: str = ""
     """labeller network: folder of a SegFormer or Mask2Former with Cityscapes classes in the transformers format,
     or its name in the Hugging Face cache (owner/name or owner/name@revision). labeller embedded: folder of a network
