@@ -568,7 +568,6 @@ METRICS: Final[dict[str, MetricRow]] = {
     "temporal_flickering": MetricRow("temporal flickering", "", ("views",), "higher", None),
     "lpips": MetricRow("LPIPS", "", ("rgb", "LPIPS weights"), "lower", None),
     "lpips_vgg": MetricRow("LPIPS (VGG)", "", ("rgb", "LPIPS weights"), "lower", None),
-    "lpips_squeeze": MetricRow("LPIPS (Squeeze)", "", ("rgb", "LPIPS weights"), "lower", None),
     "fid": MetricRow("FID", "", ("rgb", "Inception weights"), "lower", None),
     "kid": MetricRow("KID", "", ("rgb", "Inception weights"), "lower", None),
     "fd_dinov2": MetricRow("FD-DINOv2", "", ("rgb", "DINOv2 weights"), "lower", None),

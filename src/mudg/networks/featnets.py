@@ -17,7 +17,7 @@ The bank is differentiable, deterministic, and costs about as much as SSIM.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, Final, Literal, NamedTuple
 
 import torch
@@ -141,7 +141,7 @@ class CodecFeatures(nn.Module):
 WHOLE_PIXELS: Final = 2_500_000
 """Larger images (1920 x 1280 is just below) are halved until they have no more, before they are compared in the
 features of the codec."""
-LpipsTrunk = Literal["alex", "vgg", "squeeze"]
+LpipsTrunk = Literal["alex", "vgg"]
 LpipsInput = Literal["correct", "unscaled"]
 
 
@@ -156,32 +156,8 @@ class _Layer(NamedTuple):
     padding: int = 1
 
 
-class _Fire(NamedTuple):
-    """SqueezeNet's block: place in the trunk, channels in, between, and out of each of its two branches."""
-
-    place: str
-    into: int
-    between: int
-    each: int
-
-    def layers(self) -> tuple[_Layer, _Layer, _Layer]:
-        """What squeezes, and both branches."""
-        return (
-            _Layer(f"{self.place}.squeeze", self.between, self.into, 1, 1, 0),
-            _Layer(f"{self.place}.expand1x1", self.each, self.between, 1, 1, 0),
-            _Layer(f"{self.place}.expand3x3", self.each, self.between),
-        )
-
-
-class _Maximum(NamedTuple):
-    """Maxima over squares at every second place; ``whole``: squares that reach over the edge count, too."""
-
-    size: int
-    whole: bool = False
-
-
-_Stage = tuple[_Layer | _Fire | _Maximum, ...]
-_POOL, _SQUEEZE_POOL = _Maximum(3), _Maximum(3, whole=True)
+_Stage = tuple[_Layer | int, ...]
+"""Convolutions; a number stands for maxima over squares of that side at every second place."""
 
 
 def _vgg(first: int, channels: tuple[int, ...]) -> tuple[_Layer, ...]:
@@ -193,26 +169,17 @@ def _vgg(first: int, channels: tuple[int, ...]) -> tuple[_Layer, ...]:
 TRUNKS: Final[dict[LpipsTrunk, tuple[_Stage, ...]]] = {
     "alex": (
         (_Layer("0", 64, 3, 11, 4, 2),),
-        (_POOL, _Layer("3", 192, 64, 5, 1, 2)),
-        (_POOL, _Layer("6", 384, 192)),
+        (3, _Layer("3", 192, 64, 5, 1, 2)),
+        (3, _Layer("6", 384, 192)),
         (_Layer("8", 256, 384),),
         (_Layer("10", 256, 256),),
     ),
     "vgg": (
         _vgg(0, (3, 64, 64)),
-        (_Maximum(2), *_vgg(5, (64, 128, 128))),
-        (_Maximum(2), *_vgg(10, (128, 256, 256, 256))),
-        (_Maximum(2), *_vgg(17, (256, 512, 512, 512))),
-        (_Maximum(2), *_vgg(24, (512, 512, 512, 512))),
-    ),
-    "squeeze": (
-        (_Layer("0", 64, 3, 3, 2, 0),),
-        (_SQUEEZE_POOL, _Fire("3", 64, 16, 64), _Fire("4", 128, 16, 64)),
-        (_SQUEEZE_POOL, _Fire("6", 128, 32, 128), _Fire("7", 256, 32, 128)),
-        (_SQUEEZE_POOL, _Fire("9", 256, 48, 192)),
-        (_Fire("10", 384, 48, 192),),
-        (_Fire("11", 384, 64, 256),),
-        (_Fire("12", 512, 64, 256),),
+        (2, *_vgg(5, (64, 128, 128))),
+        (2, *_vgg(10, (128, 256, 256, 256))),
+        (2, *_vgg(17, (256, 512, 512, 512))),
+        (2, *_vgg(24, (512, 512, 512, 512))),
     ),
 }
 """Stages of each network; features are read after each. Places are those of torchvision's networks."""
@@ -222,23 +189,13 @@ def lpips_shapes(trunk: LpipsTrunk) -> dict[str, tuple[int, ...]]:
     """Name -> shape of the tensors of a network of LPIPS, as the lpips package names them."""
     shapes: dict[str, tuple[int, ...]] = {}
     for number, stage in enumerate(TRUNKS[trunk]):
-        width = 0
-        for step in stage:
-            width = step.out if isinstance(step, _Layer) else 2 * step.each if isinstance(step, _Fire) else width
-        for layer in _layers(stage):
+        layers = [step for step in stage if isinstance(step, _Layer)]
+        for layer in layers:
             named = f"net.slice{number + 1}.{layer.place}"
             shapes[f"{named}.weight"] = (layer.out, layer.into, layer.size, layer.size)
             shapes[f"{named}.bias"] = (layer.out,)
-        shapes[f"lin{number}.model.1.weight"] = (1, width, 1, 1)
+        shapes[f"lin{number}.model.1.weight"] = (1, layers[-1].out, 1, 1)
     return shapes
-
-
-def _layers(stage: _Stage) -> Iterator[_Layer]:
-    for step in stage:
-        if isinstance(step, _Layer):
-            yield step
-        elif isinstance(step, _Fire):
-            yield from step.layers()
 
 
 class LpipsFeatures(nn.Module):
@@ -248,7 +205,7 @@ class LpipsFeatures(nn.Module):
         state: ``net.slice1.0.weight``, ..., ``lin0.model.1.weight``, ..., as the lpips package names them; other
             entries are left alone.
         where: file name for errors.
-        trunk: AlexNet, VGG-16 or SqueezeNet 1.1.
+        trunk: AlexNet or VGG-16.
         given: correct: colours are brought to [-1, 1] first. unscaled: they stay in [0, 1], as in much published code
             of Gaussian scenes.
 
@@ -288,21 +245,14 @@ class LpipsFeatures(nn.Module):
         features = []
         for number, stage in enumerate(TRUNKS[self.trunk]):
             for step in stage:
-                if isinstance(step, _Maximum):
-                    x = F.max_pool2d(x, step.size, 2, ceil_mode=step.whole)
-                elif isinstance(step, _Fire):
-                    squeeze, *branches = step.layers()
-                    x = self._convolved(number, squeeze, x)
-                    x = torch.cat([self._convolved(number, branch, x) for branch in branches], 1)
-                else:
-                    x = self._convolved(number, step, x)
+                if isinstance(step, int):
+                    x = F.max_pool2d(x, step, 2)
+                    continue
+                path = f"net/slice{number + 1}/{step.place}"
+                kernel, bias = self.get_buffer(f"{path}/weight"), self.get_buffer(f"{path}/bias")
+                x = F.relu(F.conv2d(x, kernel, bias, step.stride, step.padding))
             features.append(x[0])
         return features
-
-    def _convolved(self, stage: int, layer: _Layer, x: Tensor) -> Tensor:
-        path = f"net/slice{stage + 1}/{layer.place.replace('.', '/')}"
-        kernel, bias = self.get_buffer(f"{path}/weight"), self.get_buffer(f"{path}/bias")
-        return F.relu(F.conv2d(x, kernel, bias, layer.stride, layer.padding))
 
 
 def reduced(image: Tensor) -> Tensor:

@@ -59,7 +59,6 @@ TRUTH: Final = "=truth"
 LPIPS_FILES: Final[Mapping[str, tuple[str, LpipsTrunk]]] = {
     "lpips_weights": ("lpips", "alex"),
     "lpips_vgg_weights": ("lpips_vgg", "vgg"),
-    "lpips_squeeze_weights": ("lpips_squeeze", "squeeze"),
 }
 """Setting that names a file -> row of the table and the network in the file."""
 DEPTH_LIMIT_M: Final = 80.0
