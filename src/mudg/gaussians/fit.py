@@ -16,6 +16,7 @@ import shutil
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -242,8 +243,8 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
             # The one way to the device; results come back in gaussians/rendering.py.
             seen = [sizes.sized(view, step).as_tensors(state.device) for view in chosen]
             check = FiniteCheck(step, at_once=state.device.type == "cpu")
-            how = [LearnStep(config, raster, perception, check, step, first=view is seen[0]) for view in seen]
-            learnt = [_learn_from(state, view, of_view) for view, of_view in zip(seen, how)]
+            learn = partial(_learn_from, state, config=config, raster=raster, perception=perception, check=check)
+            learnt = [learn(view, step=step, first=view is seen[0]) for view in seen]
             check.refuse()
             adam_step(state.model, step, config.iterations, state.begun_at)
             rates = appearance_rates(step, config.iterations)
@@ -275,19 +276,6 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
                 interruption.stop_now()
 
 
-@dataclass(frozen=True)
-class LearnStep:
-    """What a step does with one of its views. ``check``: takes what must be finite. ``first``: whether it is the first
-    view of this step; terms that do not depend on the view count with it."""
-
-    config: FitConfig
-    raster: RasterConfig
-    perception: Perception
-    check: FiniteCheck
-    step: int
-    first: bool
-
-
 class LearntPicture(NamedTuple):
     """What a step rendered: colours f32[3, H, W] without the sky, and coverage f32[1, H, W]."""
 
@@ -295,11 +283,21 @@ class LearntPicture(NamedTuple):
     alpha: Tensor
 
 
-def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[LearntPicture, dict[str, Tensor]]:
+def _learn_from(
+    state: FitState,
+    view: TrainView,
+    *,
+    step: int,
+    first: bool,
+    config: FitConfig,
+    raster: RasterConfig,
+    perception: Perception,
+    check: FiniteCheck,
+) -> tuple[LearntPicture, dict[str, Tensor]]:
     """Render a view and add the gradients of its loss to the parameters'. Returns the picture (not all that was
-    rendered: that would stay in memory while the next view is), and the weighted loss terms."""
-    config, step, raster, recipe = how.config, how.step, how.raster, recipe_of(how.config.method)
-    recorded = view.kind == "recorded"
+    rendered: that would stay in memory while the next view is), and the weighted loss terms. ``first``: of the views of
+    this step; terms that do not depend on the view count with it."""
+    recipe, recorded = recipe_of(config.method), view.kind == "recorded"
     model = recipe.drawn_model(state.model, view, step, config) if recorded else state.model
     growing = recorded and isinstance(state.schedule, DensifySettings) and step <= state.schedule.stop
     with_classes = not recorded or step % config.loss.semantic_every == 0
@@ -310,13 +308,13 @@ def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[Learn
         terms = recorded_terms(state, render, view, recipe.common(config))
         terms |= recipe.terms(DrawnView(model, gaussians, render, view, step, config, raster))
     else:
-        terms = virtual_terms(state, render, view, config, how.perception)
-    if how.first and config.loss.opacity_weight:
+        terms = virtual_terms(state, render, view, config, perception)
+    if first and config.loss.opacity_weight:
         terms["opacity"] = config.loss.opacity_weight * gaussians.opacity.mean()
     terms |= correction_terms(state, gaussians, view, config, raster, step)
-    how.check.terms(view.name, terms)
+    check.terms(view.name, terms)
     torch.stack(list(terms.values())).sum().backward()
-    how.check.gradients(view.name, state.model, state.appearance)
+    check.gradients(view.name, state.model, state.appearance)
     if growing:
         camera = view.view.camera
         timed = state.model.table["tau"].grad if "tau" in state.model.table.columns else None
