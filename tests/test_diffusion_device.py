@@ -111,9 +111,7 @@ def test_a_clip_of_the_small_model_is_the_same_on_a_device_and_crosses_once(smal
     assert sorted(crossed.to_host) == sorted(back + latents + fits)
 
 
-@pytest.mark.parametrize(
-    "changes", [{"sampler": "dpm_solver", "steps": 4}, pytest.param({"align": False}, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("changes", [{"steps": 4}, pytest.param({"align": False}, marks=pytest.mark.slow)])
 def test_other_requests_and_a_second_window_too(small, changes):
     condition = made_up_clip(2).condition
     first = generated(small, condition, SampleRequest(1, 5))

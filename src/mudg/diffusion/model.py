@@ -423,8 +423,7 @@ class MDM(nn.Module):
 
     @staticmethod
     def check_request(request: SampleRequest) -> None:
-        """UsageError for a setting that does not apply to this kind of model, or to the sampler."""
-        request.sampler_settings()
+        """UsageError for a setting that does not apply to this kind of model."""
         if request.guidance is not None or request.guidance_rescale is not None:
             raise UsageError(
                 "only published-type models have guidance",

@@ -28,11 +28,8 @@ class SynthesizeConfig:
     steps: int = setting(default=2, ge=1, le=1000)
     """Denoising steps. More add texture and agree less with the truth pixel by pixel. Use 50 for published-type
     models."""
-    sampler: Literal["ddim", "dpm_solver"] = "ddim"
-    """Sampler of the diffusion model. ddim: first order, with fresh noise between steps. dpm_solver: second order and
-    deterministic, for many steps. Both cost one network pass per step."""
     eta: float | None = setting(default=None, ge=0, le=1)
-    """Sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not
+    """Noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not
     given: 1)."""
     condition: Literal["full", "reference", "points", "concat", "repair"] = "full"
     """Which parts of the model's condition are given, to measure what each brings. reference: the nearest recorded
