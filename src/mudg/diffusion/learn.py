@@ -284,7 +284,6 @@ def log_rules(config: LearnConfig, multiple: int, points_alone: bool = False) ->
 def rules_of_size(config: LearnConfig, size: tuple[int, int], held_out_every: int, points_alone: bool) -> LogClipRules:
     """How clips of a size are cut from logs."""
     data = config.data
-    least_points = 1.0 if points_alone else LogClipRules.least_points
     return LogClipRules(
         *size,
         window=data.window,
@@ -293,8 +292,7 @@ def rules_of_size(config: LearnConfig, size: tuple[int, int], held_out_every: in
         held_out_every=held_out_every,
         seed=config.seed,
         published=points_alone,
-        depth=data.depth,
-        least_points=least_points if data.least_points is None else data.least_points,
+        least_points=1.0 if points_alone else LogClipRules.least_points,
     )
 
 
@@ -324,13 +322,12 @@ def clips_of_logs(config: LearnConfig, rules: LogClipRules, folder: Path, train:
     if not scored:
         log.warn("learn: no clip is held out; the scored clip was also trained on")
     condition = "the projected points and the first image" if rules.published else "images taken at other times"
-    elsewhere = ", and from labels elsewhere" if rules.depth == "annotated" else ""
     about = (
         f"{train} clips of {data.window} frames of {len(data.scenes)} recorded"
         f" {'log' if len(data.scenes) == 1 else 'logs'} at {rules.width}x{rules.height} pixels, seen from where"
-        f" they were\nrecorded, with {condition} as condition. Depth was learned where a sweep measured it{elsewhere}."
-        " The model this\none continues from has training data of its own. `held-out` below means every"
-        f" {data.held_out_every}. window of these logs."
+        f" they were\nrecorded, with {condition} as condition. Depth was learned where a sweep measured it,"
+        " and from labels elsewhere. The model this\none continues from has training data of its own. `held-out` below"
+        f" means every {data.held_out_every}. window of these logs."
     )
     to_score = [city_clips.HELD_OUT + n for n in range(scored)] if data.held_out_every else [0]
     return TrainingClips(config, folder, size, [size], range(train), train, to_score, about)

@@ -192,12 +192,6 @@ class LearnData:
     """Logs: frames between the starts of two clips. Values below `window` give overlapping clips."""
     held_out_every: int = setting(default=5, ge=0)
     """Logs: every n-th clip is used for scoring only (0 = none)."""
-    depth: Literal["annotated", "sweep"] = "annotated"
-    """Logs: what is learned as depth. annotated: the sweep taken with an image where it measured, elsewhere the scene's
-    depth labels, weighted with their confidence. sweep: the sweep alone, which covers a few percent of the pixels."""
-    least_points: float | None = setting(default=None, gt=0, le=1)
-    """Logs: smallest share of the cloud's points in the condition of a training clip; the share is drawn between this
-    and 1 (not given: 0.3; published-type models: 1, all points, as in the paper)."""
 
 
 @settings

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
@@ -41,7 +42,7 @@ from mudg.labels.ground import driven_path
 from mudg.labels.inputs import DepthInput, DepthNetwork, LabelInput, Labeller, Labels
 from mudg.labels.segmenters import Segmenter
 from mudg.labels.settings import AnnotateConfig
-from mudg.networks.folders import Compute, find, title
+from mudg.networks.folders import find, title
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points, read_scene, spread
 from mudg.scene.write import SceneWriter
@@ -53,12 +54,12 @@ from mudg.scene.write import SceneWriter
 # for both (`by_geometry.py`).
 
 
-def _network(weights: str, compute: Compute) -> Labeller:
-    segmenter = Segmenter.load(weights, compute)
+def _network(weights: str, device: torch.device) -> Labeller:
+    segmenter = Segmenter.load(weights, device)
     return lambda given: label_by_network(given, *segmenter.classes(given.rgb))
 
 
-LABELLERS: Mapping[str, Callable[[str, Compute], Labeller]] = {
+LABELLERS: Mapping[str, Callable[[str, torch.device], Labeller]] = {
     "embedded": street_net.StreetLabeller.load,
     "network": _network,
 }
@@ -73,10 +74,9 @@ Raises: ResourceError: weights, or the packages that read them, are missing."""
 # it is marked by a small file beside its labels, warned of, and counted in the notes.
 
 
-def place(config: AnnotateConfig) -> Compute:
+def place(config: AnnotateConfig) -> torch.device:
     """Where the networks of a configuration compute."""
-    device = choose_device(config.device, "networks of annotate", NETWORK_KINDS)
-    return Compute(str(device), config.precision == "bfloat16")
+    return choose_device(config.device, "networks of annotate", NETWORK_KINDS)
 
 
 def placed(config: AnnotateConfig) -> AnnotateConfig:
@@ -85,7 +85,7 @@ def placed(config: AnnotateConfig) -> AnnotateConfig:
     Raises:
         UsageError: not a device for networks. ResourceError: it is not on this machine.
     """
-    return replace(config, device=place(config).device)
+    return replace(config, device=str(place(config)))
 
 
 def folders(config: AnnotateConfig) -> dict[str, Path]:

@@ -40,7 +40,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.core.pictures import resize_bicubic
 from mudg.labels.inputs import DepthInput, Prediction
 from mudg.networks import clip, folders
-from mudg.networks.folders import CPU, Compute
+from mudg.networks.folders import CPU
 
 KIND: Final = "depthlab"
 SCHEMA: Final = 1
@@ -146,15 +146,15 @@ class DepthLabParts:
     scheduler: Any
 
 
-def read_parts(folder: Path, described: Mapping[str, Any], compute: Compute = CPU) -> DepthLabParts:
+def read_parts(folder: Path, described: Mapping[str, Any], device: torch.device = CPU) -> DepthLabParts:
     """The networks of a converted folder in float32 on their device, every file checked against its sha256.
 
     Raises:
         InputError: the description is not whole, or tensors do not fit it. IntegrityError: a file is missing or
             altered.
-        ResourceError: a package or the device is missing.
+        ResourceError: a package is missing.
     """
-    device, where = compute.ready(), folder / DESCRIPTION
+    where = folder / DESCRIPTION
     with records.understood("a DepthLab model", str(where)):
         configs = {name: dict(described["parts"][name]["config"]) for name in PARTS}
         files = {name: {str(f): str(d) for f, d in described["parts"][name]["files"].items()} for name in PARTS}
@@ -340,24 +340,24 @@ class DepthLab:
     """A DepthLab model ready for use; ``load`` makes one from a converted folder."""
 
     def __init__(
-        self, parts: DepthLabParts, sampling: DepthLabSampling = PUBLISHED_SAMPLING, compute: Compute = CPU
+        self, parts: DepthLabParts, sampling: DepthLabSampling = PUBLISHED_SAMPLING, device: torch.device = CPU
     ) -> None:
         """Raises: UsageError: more steps than the noise schedule has."""
         most = int(parts.scheduler.config.num_train_timesteps)
         if sampling.steps > most:
             where, got = "--depth-steps", str(sampling.steps)
             raise UsageError("too many denoising steps", where=where, expected=f"<= {most}", got=got)
-        self._parts, self._sampling, self._compute = parts, sampling, compute
+        self._parts, self._sampling, self._device = parts, sampling, device
         self._cell = 2 ** (len(parts.vae.config.block_out_channels) - 1)
         share_features(parts.reference_unet, parts.denoising_unet)
 
     @classmethod
-    def load(cls, folder: str | Path, compute: Compute = CPU, steps: int = 0) -> DepthLab:
+    def load(cls, folder: str | Path, device: torch.device = CPU, steps: int = 0) -> DepthLab:
         """Read a folder that ``mudg convert`` wrote; ``steps`` of denoising, 0 = as the folder says.
 
         Raises:
             InputError: not such a folder, or not of this version. IntegrityError: a file is missing or altered.
-            ResourceError: a package or the device is missing. UsageError: too few steps.
+            ResourceError: a package is missing. UsageError: too few steps.
         """
         file = Path(folder) / DESCRIPTION
         described = folders.read_settings(file)
@@ -367,7 +367,7 @@ class DepthLab:
             raise InputError(what, where=str(file), expected=f"kind {KIND}, schema {SCHEMA}", got=got, remedy=remedy)
         sampling = records.parse_dataclass(DepthLabSampling, described.get("sampling"), f"{file}: sampling")
         sampling = dataclasses.replace(sampling, steps=steps or sampling.steps)
-        return cls(read_parts(Path(folder), described, compute), sampling, compute)
+        return cls(read_parts(Path(folder), described, device), sampling, device)
 
     def __call__(self, inputs: DepthInput) -> Prediction:
         """Depth of one image at the image's size, near metres: it is to be aligned.
@@ -383,37 +383,32 @@ class DepthLab:
 
     def predict(self, prepared: Prepared, noise: Tensor) -> Tensor:
         """Depth f32[1, 1, h, w], 0..1 between least and greatest known (others go beyond), from noise [1, C, H, W]."""
-        parts, sampling, device = self._parts, self._sampling, self._compute.device
+        parts, sampling, device = self._parts, self._sampling, self._device
         noise = noise.to(device)
         with torch.inference_mode():
             planes = (prepared.nearest, prepared.linear, 2 * prepared.missing - 1, prepared.image)
             depth, known, mask, image = map(self._encoded, planes)
             # one pixel of every cell decides, as published
             missing = functional.interpolate(prepared.missing, size=noise.shape[2:], mode="nearest").to(device)
-            with self._compute.autocast():
-                embedding = parts.mapping_layer(parts.image_encoder(prepared.crop.to(device)).image_embeds[:, None])
-                parts.reference_unet(image, torch.zeros((), dtype=torch.int64), encoder_hidden_states=embedding)
+            embedding = parts.mapping_layer(parts.image_encoder(prepared.crop.to(device)).image_embeds[:, None])
+            parts.reference_unet(image, torch.zeros((), dtype=torch.int64), encoder_hidden_states=embedding)
             parts.scheduler.set_timesteps(sampling.steps)
             times = parts.scheduler.timesteps[sampling.steps - int(sampling.steps * sampling.strength) :]
             latent = parts.scheduler.add_noise(depth, noise, times[:1]) if sampling.strength < 1 else noise
             for i, t in enumerate(times):
-                with self._compute.autocast():
-                    seen = torch.cat([latent, mask, known], 1)
-                    output = parts.denoising_unet(seen, t, encoder_hidden_states=embedding, return_dict=False)[0]
-                latent = parts.scheduler.step(output.float(), t, latent).prev_sample
+                seen = torch.cat([latent, mask, known], 1)
+                output = parts.denoising_unet(seen, t, encoder_hidden_states=embedding, return_dict=False)[0]
+                latent = parts.scheduler.step(output, t, latent).prev_sample
                 if i + 1 < len(times):
                     as_known = parts.scheduler.add_noise(depth, noise, times[i + 1 : i + 2])
                     latent = missing * latent + (1 - missing) * as_known
-            with self._compute.autocast():
-                decoded = parts.vae.decode(latent / LATENT_SCALE, return_dict=False)[0]
-        found = decoded.float().mean(1, keepdim=True)[..., : prepared.size[0], : prepared.size[1]]
+            decoded = parts.vae.decode(latent / LATENT_SCALE, return_dict=False)[0]
+        found = decoded.mean(1, keepdim=True)[..., : prepared.size[0], : prepared.size[1]]
         return (found / sampling.normalize_scale + 1) / 2
 
     def _encoded(self, plane: Tensor) -> Tensor:
         """Latent f32 of an image [1, 3, H, W], or of one channel thrice."""
-        with self._compute.autocast():
-            latent = self._parts.vae.encode(plane.expand(-1, 3, -1, -1).to(self._compute.device)).latent_dist.mode()
-        return latent.float() * LATENT_SCALE
+        return self._parts.vae.encode(plane.expand(-1, 3, -1, -1).to(self._device)).latent_dist.mode() * LATENT_SCALE
 
 
 # conversion ---------------------------------------------------------------------------------------

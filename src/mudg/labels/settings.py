@@ -29,9 +29,6 @@ class AnnotateConfig:
     """DepthLab: denoising steps (0 = as in the model folder)."""
     device: DeviceName = "auto"
     """Device of the networks of labeller and `depth_network`: auto (CUDA if there is one), cpu, cuda, cuda:N, mps."""
-    precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Number format of these networks. auto is float32; bfloat16 is faster on some devices and rounds depth to 0.4
-    percent."""
     sweeps: int = setting(default=6, ge=1, le=100)
     """Number of sweeps per LiDAR, nearest in time, whose points are merged for dense depth."""
     dynamic: bool = True
