@@ -7,7 +7,7 @@
 The scene is a generated city of 8 frames at the wanted size, made once and kept in --work; its frames (and exact
 virtual views of them) are named as often as views are wanted, so that all are read and decoded but the disk holds few.
 The fit is the product's own: `load_recorded`, `load_virtual`, the starting model and the loop. The peak is that of
-anonymous memory: pages of the scratch file that the system keeps are its own to drop.
+anonymous memory: pages of the files that the system keeps are its own to drop.
 """
 
 from __future__ import annotations
@@ -145,12 +145,6 @@ def loaded(
         "loading_cpu_s": time.process_time() - began[1],
         "expected_gib": needed / GIB,
     }
-    for name in ("recorded", "virtual"):
-        every = getattr(found, name)
-        if isinstance(every, kept.ViewFile):
-            numbers[f"bytes_per_{name}_view"] = (
-                statistics.fmean(slot.size for slot in every._slots) if len(every) else 0
-            )
     began = time.perf_counter(), time.process_time()
     state = fit.start_state(config, scene, cloud, found, classes)
     return state, config, {**numbers, "start_s": time.perf_counter() - began[0], "gaussians": len(state.model.table)}
@@ -158,22 +152,10 @@ def loaded(
 
 @contextlib.contextmanager
 def step_times(first: int, last: int) -> Iterator[dict[str, list[float]]]:
-    """Clocks in the loop: waiting for views, reading them and making tensors (processor time of the thread), whole
-    steps."""
-    found: dict[str, list[float]] = {"waiting": [], "tensors": [], "reading": [], "step": []}
-    chosen_ahead, due, choose, tensors = (
-        fit.views.chosen_ahead,
-        fit.densify_if_due,
-        ViewSet.choose,
-        StoredView.as_tensors,
-    )
+    """Clocks in the loop: choosing views and making tensors of them (processor time of the thread), whole steps."""
+    found: dict[str, list[float]] = {"choosing": [], "tensors": [], "step": []}
+    due, choose, tensors = fit.densify_if_due, ViewSet.choose, StoredView.as_tensors
     began = [time.perf_counter()]
-
-    @contextlib.contextmanager
-    def with_clock(*arguments: Any) -> Iterator[Any]:
-        with chosen_ahead(*arguments) as upcoming:
-            ask = timed(lambda: next(upcoming), found["waiting"])
-            yield iter(ask, None)
 
     def count(*given: Any) -> dict[str, Any]:
         found["step"].append(time.perf_counter() - began[0])
@@ -182,13 +164,13 @@ def step_times(first: int, last: int) -> Iterator[dict[str, list[float]]]:
             raise EnoughSteps
         return due(*given)
 
-    fit.views.chosen_ahead, fit.densify_if_due = with_clock, count
-    ViewSet.choose = timed(choose, found["reading"], time.thread_time)
+    fit.densify_if_due = count
+    ViewSet.choose = timed(choose, found["choosing"], time.thread_time)
     StoredView.as_tensors = timed(tensors, found["tensors"], time.thread_time)
     try:
         yield found
     finally:
-        fit.views.chosen_ahead, fit.densify_if_due = chosen_ahead, due
+        fit.densify_if_due = due
         ViewSet.choose, StoredView.as_tensors = choose, tensors
     for name in found:
         found[name] = found[name][first:]
@@ -202,7 +184,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         folder = RunDir.open(Path(out) / "fit", fit.OUTPUT, {}, {})
         state, config, numbers = loaded(options, city, folder.path)
         numbers["peak_loading_gib"] = memory.peak / GIB
-        with contextlib.closing(state.views), step_times(3, options.steps) as found, contextlib.suppress(EnoughSteps):
+        with step_times(3, options.steps) as found, contextlib.suppress(EnoughSteps):
             fit.optimise(state, config, folder)
     medians = {f"{name}_ms": 1e3 * statistics.median(values) for name, values in found.items()}
     return {
@@ -217,19 +199,14 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
 def table(found: dict[str, Any]) -> str:
     """The numbers for people."""
     count = found["views"] + found["virtual"]
-    step, waiting = found["step_ms"], found["waiting_ms"]
-    held = [
-        f"{found[f'bytes_per_{n}_view'] / 1e6:.1f} MB per {n} view"
-        for n in ("recorded", "virtual")
-        if f"bytes_per_{n}_view" in found
-    ]
+    step, tensors = found["step_ms"], found["tensors_ms"]
     return (
         "\n".join(
             [
                 (
                     f"{found['views']} recorded and {found['virtual']} virtual views of {found['size']},"
                     f" {found['expected_gib']:.1f} GiB expected,"
-                    f" {'in memory' if found['in_memory'] else 'in a scratch file: ' + ', '.join(held)}"
+                    f" {'in memory' if found['in_memory'] else 'in files'}"
                 ),
                 (
                     f"loading {found['loading_s']:.0f} s, {1e3 * found['loading_cpu_s'] / count:.0f} ms of processor"
@@ -241,10 +218,8 @@ def table(found: dict[str, Any]) -> str:
                     f" {found['peak_gib']:.2f} GiB in all"
                 ),
                 (
-                    f"{found['steps']} steps, {found['threads']} threads, medians: step {step:.0f} ms, of which waiting"
-                    f" for views {waiting:.1f} ms ({waiting / step:.1%}), the making of tensors included; processor"
-                    f" time: tensors of a view {found['tensors_ms']:.1f} ms, reading the views of a step, in other"
-                    f" threads if in a file, {found['reading_ms']:.1f} ms"
+                    f"{found['steps']} steps, {found['threads']} threads, medians: step {step:.0f} ms; tensors of"
+                    f" a view {tensors:.1f} ms"
                 ),
             ]
         )
@@ -265,7 +240,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--in-memory", action="store_true", help="keep all views in memory, whatever they take")
     parser.add_argument(
-        "--work", default=str(Path(tempfile.gettempdir()) / "mudg_bench_fit"), help="where scene and scratch file lie"
+        "--work", default=str(Path(tempfile.gettempdir()) / "mudg_bench_fit"), help="where scene and files lie"
     )
     parser.add_argument("--json", default="", help="also write the numbers here")
     options = parser.parse_args()

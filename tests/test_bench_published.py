@@ -106,7 +106,6 @@ def test_every_setting_has_its_benchmarks():
 REFUSED = [
     ("paper", ["--steps", "50"], "--steps", "--synthesize.steps"),
     ("shift", ["--eta", "0.5"], "--eta", "--synthesize.eta"),
-    ("real", ["--sampler", "dpm_solver"], "--sampler", "--synthesize.sampler"),
     ("paper", ["--cities", "development"], "--cities", "leave it out"),
     ("paper", ["--ablation"], "--ablation", "leave it out"),
     ("paper", ["--variant", "a=sh_degree:1"], "--variant", "leave it out"),

@@ -16,11 +16,11 @@ from mudg.base import store
 from mudg.base.types import Gaussians, Track
 from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.core.table import Table
-from mudg.gaussians import fit
+from mudg.gaussians import fit, trust
 from mudg.gaussians.model import SceneModel, compose
 from mudg.gaussians.nodes import RigidNode, SkyNode, StaticNode
 from mudg.gaussians.rendering import render_condition
-from mudg.gaussians.trust import COLOR_ERROR, DEPTH_ERROR, PhotoEvidence, certainty_of, difference_images, weight_sums
+from mudg.gaussians.trust import COLOR_ERROR, DEPTH_ERROR, certainty_of, difference_images, weight_sums
 from mudg.gaussians.views import LidarPixels, StoredView
 from mudg.scene.clouds import write_fused
 from mudg.steps.fit import Fit
@@ -108,7 +108,7 @@ def test_images_of_differences():
 def test_certainty_of_known_sums():
     def certainty(views: float, color: float, lidar: float, depth: float) -> float:
         values = (views, 10.0, 10.0 * color, lidar, lidar * depth)
-        return float(PhotoEvidence(*(torch.tensor([value]) for value in values)).certainty())
+        return float(trust.certainty(*(torch.tensor([value]) for value in values)))
 
     assert certainty(0, 0, 0, 0) == 0
     assert certainty(1, 0, 0, 0) == pytest.approx(0.5 * 0.5)  # LiDAR never met it

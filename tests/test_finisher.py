@@ -206,7 +206,7 @@ def test_the_finisher_starts_from_the_stated_error_not_from_the_confidence():
 
 def gradients(model, clips):
     model.zero_grad(set_to_none=True)
-    loss = model.loss(clips, BatchPart(0, 0, 0, len(clips)), LossSettings(None, 1.0, 0.2))
+    loss = model.loss(clips, BatchPart(0, 0, 0, len(clips)), LossSettings(1.0, 0.2))
     loss.total.backward()
     return loss, {name: None if p.grad is None else p.grad.clone() for name, p in model.named_parameters()}
 
@@ -263,7 +263,7 @@ def test_a_patch_is_finished_from_its_own_part_of_its_own_clip(monkeypatch, row,
     stated["rgb"][:, :, :3] = functional.avg_pool2d(of_clips, 2).unflatten(0, (2, frames))
     monkeypatch.setattr(model, "refine", refined)
     monkeypatch.setattr(model.finisher, "forward", finished)
-    model._finisher_terms(stated, encoded, clips, LossSettings(None, 1.0, 0.2))
+    model._finisher_terms(stated, encoded, clips)
     made, scale = seen[0]
     assert scale.tolist() == [2.0] * frames
     assert made.rgb.shape == (frames, 3, 2 * side, 2 * side)
@@ -283,16 +283,15 @@ def test_refining_the_surroundings_of_a_patch_is_as_good_as_refining_its_image(r
     clip = with_patch(made_up_clip(3, 192, 128), row, column, side, scale=2)
     clip = replace(clip, fine=replace(clip.fine, clip=replace(clip.fine.clip, rgb=clip.fine.clip.rgb * 0.9)))
     encoded, truth = model.encode_condition([clip.condition]), model.encode_truth([clip])
-    settings = LossSettings(None, 1.0, 0.2)
     stated = {m: z + 0.2 * torch.randn(z.shape, generator=generator) for m, z in truth.latents.items()}
     with torch.no_grad():
-        terms = model._finisher_terms(stated, encoded, [clip], settings)
+        terms = model._finisher_terms(stated, encoded, [clip])
         whole = model._made(model.refine({m: z[0] for m, z in stated.items()}, encoded.pixels, frames))
         made = whole.enlarged((256, 384), (2 * row, 2 * (row + side)), (2 * column, 2 * (column + side)))
         given = model._pixels_of(Stacked.of([clip.fine.clip.condition]))
         done = model.finisher(made, given, frames, torch.full((frames,), 2.0))
         as_refined = Refined(done.rgb, done.depth_code, network.class_scores(done), done.log_error)
-        expected = model._pixel_terms(as_refined, model.pixel_truth([clip.fine.clip]), settings, "fine")
+        expected = model._pixel_terms(as_refined, model.pixel_truth([clip.fine.clip]), "fine")
     for name, value in expected.items():
         assert float(terms[name]) == pytest.approx(float(value), rel=1.5e-3, abs=1e-5), name
 

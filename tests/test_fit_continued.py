@@ -53,9 +53,9 @@ def psnr_beside(folder: Path) -> float:
 def test_it_starts_from_the_finished_scene_and_learns_from_virtual_views_at_once(world, tmp_path, monkeypatch):
     seen, learn = [], fit._learn_from
 
-    def spy(state, view, *rest):
+    def spy(state, view, **how):
         seen.append((len(seen), view.kind))
-        return learn(state, view, *rest)
+        return learn(state, view, **how)
 
     monkeypatch.setattr(fit, "_learn_from", spy)
     one = go_on(world, tmp_path / "one", settings(iterations=1, virtual__continued_probability=1.0, virtual__stop=1.0))

@@ -1,4 +1,4 @@
-"""Views in a scratch file are those in memory, to the bit; threads that read ahead leave nothing behind."""
+"""Views in files are those in memory, to the bit; threads that read frames leave nothing behind."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import errno
 import itertools
 import os
 import shutil
-import sys
 import threading
-import tracemalloc
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -27,7 +26,7 @@ from mudg.gaussians import views as fit_views
 from mudg.gaussians import views as kept
 from mudg.gaussians.nodes import SkyNode
 from mudg.gaussians.start import StartPoints
-from mudg.gaussians.views import LidarPixels, StoredView, TrainView, ViewSet
+from mudg.gaussians.views import LidarPixels, StoredView, TrainView
 from mudg.scene.read import read_scene
 
 SIZE, FRAMES = (60, 40), 6
@@ -74,144 +73,42 @@ def assert_same(found: StoredView | TrainView, wanted: StoredView | TrainView) -
             assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes()), field.name
 
 
-def filed(folder: Path, views: list[StoredView]) -> kept.ViewFile:
+def filed(folder: Path, views: list[StoredView]) -> Sequence[StoredView]:
     def loaded():
         for index in reversed(range(len(views))):  # any order
             yield index, views[index]
 
-    found = kept.keep(loaded(), len(views), folder)
-    assert isinstance(found, kept.ViewFile)
-    return found
+    return kept.keep(loaded(), len(views), folder)
 
 
-def open_in(folder: Path) -> list[str]:
-    """Files below a folder that this process holds open, deleted ones included."""
-    descriptors = Path("/proc/self/fd")
-    if not descriptors.is_dir():
-        pytest.skip("the system does not list open files")
-    targets = []
-    for entry in descriptors.iterdir():
-        try:
-            targets.append(os.readlink(entry))
-        except OSError:
-            continue
-    return [target for target in targets if target.startswith(str(folder))]
-
-
-def test_every_combination_of_fields_and_number_types_comes_back_to_the_bit(tmp_path):
+def test_every_combination_of_fields_and_number_types_comes_back_to_the_bit(tmp_path, monkeypatch):
     """A label image may hold other numbers than usual; nothing may be cut off."""
     combinations = [c for n in range(len(OPTIONAL) + 1) for c in itertools.combinations(OPTIONAL, n)]
     views = [a_view(seed, given) for seed, given in enumerate(combinations)]
+    monkeypatch.setattr(kept, "FILE_BYTES", 1000)
     read = filed(tmp_path, views)
     assert len(read) == len(views) == 64
     for found, wanted in zip(read, views, strict=True):
         assert_same(found, wanted)
         assert_same(found.as_tensors(), wanted.as_tensors())
-    assert list(fit_views.heads_of(read)) == list(fit_views.heads_of(views))
+        assert isinstance(found.rgb.base.base if found.rgb.base.base is not None else found.rgb.base, np.memmap)
     assert list(tmp_path.iterdir()) == []
-    read.close()
     usual = a_view(5)
     views = [replace(usual, depth=usual.depth.astype(np.float64)), replace(usual, depth=usual.depth.astype(np.float16))]
     for found, wanted in zip(filed(tmp_path, views), views, strict=True):
         assert_same(found, wanted)
 
 
-def test_a_file_of_views_reads_one_at_a_time_from_any_thread(tmp_path):
-    views = [a_view(seed) for seed in range(40)]
-    read = filed(tmp_path, views)
-    wrong: list[int] = []
-
-    def check(start: int) -> None:
-        for index in range(start, 40, 4):
-            try:
-                assert_same(read[index], views[index])
-            except AssertionError:
-                wrong.append(index)
-
-    threads = [threading.Thread(target=check, args=(start,)) for start in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert wrong == []
-    with pytest.raises(IndexError):
-        read[40]
-    with pytest.raises(TypeError):
-        read[3:5]
-
-
-@pytest.mark.parametrize("first", [1, 14])
-def test_views_prepared_ahead_are_those_of_their_steps(tmp_path, first):
-    """From the beginning, and from the step at which a resumed fit goes on."""
-    recorded, virtual = [a_view(seed) for seed in range(5)], [a_view(seed, kind="virtual") for seed in range(20, 23)]
-    direct = ViewSet(tuple(recorded), tuple(virtual))
-    read = ViewSet(filed(tmp_path, recorded), filed(tmp_path, virtual))
-    assert read.filed and not direct.filed
-    steps = range(first, 31)
-
-    def chosen(views: ViewSet):
-        return lambda step: views.choose(3, step, 0.5 if step > 10 else 0.0, beside=True)
-
-    with kept.chosen_ahead(read, chosen(read), steps) as ahead:
-        found = list(ahead)
-    with kept.chosen_ahead(direct, chosen(direct), steps) as usual:
-        wanted = list(usual)
-    assert {len(views) for views in wanted} == {1, 2}
-    for step, ours, theirs in zip(steps, found, wanted, strict=True):
-        for one, other, stored in zip(ours, theirs, chosen(direct)(step), strict=True):
-            assert_same(one, other)
-            assert_same(one, stored.as_tensors())
-
-
 def test_views_grow_on_their_device(tmp_path):
-    views = ViewSet(filed(tmp_path, [a_view(seed) for seed in range(4)]), ())
-    with (
-        pretend_device() as there,
-        kept.chosen_ahead(views, lambda step: views.choose(0, step, 0.0), range(1, 5), there) as ahead,
-    ):
-        for step, (view,) in enumerate(ahead, start=1):
-            wanted = views.choose(0, step, 0.0)[0].as_tensors()
-            given = [getattr(view, f.name) for f in fields(view) if isinstance(getattr(view, f.name), torch.Tensor)]
-            every = (*given, view.lidar.pixel, view.lidar.depth_m)
-            assert len(given) == 6 and all(tensor.device == there for tensor in every)
-            assert torch.equal(view.lidar.pixel.cpu(), wanted.lidar.pixel)
-            for name in ("rgb", "mask", "channels"):
-                assert torch.equal(getattr(view, name).cpu(), getattr(wanted, name))
-
-
-def test_an_error_of_a_thread_is_raised_at_its_step_in_words(tmp_path):
-    views = ViewSet(filed(tmp_path, [a_view(seed) for seed in range(6)]), ())
-    # the file was written from the last view to the first
-    views.recorded._file._file.truncate(2 * views.recorded._slots[0].size)
-    seen, before = [], threads_at_work()
-
-    def go_through() -> None:
-        with kept.chosen_ahead(views, lambda step: (views.recorded[6 - step],), range(1, 7)) as ahead:
-            seen.extend(view.name for (view,) in ahead)
-
-    with pytest.raises(ResourceError, match=r"scratch file ended early[\s\S]*repeat the command"):
-        go_through()
-    assert threads_at_work() == before
-
-
-def test_ctrl_c_ends_the_threads(tmp_path):
-    views = ViewSet(filed(tmp_path, [a_view(seed) for seed in range(6)]), ())
-    before, read = threads_at_work(), []
-
-    def choose(step: int) -> tuple[StoredView, ...]:
-        read.append(step)
-        return (views.recorded[step % 6],)
-
-    def go_through() -> None:
-        with kept.chosen_ahead(views, choose, range(1, 100_001)) as ahead:
-            next(ahead)
-            assert threads_at_work() > before
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        go_through()
-    assert threads_at_work() == before
-    assert len(read) < 20  # what had not begun was dropped
+    stored = a_view(3)
+    with pretend_device() as there:
+        view, wanted = stored.as_tensors(there), stored.as_tensors()
+        given = [getattr(view, f.name) for f in fields(view) if isinstance(getattr(view, f.name), torch.Tensor)]
+        every = (*given, view.lidar.pixel, view.lidar.depth_m)
+        assert len(given) == 6 and all(tensor.device == there for tensor in every)
+        assert torch.equal(view.lidar.pixel.cpu(), wanted.lidar.pixel)
+        for name in ("rgb", "mask", "channels"):
+            assert torch.equal(getattr(view, name).cpu(), getattr(wanted, name))
 
 
 def test_a_full_disk_is_said_before_anything_is_read(tmp_path, monkeypatch):
@@ -222,13 +119,6 @@ def test_a_full_disk_is_said_before_anything_is_read(tmp_path, monkeypatch):
     said = r"too little room[\s\S]*4.0 GiB free for 9 views[\s\S]*3.0 GiB[\s\S]*--width-px"
     with pytest.raises(ResourceError, match=said):
         kept.scratch_folder(9, 4 << 30, tmp_path)
-
-
-@pytest.mark.skipif(not Path("/dev/full").is_char_device(), reason="needs a device that is always full")
-def test_a_disk_that_fills_up_is_an_error_in_words(tmp_path, monkeypatch):
-    monkeypatch.setattr(scratch.tempfile, "TemporaryFile", lambda **_: open("/dev/full", "wb", buffering=0))
-    with pytest.raises(ResourceError, match=r"writing failed[\s\S]*No space left[\s\S]*free disk space"):
-        scratch.ScratchFile(tmp_path).append(np.zeros(100, np.uint8))
 
 
 def test_a_mapped_array_keeps_its_values_and_has_no_name(tmp_path):
@@ -271,16 +161,13 @@ def test_a_fit_from_a_file_of_views_is_the_same_fit_also_when_resumed(world, tmp
     step = fit_to(world, tmp_path / "whole", settings(), observations=(world["virtual"],))
     usual = replace(step, out=tmp_path / "usual").run()
     monkeypatch.setattr(kept, "IN_MEMORY_BYTES", 0)
-    before, folder, asked = threads_at_work(), tmp_path / "filed", []
-    with interrupted(9, lambda: asked.append(len(open_in(folder)))):
+    folder = tmp_path / "filed"
+    with interrupted(9):
         replace(step, out=folder).run()
-    assert asked == [2]  # recorded and virtual views
-    assert threads_at_work() == before and open_in(folder) == []
     replace(step, out=folder).run()
     assert result_of(folder) == result_of(usual)
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
     assert names == {path.relative_to(tmp_path / "usual").as_posix() for path in (tmp_path / "usual").rglob("*")}
-    assert threads_at_work() == before and open_in(folder) == []
 
 
 def test_a_wrong_frame_is_named_by_the_thread_that_reads_it(world, tmp_path):
@@ -302,19 +189,19 @@ def test_a_wrong_frame_is_named_by_the_thread_that_reads_it(world, tmp_path):
     (tmp_path / "scratch").mkdir()
     with pytest.raises(ResourceError, match="the disk broke"):
         kept.keep(loaded(), 2, tmp_path / "scratch")
-    assert open_in(tmp_path) == [] and list((tmp_path / "scratch").iterdir()) == []
+    assert list((tmp_path / "scratch").iterdir()) == []
 
 
 def test_ctrl_c_while_frames_are_read_ends_the_threads(world, tmp_path, monkeypatch):
-    def ctrl_c(self, index, stored):
+    def ctrl_c(*_):
         assert threads_at_work() > before
         raise KeyboardInterrupt
 
     scene, before = read_scene(world["scene"]), threads_at_work()
-    monkeypatch.setattr(kept.ViewFile, "put", ctrl_c)
+    monkeypatch.setattr(kept, "mapped_array", ctrl_c)
     with pytest.raises(KeyboardInterrupt):
         fit.recorded_views(settings(), scene, scratch=tmp_path)
-    assert threads_at_work() == before and open_in(tmp_path) == []
+    assert threads_at_work() == before
 
 
 def test_sweeps_are_let_go_and_depths_stay_the_same(world, monkeypatch):
@@ -381,17 +268,3 @@ def test_few_points_of_unseen_surfaces_still_cover_them():
     distance, nearest = cKDTree(few.xyz).query(grid)
     assert distance.max() < 2.5 and np.median(distance / few.scale_m[nearest]) < 1.5
     assert np.array_equal(all_of_them.xyz, grid) and np.allclose(all_of_them.scale_m, 0.05)
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="reads the peak of resident memory as Linux gives it")
-def test_views_of_a_pass_are_not_held(tmp_path):
-    """Reading all views one after the other takes the memory of one, not of all."""
-    shape = (200, 300)
-    rgb = np.zeros((*shape, 3), np.uint8)
-    large = StoredView("v", view_at(0.0, camera(300, 200)), "recorded", rgb, rgb[..., 0].copy())
-    read = kept.keep(((index, large) for index in range(40)), 40, tmp_path)
-    tracemalloc.start()
-    total = sum(int(view.rgb.sum()) for view in read)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert total == 0 and peak < 4 * 4 * shape[0] * shape[1]

@@ -1,4 +1,4 @@
-"""Large images: compared in bands of rows, with the result of the whole; views that cannot fit are refused."""
+"""Large images: compared at half their size; views that cannot fit are refused."""
 
 from __future__ import annotations
 
@@ -39,45 +39,9 @@ def small_distance() -> PerceptualDistance:
     return PerceptualDistance(CodecFeatures(codec.eval()))
 
 
-@pytest.mark.parametrize(("height", "width"), [(136, 40), (133, 29), (40, 24), (201, 16)])
-@pytest.mark.parametrize("masked", [False, True])
-def test_bands_give_the_distance_of_the_whole(
-    height: int, width: int, masked: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pair, distance = pair_of(height, width, masked=masked), small_distance()
-    whole = distance(pair)
-    monkeypatch.setattr(featnets, "WHOLE_PIXELS", 0)
-    for rows in (8, 24, 64, 1000):
-        monkeypatch.setattr(featnets, "BAND_PIXELS", rows * width)
-        assert distance(pair) == pytest.approx(whole, rel=2e-6)
-
-
-def test_several_images_are_compared_with_features_of_the_truth_that_are_made_once(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    first, distance = pair_of(136, 40, masked=True), small_distance()
-    images = torch.rand(3, 3, 136, 40, generator=torch.Generator().manual_seed(5))
-    pairs = [replace(first, rgb=image) for image in images]
-    monkeypatch.setattr(featnets, "WHOLE_PIXELS", 0)
-    monkeypatch.setattr(featnets, "BAND_PIXELS", 24 * 40)
-    alone = [distance(pair) for pair in pairs]
-    made, forward = [], CodecFeatures.forward
-    monkeypatch.setattr(CodecFeatures, "forward", lambda self, rgb: made.append(rgb) or forward(self, rgb))
-    assert distance.of_all(pairs, 1) == distance.of_all(pairs, 3) == alone
-    assert len(made) == 2 * 6 * (len(pairs) + 1)  # six bands
-
-
-def test_bands_need_what_lies_around_them_and_nothing_has_no_distance(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The test above would notice a border that is too thin."""
-    pair, distance = pair_of(136, 40, masked=False), small_distance()
-    whole = distance(pair)
-    monkeypatch.setattr(featnets, "WHOLE_PIXELS", 0)
-    monkeypatch.setattr(featnets, "BAND_PIXELS", 24 * 40)
-    monkeypatch.setattr(CodecFeatures, "reach_rows", 16)
-    assert distance(pair) != pytest.approx(whole, rel=2e-6)
-    monkeypatch.setattr(featnets, "WHOLE_PIXELS", 0)
+def test_where_nothing_counts_there_is_no_distance() -> None:
     pair = pair_of(40, 24, masked=False)
-    empty = Pair(pair.rgb, None, None, pair.truth_rgb, None, None, None, mask=torch.zeros(1, 40, 24, dtype=torch.bool))
+    empty = replace(pair, mask=torch.zeros(1, 40, 24, dtype=torch.bool))
     assert math.isnan(small_distance()(empty))
 
 
@@ -142,8 +106,6 @@ def test_tiles_of_a_condition_are_those_of_the_whole() -> None:
 def test_perceptual_distance_of_large_images_is_that_of_their_halves(monkeypatch: pytest.MonkeyPatch) -> None:
     pair, distance = pair_of(136, 40, masked=False), small_distance()
     made, truth = (featnets.F.avg_pool2d(x[None], 2)[0] for x in (pair.rgb, pair.truth_rgb))
-    halves = Pair(made, None, None, truth, None, None, None)
-    expected = distance(halves)
+    expected = distance(Pair(made, None, None, truth, None, None, None))
     monkeypatch.setattr(featnets, "WHOLE_PIXELS", 136 * 40 - 1)
-    monkeypatch.setattr(featnets, "LARGEST_PIXELS", 136 * 40 - 1)
-    assert distance(pair) == pytest.approx(expected, rel=2e-6)
+    assert distance(pair_of(136, 40, masked=False)) == expected

@@ -14,7 +14,7 @@ from mudg.base import checkpoint
 from mudg.base.config import load
 from mudg.base.errors import InputError, NumericsError, ResourceError, UsageError
 from mudg.diffusion import city_clips, learn, model_files, models, score
-from mudg.diffusion.clips import await_shard, class_weights, read_clip
+from mudg.diffusion.clips import await_shard, read_clip
 from mudg.diffusion.model import MDM
 from mudg.diffusion.parallel import TrainingState
 from mudg.diffusion.requests import GeneratedClip
@@ -81,12 +81,6 @@ def test_training_continues_from_a_model(clips, whole, tmp_path):
         await_shard(tmp_path, 1, patience_s=0.0)
 
 
-def test_class_weights_lift_rare_classes(clips):
-    assert torch.equal(class_weights(clips, range(2), 0.0), torch.ones(19))
-    weight = class_weights(clips, range(2), 0.5)
-    assert float(weight[13]) > float(weight[0])
-
-
 def test_numbers_that_are_not_finite_are_named_and_kept_out(clips, tmp_path):
     with pytest.raises(NumericsError, match=r"network(.|\n)*step \d"):
         Learn(out=tmp_path / "run", settings=tiny(clips, lr=1e30, steps=20, checkpoint_every=1)).run()
@@ -133,7 +127,7 @@ def test_schedules(clips):
     assert {learn.learning_rate(constant, step) for step in range(100)} == {1e-5}
     config = with_settings(tiny(clips), first_cities=40)  # fewer than training begins with are not waited for
     assert config.data.cities < config.data.first_cities
-    assert learn.clips_of_cities(config, clips).weighed() == range(config.data.cities)
+    assert learn.clips_of_cities(config, clips).in_use(0) == range(config.data.cities)
 
 
 def test_perfect_samples_score_perfectly_and_confidence_ranks(clips):
@@ -176,9 +170,8 @@ def test_the_second_stage_takes_over_everything_at_another_size(large_clips, who
     config = tiny(
         large_clips, start=str(whole), steps=1, width=96, height=64, frozen="temporal_transformers", average_decay=0
     )
-    begun, fresh = models.starting_model(config)
+    begun = models.starting_model(config)
     before, start = model_files.load(whole).state_dict(), begun.state_dict()
-    assert not fresh
     assert all(torch.equal(before[name], start[name]) for name in before)
     after = model_files.load(Learn(out=tmp_path / "two", settings=config).run()).state_dict()
     kept = {name for name in before if name.startswith("codec.") or ".temporal." in name}
@@ -191,13 +184,13 @@ def test_the_second_stage_takes_over_everything_at_another_size(large_clips, who
 
 def test_the_modality_embedding_survives_a_change_of_stage(whole, unrefined, clips):
     """It once was overwritten by the time embedding in the published second stage."""
-    for folder, changes in ((whole, {}), (whole, {"refine_widths": (16, 16)}), (unrefined, {})):
+    for folder in (whole, unrefined):
         if folder is unrefined:
             config = LearnConfig(start=str(folder), data=LearnData(clips=str(clips), window=WINDOW))
         else:
-            config = tiny(clips, start=str(folder), **changes)
+            config = tiny(clips, start=str(folder))
         label = model_files.load(folder).net.label.state_dict()
-        begun, _ = models.starting_model(config)
+        begun = models.starting_model(config)
         assert all(torch.equal(value, begun.net.label.state_dict()[name]) for name, value in label.items())
         assert not torch.equal(label["0.weight"], begun.net.time.state_dict()["0.weight"])
 

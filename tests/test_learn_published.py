@@ -67,9 +67,8 @@ def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
     config = published_settings(
         one, large, width=36, height=32, frozen="temporal_transformers", steps=1, batch_frames=4
     )
-    begun, fresh = models.starting_model(config)
+    begun = models.starting_model(config)
     first, start = (published.load(folder).state_dict() for folder in (converted, one))
-    assert not fresh
     assert all(torch.equal(value, start[name]) for name, value in begun.state_dict().items())  # the modality label too
     two = Learn(out=tmp_path / "two", settings=config).run()
     last = published.load(two)
@@ -97,13 +96,13 @@ def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
 def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
     """With dropout inside the network on; terms too, and they have the same names in every part."""
     settings = published_settings(converted, clips)
-    model, _ = models.starting_model(settings)
+    model = models.starting_model(settings)
     model.trained_part().train()
 
     @torch.no_grad()
     def losses(step, part):
         drawn = corners(settings, clips, step, 2, 4, "batch", part)
-        return model(drawn, BatchPart(settings.seed, step, part.start, 2), LossSettings(None, 1.0, 0.2))
+        return model(drawn, BatchPart(settings.seed, step, part.start, 2), LossSettings(1.0, 0.2))
 
     for step in range(2):
         whole, parts = losses(step, slice(0, 2)), [losses(step, slice(n, n + 1)) for n in (0, 1)]
@@ -119,16 +118,14 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
 
 def test_unknown_truth_has_no_part_in_the_loss(converted, clips):
     settings = published_settings(converted, clips)
-    model, _ = models.starting_model(settings)
+    model = models.starting_model(settings)
     drawn = corners(settings, clips, 0, 4, 4, "batch")
     nothing = [
         replace(clip, depth_valid=torch.zeros_like(clip.depth_valid), semantics=torch.full_like(clip.semantics, 255))
         for clip in drawn
     ]
     with torch.no_grad():
-        terms, without = (
-            model(some, BatchPart(0, 0, 0, 4), LossSettings(None, 1.0, 0.2)).terms for some in (drawn, nothing)
-        )
+        terms, without = (model(some, BatchPart(0, 0, 0, 4), LossSettings(1.0, 0.2)).terms for some in (drawn, nothing))
     assert {"depth", "semantics"} & set(terms)
     assert all(terms[m] > 0 and without[m] == 0 for m in ("depth", "semantics") if m in terms)
 
@@ -176,10 +173,10 @@ def test_the_reference_is_left_out_once(converted, clips, tmp_path, monkeypatch)
 
 def test_frame_0_shows_the_reference_also_where_the_tokens_go_without(converted, clips):
     settings = published_settings(converted, clips)
-    model, _ = models.starting_model(settings)
+    model = models.starting_model(settings)
     (clip,) = corners(settings, clips, 0, 1, 4, "batch")
     other = replace(clip, condition=replace(clip.condition, reference=1 - clip.condition.reference))
-    rules = LossSettings(None, 1.0, 1.0)
+    rules = LossSettings(1.0, 1.0)
     with torch.no_grad():
         loss, again, changed = (float(model([one], BatchPart(0, 0, 0, 1), rules).total) for one in (clip, clip, other))
     assert loss == again != changed
@@ -192,7 +189,6 @@ def test_what_does_not_fit_is_refused_in_words(converted, clips, tmp_path):
         ({"full_window_share": 0.5}, length),
         ({"width": 50}, "multiples of 4"),
         ({"widths": (16, 32, 64)}, "cannot be changed"),
-        ({"frozen": "denoiser"}, "without a refiner"),
     ):
         with pytest.raises(UsageError, match=said):
             Learn(out=tmp_path / said[:8], settings=published_settings(converted, clips, **wrong)).run()

@@ -1,6 +1,5 @@
 """Noise schedule, prediction algebra and samplers against golden numbers and closed forms."""
 
-import inspect
 import math
 from pathlib import Path
 
@@ -131,86 +130,3 @@ def test_guidance_rescale_restores_the_spread():
     full = noise.guide(c, u, 7.5, 1.0)
     assert torch.allclose(full.std((1, 2, 3)), c.std((1, 2, 3)), rtol=1e-5)
     assert torch.equal(noise.guide(c, u, 1.0), u + (c - u))
-
-
-@pytest.mark.parametrize("prediction", ["x0", "v"])
-@pytest.mark.parametrize(("base", "shares"), [(None, (0.8, 0.55, 0.45)), (0.7, (0.8, 0.8, 0.8))])
-def test_second_order_solver_comes_nearer_to_the_exact_flow_than_ddim(prediction, base, shares):
-    """The flow of a Gaussian, scaled as in training or not, maps x_T to mean + spread x_T. Under the rescale the error
-    falls with the square of the step; no factor is left in the sample, where that of ddim keeps the last step's."""
-    schedule, mean, spread = Schedule(ScheduleConfig(base_scale=base)), 0.7, 0.4
-    start = torch.linspace(-2, 2, 9, dtype=torch.float64).view(1, 9)
-
-    def denoise(x, t):
-        alpha, sigma, scale = (getattr(schedule, name)[t].double() for name in ("alpha", "sigma", "scale"))
-        factor = alpha * scale
-        x0 = mean + factor * spread**2 / (factor**2 * spread**2 + sigma**2) * (x - factor * mean)
-        return scale * x0 if prediction == "x0" else (alpha * x - scale * x0) / sigma
-
-    def made(sampler, steps):
-        settings = {"eta": 0.0} if sampler is noise.ddim else {}
-        return sampler(denoise, start, schedule, noise.trailing_steps(1000, steps), prediction=prediction, **settings)
-
-    def errors(sampler):
-        return [float((made(sampler, n) - (mean + spread * start)).abs().max()) for n in (20, 80, 250)]
-
-    ours, plain = errors(noise.dpm_solver), errors(noise.ddim)
-    assert all(a < share * b for a, b, share in zip(ours, plain, shares))
-    if base is not None:
-        assert ours[2] < 0.02 and ours[0] > 3 * ours[2]
-        kept = float((made(noise.ddim, 4) / made(noise.dpm_solver, 4)).mean())
-        assert kept == pytest.approx(float(schedule.scale[noise.trailing_steps(1000, 4)[-1]]), abs=0.05)
-
-
-@pytest.mark.parametrize("base", [None, 0.7])
-def test_second_order_solver_follows_the_published_update(base):
-    """Three steps written out in log-SNR and exponentials, from a level that has one; under the rescale with alpha
-    times it in place of alpha."""
-    schedule = Schedule(ScheduleConfig(base_scale=base))
-    output = lambda x, t: 0.3 * torch.tanh(x) + 0.0005 * t
-    start = torch.linspace(-1, 1, 5, dtype=torch.float64)
-    indices = [899, 599, 299, 49]
-    scale = schedule.scale[indices].double()
-    alpha, sigma = schedule.alpha_bar[indices].sqrt() * scale, (1 - schedule.alpha_bar[indices]).sqrt()
-    h = torch.log(alpha / sigma).diff()
-    x, estimates = start, []
-    for i in range(3):
-        estimates.append(output(x, indices[i]) / scale[i])
-        r = h[i - 1] / h[i]
-        mixed = estimates[-1] if i == 0 else (1 + 1 / (2 * r)) * estimates[-1] - estimates[-2] / (2 * r)
-        x = sigma[i + 1] / sigma[i] * x - alpha[i + 1] * torch.expm1(-h[i]) * mixed
-    made = noise.dpm_solver(output, start, schedule, indices)
-    assert torch.allclose(made, output(x, 49) / scale[3], atol=1e-6)
-
-
-def test_first_steps_of_the_second_order_solver_are_those_of_ddim():
-    """From pure noise the first two steps have nothing to extrapolate from."""
-    schedule = Schedule()
-    start = torch.randn(1, 6, generator=torch.Generator().manual_seed(0))
-    denoise = lambda x, t: 0.3 * torch.tanh(x) + 0.001 * t
-    indices = noise.trailing_steps(1000, 20)[:3]
-    seen = {}
-    for sampler in (noise.ddim, noise.dpm_solver):
-        estimates = []
-        settings = {"eta": 0.0} if sampler is noise.ddim else {}
-        watched = lambda x, t, kept=estimates: kept.append(denoise(x, t)) or kept[-1]
-        sampler(watched, start, schedule, indices, **settings)
-        seen[sampler] = estimates
-    for a, b in zip(seen[noise.ddim], seen[noise.dpm_solver]):
-        assert torch.allclose(a, b, atol=1e-5)
-
-
-def test_every_sampler_takes_its_settings_and_no_other():
-    """The table says what the functions take; what it does not list is refused by the table and by the function."""
-    assert set(noise.SAMPLER_SETTINGS) == set(noise.SAMPLERS)
-    every = {name for names in noise.SAMPLER_SETTINGS.values() for name in names}
-    for sampler, function in noise.SAMPLERS.items():
-        shared = {"denoise", "start", "schedule", "step_indices", "prediction"}
-        own = set(inspect.signature(function).parameters) - shared
-        assert own == set(noise.SAMPLER_SETTINGS[sampler])
-        noise.check_sampler(sampler, own)
-        for name in every - own:
-            with pytest.raises(UsageError, match=f"{sampler} does not take the setting {name}") as caught:
-                noise.check_sampler(sampler, [name])
-            assert f"{name} with ddim" in str(caught.value)
-    refused("unknown sampler", noise.check_sampler, "magic", raises=UsageError)

@@ -60,7 +60,7 @@ def _ingest(g: Given, v: int) -> Any:
 
 
 def _annotate(g: Given, v: int) -> Any:
-    config = AnnotateConfig(labeller="geometry", sweeps=v, processes=1, weights=str(g.get("weights", "")))
+    config = AnnotateConfig(sweeps=v, processes=1, weights=str(g.get("weights", "")))
     return partial(Annotate, scene=g["plain scene"], settings=config)
 
 

@@ -272,20 +272,6 @@ def test_a_recorded_log_has_a_perceptual_distance_but_no_flicker_and_no_dynamic_
 # ---- the other networks of LPIPS -----------------------------------------------------------------
 
 
-class Fire(torch.nn.Module):
-    """SqueezeNet's block from torch's layers."""
-
-    def __init__(self, into, between, each):
-        super().__init__()
-        conv = torch.nn.Conv2d
-        self.squeeze, self.expand1x1 = conv(into, between, 1), conv(between, each, 1)
-        self.expand3x3 = conv(between, each, 3, padding=1)
-
-    def forward(self, x):
-        x = functional.relu(self.squeeze(x))
-        return torch.cat([functional.relu(self.expand1x1(x)), functional.relu(self.expand3x3(x))], 1)
-
-
 def torchvision_trunk(name):
     """Layers in torchvision's numbering, and after which of them features are read."""
     conv, relu, pool = torch.nn.Conv2d, torch.nn.ReLU, torch.nn.MaxPool2d
@@ -294,20 +280,14 @@ def torchvision_trunk(name):
         for into, out in ((192, 384), (384, 256), (256, 256)):
             layers += [conv(into, out, 3, padding=1), relu()]
         return torch.nn.Sequential(*layers), (1, 4, 7, 9, 11)
-    if name == "vgg":
-        layers, into = [], 3
-        for out in (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512):
-            layers += [pool(2, 2)] if out == "M" else [conv(into, out, 3, padding=1), relu()]
-            into = into if out == "M" else out
-        return torch.nn.Sequential(*layers), (3, 8, 15, 22, 29)
-    squeeze = pool(3, 2, ceil_mode=True)
-    fires = [(64, 16, 64), (128, 16, 64), None, (128, 32, 128), (256, 32, 128), None]
-    fires += [(256, 48, 192), (384, 48, 192), (384, 64, 256), (512, 64, 256)]
-    layers = [conv(3, 64, 3, 2), relu(), squeeze, *(Fire(*sizes) if sizes else squeeze for sizes in fires)]
-    return torch.nn.Sequential(*layers), (1, 4, 7, 9, 10, 11, 12)
+    layers, into = [], 3
+    for out in (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512):
+        layers += [pool(2, 2)] if out == "M" else [conv(into, out, 3, padding=1), relu()]
+        into = into if out == "M" else out
+    return torch.nn.Sequential(*layers), (3, 8, 15, 22, 29)
 
 
-@pytest.mark.parametrize("name", ["alex", pytest.param("vgg", marks=pytest.mark.slow), "squeeze"])
+@pytest.mark.parametrize("name", ["alex", pytest.param("vgg", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("given", ["correct", "unscaled"])
 def test_lpips_equals_its_float64_twin(pictures, name, given):
     state, truth = lpips_state(name), pictures[0][:, :70, :75]

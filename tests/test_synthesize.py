@@ -16,7 +16,6 @@ from mudg.base.errors import InputError, UsageError
 from mudg.core import trajectory
 from mudg.diffusion import condition, model_files, synthesize
 from mudg.diffusion.model import MDM
-from mudg.diffusion.models import extended
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.diffusion.views import ViewMaker, add_detail, windows
 from mudg.gaussians import fit
@@ -200,20 +199,17 @@ def test_further_paths_are_made_and_parts_of_the_condition_switched_off(world, u
     assert all(not torch.equal(seen[a], seen[b]) for a in names for b in names if a < b)
 
 
-def test_a_setting_that_the_sampler_does_not_take_ends_the_command(tmp_path, capsys):
+def test_a_setting_that_the_model_does_not_take_ends_the_command(tmp_path, capsys):
     """Before any work: neither scene nor cloud is read, and nothing is written."""
     for folder, name in (("scene", "scene.json"), ("fused", "fuse.json")):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / name).write_text("{}")
     words = ["synthesize", str(tmp_path / "scene"), "--fused", str(tmp_path / "fused"), "--out", str(tmp_path / "out")]
-    assert app.main([*words, "--sampler", "dpm_solver", "--eta", "0.5"]) == 2
-    said = capsys.readouterr().err
-    assert all(word in said for word in ("dpm_solver", "eta", "ddim"))
-    assert not (tmp_path / "out").exists()
     for flags, word in ((("--guidance", "3"), "guidance"), (("--memory-budget-gb", "3"), "memory-budget")):
         assert app.main([*words, *flags]) == 2
         assert word in capsys.readouterr().err
-    assert app.main([*words, "--sampler", "ddim", "--eta", "0.5"]) == 3  # on to the next fault: no such scene
+    assert not (tmp_path / "out").exists()
+    assert app.main([*words, "--eta", "0.5"]) == 3  # on to the next fault: no such scene
 
 
 @pytest.fixture(scope="module")
@@ -223,9 +219,8 @@ def fitted(world, tmp_path_factory):
     folder = tmp_path_factory.mktemp("fitted")
     settings = fit_config(method="street_gaussians", iterations=4, start__gaussians=900)
     scene = Fit(scene=root / "scene", fused=root / "fused", out=folder / "fit", settings=settings).run()
-    before = model_files.load(root / "model")
-    grown = replace(before.config, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1))
-    model_files.save(extended(before, grown), folder / "model", "", {})
+    config = replace(model_files.load(root / "model").config, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1))
+    model_files.save(MDM(config), folder / "model", "", {})
     return scene, folder / "model"
 
 

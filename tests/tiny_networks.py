@@ -123,7 +123,7 @@ def depthlab(folder: Path) -> dict[str, Any]:
         "reference_unet": seeded(d.UNet2DConditionModel(**{**config, "in_channels": 4}), 6),
         "mapping_layer": seeded(torch.nn.Linear(6, 8), 7),
         "vae": vae,
-        "clip": _saved(clip, folder / "CLIP"),
+        "clip": _saved(clip, folder / "CLIP-ViT-H-14-laion2B-s32B-b79K"),
     }
     (folder / "DepthLab").mkdir()
     for name, prefix in (("denoising_unet", ""), ("reference_unet", ""), ("mapping_layer", "mapping_layer.")):

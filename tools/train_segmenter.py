@@ -2,7 +2,7 @@
 
 python tools/train_segmenter.py data  WORK                       images of generated cities, some four seconds a city
 python tools/train_segmenter.py train WORK                       goes on from the newest checkpoint
-python tools/train_segmenter.py score WORK --list development    mIoU on city logs, beside the geometry labeller
+python tools/train_segmenter.py score WORK --list development    mIoU on city logs
 python tools/train_segmenter.py ship  WORK --model FOLDER        calibrates confidences, writes model, weights and card
 
 Every draw depends on (seed, step) alone: a run that was stopped ends as one that was not, and a second run gives the
@@ -36,7 +36,6 @@ from mudg.base.errors import ResourceError
 from mudg.base.palette import CLASSES, UNLABELLED
 from mudg.city import logs as city_logs
 from mudg.labels import street_net
-from mudg.labels.by_geometry import label_by_geometry
 from mudg.labels.evidence import encode
 from mudg.labels.street_net import StreetLabeller, StreetNet, StreetNetConfig
 
@@ -280,7 +279,7 @@ def line_of(name: str, counts: NDArray[np.int64]) -> str:
 
 
 def score(options: argparse.Namespace) -> None:
-    """Both labellers on the first logs of a list: with everything, without boxes, without LiDAR."""
+    """The labeller on the first logs of a list: with everything, without boxes, without LiDAR."""
     labeller = StreetLabeller(street_net.load(options.model) if options.model else trained(options)[0])
     totals: dict[str, NDArray[np.int64]] = {}
     surer = np.zeros((10, 3))
@@ -290,9 +289,7 @@ def score(options: argparse.Namespace) -> None:
             cases = {"all": given, "no boxes": dataclasses.replace(given, tracks=()), "no LiDAR": blind}
             for name, case in cases.items():
                 ids, confidence = labeller.classes(case)
-                found = {"embedded": ids, "geometry": label_by_geometry(case).semantics}
-                for kind, classes in found.items():
-                    totals[f"{kind}, {name}"] = totals.get(f"{kind}, {name}", 0) + counted(classes, truth)
+                totals[name] = totals.get(name, 0) + counted(ids, truth)
                 if name == "all":
                     place = np.minimum((confidence * 10).astype(int), 9)
                     for n, value in enumerate((np.ones_like(confidence), confidence, ids == truth)):

@@ -20,13 +20,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mudg.base import checkpoint, geometry, log, seeds, store
+from mudg.base import checkpoint, geometry, log, records, seeds, store
 from mudg.base.devices import memory_of
 from mudg.base.errors import InputError, NumericsError
 from mudg.base.processes import Interruption, one_torch_thread
 from mudg.base.records import understood
 from mudg.base.run_folder import RunDir
-from mudg.base.types import Frame, Observation, Scene, View
+from mudg.base.types import Observation, Scene, View
 from mudg.baselines import emernerf_field as fields
 from mudg.core.pictures import depth_colors, gray, side_by_side, to_bytes
 from mudg.gaussians.rendering import COVERED
@@ -197,15 +197,6 @@ class Pixels:
         self.errors[cells] = ERROR_KEPT * self.errors[cells] + (1 - ERROR_KEPT) * error.cpu().sqrt()
 
 
-def recorded_pixels(
-    scene: Scene, frames: Sequence[Frame], width_px: int, cameras: Sequence[str], extent: fields.Extent
-) -> tuple[Pixels, StoredView]:
-    """The pixels of these frames, and the middle view."""
-    places = dict(load_recorded(scene, frames, (), width_px, False))
-    views = [places[index] for index in range(len(frames))]
-    return Pixels(views, cameras, extent), views[len(views) // 2]
-
-
 # views of a field ---------------------------------------------------------------------------------
 
 RAYS_AT_ONCE = 2048
@@ -287,7 +278,7 @@ def load_field(folder: Path) -> tuple[fields.RadianceField, fields.Budget]:
         store.verify_manifest(folder)
     values, tensors = description_of(folder), store.read_tensors(folder / "field.safetensors")
     with understood("a radiance field", str(folder)):
-        budget = fields.Budget(**{**values["budget"], "proposals": tuple(values["budget"]["proposals"])})
+        budget = records.parse_dataclass(fields.Budget, values["budget"], "budget: ")
         return fields.RadianceField.from_state(values, tensors), budget
 
 
@@ -360,12 +351,21 @@ def prepare(config: FitConfig, scene: Scene, folder: RunDir, device: torch.devic
     cameras = tuple(dict.fromkeys(frame.view.camera.name for frame in frames))
     lidar = lidar_rays(scene)
     extent = extent_of(scene, lidar)
-    pixels, shown = recorded_pixels(scene, frames, config.width_px, cameras, extent)
+    places = dict(load_recorded(scene, frames, (), config.width_px, False))
+    views = [places[index] for index in range(len(frames))]
+    pixels = Pixels(views, cameras, extent)
     if pixels.sky is None:
         log.info("the sky of this scene is not labelled: fitted without the sky term")
     facts = {"method": config.method, "scene": scene.id}
     field = fields.RadianceField(fields.SIZES[config.radiance.size], extent, cameras, facts, config.seed).to(device)
-    state = RadianceState(field, _optimisers(field), pixels, lidar, shown)
+    proposals = list(field.proposals.parameters())
+    own = {id(value) for value in proposals}
+    fused = device.type in ("cpu", "cuda")
+    of_fields, of_proposals = (
+        torch.optim.Adam(given, RATE, BETAS, EPSILON, WEIGHT_DECAY, fused=fused, foreach=None if fused else False)
+        for given in ([value for value in field.parameters() if id(value) not in own], proposals)
+    )
+    state = RadianceState(field, (of_fields, of_proposals), pixels, lidar, views[len(views) // 2])
     found = checkpoint.latest(folder.path / "steps")
     if found is not None:
         log.info(f"resuming at step {found.step} of {config.iterations}")
@@ -485,18 +485,7 @@ def _progress(terms: Mapping[str, Tensor]) -> dict[str, float]:
     return {"psnr": round(-10 * math.log10(max(named["loss_color"], 1e-10)), 3), **named}
 
 
-# ---- the optimisers, and checkpoints -------------------------------------------------------------
-
-
-def _optimisers(field: fields.RadianceField) -> tuple[torch.optim.Adam, torch.optim.Adam]:
-    proposals = list(field.proposals.parameters())
-    own = {id(value) for value in proposals}
-    fused = field.device.type in ("cpu", "cuda")
-    first, second = (
-        torch.optim.Adam(given, RATE, BETAS, EPSILON, WEIGHT_DECAY, fused=fused, foreach=None if fused else False)
-        for given in ([value for value in field.parameters() if id(value) not in own], proposals)
-    )
-    return first, second
+# ---- checkpoints -------------------------------------------------------------
 
 
 def save_checkpoint(state: RadianceState, folder: RunDir) -> None:

@@ -19,8 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import seeds
-from mudg.base.errors import InputError
+from mudg.base import records, seeds, weights
 from mudg.core.grids import HashGrid, encode
 
 # sampling -----------------------------------------------------------------------------------------
@@ -256,18 +255,10 @@ class RadianceField(nn.Module):
     def from_state(cls, values: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> RadianceField:
         """Inverse of ``description`` and ``state_dict``. InputError: tensors are missing, left over or of another
         shape."""
-        sizes = {
-            k: v if isinstance(v, int) else tuple(tuple(r) if isinstance(r, list) else r for r in v)
-            for k, v in values["sizes"].items()
-        }
-        extent = {k: tuple(v) if isinstance(v, list) else v for k, v in values["extent"].items()}
-        field = cls(FieldSizes(**sizes), Extent(**extent), values["cameras"], values["facts"])
-        wanted = {name: tuple(tensor.shape) for name, tensor in field.state_dict().items()}
-        given = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-        if wanted != given:
-            odd = sorted(name for name in wanted.keys() | given.keys() if wanted.get(name) != given.get(name))
-            what, expected = "the parameters do not fit the radiance field", f"{len(wanted)} tensors"
-            raise InputError(what, got=", ".join(odd[:4]), expected=expected)
+        sizes = records.parse_dataclass(FieldSizes, values["sizes"], "sizes: ")
+        extent = records.parse_dataclass(Extent, values["extent"], "extent: ")
+        field = cls(sizes, extent, values["cameras"], values["facts"])
+        weights.match_exactly(tensors, weights.shapes_of(field), "field.safetensors", "the radiance field")
         field.load_state_dict(dict(tensors))
         return field
 

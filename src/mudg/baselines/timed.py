@@ -30,7 +30,7 @@ from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import SkyNode, StaticNode
 from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.start import StartPoints, fill_unreached, neighbour_scale, thinned, voxel_filter
-from mudg.gaussians.views import StoredView, heads_of
+from mudg.gaussians.views import StoredView
 from mudg.scene.read import read_points
 
 SAME_DEPTH = 0.02
@@ -52,7 +52,7 @@ def timed_points(
     if len(xyz) == 0:
         what = "no LiDAR point is seen by a training photograph of its time"
         raise InputError(what, where=scene.root, remedy="check the LiDAR of the scene and --cameras")
-    centers = np.stack([head.view.center_world for head in heads_of(views)]).astype(np.float32)
+    centers = np.stack([stored.view.center_world for stored in views]).astype(np.float32)
     half = replace(config, start=replace(config.start, gaussians=max(50, config.start.gaussians // 2)))
     parts = [thinned(xyz, centers, half), *_by_moment(xyz, time_s, scene, half)]
     chosen = [
@@ -86,14 +86,13 @@ def frame_seconds(scene: Scene) -> float:
 def _measured(
     scene: Scene, views: Sequence[StoredView], classes: tuple[int, ...], colors: CameraColors
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64]]:
-    heads = heads_of(views)
     near_s = 0.5 * frame_seconds(scene) + 1e-3
     found: list[tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64]]] = []
     for sweep in scene.sweeps:
         nearest: dict[str, int] = {}
-        for index in sorted(range(len(heads)), key=lambda index: abs(heads[index].view.time_s - sweep.time_s)):
-            if abs(heads[index].view.time_s - sweep.time_s) <= near_s:
-                nearest.setdefault(heads[index].view.camera.name, index)
+        for index in sorted(range(len(views)), key=lambda index: abs(views[index].view.time_s - sweep.time_s)):
+            if abs(views[index].view.time_s - sweep.time_s) <= near_s:
+                nearest.setdefault(views[index].view.camera.name, index)
         if not nearest:
             continue
         points = read_points(scene, sweep)

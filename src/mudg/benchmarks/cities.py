@@ -73,7 +73,7 @@ def measure_mdm(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
     """Scores of the model at every number of steps, with and without classes, and its seam; numbers and tables."""
     device = choose_device(config.device, "diffusion model", NETWORK_KINDS)
     bf16 = choose_bf16(config.precision, device)
-    request = SampleRequest(1, config.seed, sampler=config.sampler, eta=config.eta, bf16=bf16)
+    request = SampleRequest(1, config.seed, eta=config.eta, bf16=bf16)
     MDM.check_request(request)
     model = mdm_files.load(config.model).to(device)
     cities = from_city.LISTS[config.cities][: config.count]
@@ -109,7 +109,7 @@ def seam(model: MDM, config: BenchConfig, request: SampleRequest) -> dict[str, A
     """Change of static surfaces across the seams of overlapping windows, against that inside windows.
 
     A video of `SEAM_FRAMES` frames 3 m beside the path of one city is made in windows and steps as synthesize takes
-    them by default, with the sampler of the request. Returned per place: the mean of (change made / change of the
+    them by default. Returned per place: the mean of (change made / change of the
     truth) over pairs of frames; and the pairs themselves.
     """
     city, usual = from_city.LISTS[config.cities][0], SynthesizeConfig()

@@ -35,7 +35,7 @@ RUNS = "edit RUN"
 USED: Final[Mapping[str, tuple[str, ...]]] = {
     setting: tuple(users)
     for users, names in (
-        (("mdm",), "steps sampler eta"),
+        (("mdm",), "steps eta"),
         (("mdm", "poses", EDIT), "cities count"),
         (("mdm", EDIT, *CHAINS), "model"),
         (("mdm", *CHAINS), "precision"),
@@ -115,7 +115,7 @@ def refuse_unused(name: str, config: BenchConfig, preset: PresetName) -> None:
     for setting in changed_settings(config, bench_preset(preset)):
         users, group = USED[setting.split(".")[0]], f"synthesize.{setting}"
         if name not in users:
-            elsewhere = name in CHAINS and setting in ("steps", "sampler", "eta")
+            elsewhere = name in CHAINS and setting in ("steps", "eta")
             what, expected = (
                 f"mudg bench {name} does not use this setting",
                 " or ".join(map("mudg bench {}".format, users)),

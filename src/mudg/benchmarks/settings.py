@@ -31,13 +31,9 @@ class BenchOwn:
     m, and on the recorded path."""
     steps: tuple[int, ...] = (1, 2, 8)
     """mdm: numbers of denoising steps to compare; each is measured on its own."""
-    sampler: Literal["ddim", "dpm_solver"] = "ddim"
-    """mdm: sampler of the diffusion model. ddim: first order, with fresh noise between steps. dpm_solver: second order
-    and deterministic, for many steps. Both cost one network pass per step. shift, real and paper have
-    `--synthesize.sampler`, and likewise steps and eta."""
     eta: float | None = setting(default=None, ge=0, le=1)
-    """mdm: sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has)
-    (not given: 1)."""
+    """mdm: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given: 1).
+    shift, real and paper have `--synthesize.eta`, and likewise steps."""
     precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
     """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32
     elsewhere. float16: published-type models on CUDA devices (shift, real, paper)."""

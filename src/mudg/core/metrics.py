@@ -369,12 +369,9 @@ class Metric(Protocol):
         ...
 
 
-def measure(
-    pair: Pair, metrics: Mapping[str, Metric], known: Mapping[Callable[[Pair], Any], Any] | None = None
-) -> dict[str, Any]:
-    """What the named metrics measure of one view, ready for ``Metric.add``; each source is asked once, those in
-    ``known`` not at all."""
-    found: dict[Callable[[Pair], Any], Any] = dict(known or {})
+def measure(pair: Pair, metrics: Mapping[str, Metric]) -> dict[str, Any]:
+    """What the named metrics measure of one view, ready for ``Metric.add``; each source is asked once."""
+    found: dict[Callable[[Pair], Any], Any] = {}
     for metric in metrics.values():
         if metric.source not in found:
             found[metric.source] = metric.source(pair)
@@ -599,7 +596,6 @@ METRICS: Final[dict[str, MetricRow]] = {
     "temporal_flickering": MetricRow("temporal flickering", "", ("views",), "higher", None),
     "lpips": MetricRow("LPIPS", "", ("rgb", "LPIPS weights"), "lower", None),
     "lpips_vgg": MetricRow("LPIPS (VGG)", "", ("rgb", "LPIPS weights"), "lower", None),
-    "lpips_squeeze": MetricRow("LPIPS (Squeeze)", "", ("rgb", "LPIPS weights"), "lower", None),
     "fid": MetricRow("FID", "", ("rgb", "Inception weights"), "lower", None),
     "kid": MetricRow("KID", "", ("rgb", "Inception weights"), "lower", None),
     "fd_dinov2": MetricRow("FD-DINOv2", "", ("rgb", "DINOv2 weights"), "lower", None),

@@ -18,7 +18,7 @@ A step index `t` runs from 0 (nearly clean) to `steps - 1` (pure noise).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -216,56 +216,3 @@ def ddim(
         if eta > 0 and draw is not None:
             x = x + variance.clamp(min=0.0).sqrt().float() * draw()
     return x
-
-
-def dpm_solver(
-    denoise: Denoise, start: Tensor, schedule: Schedule, step_indices: Sequence[int], *, prediction: Prediction = "x0"
-) -> Tensor:
-    """DPM-Solver++(2M) (Lu et al. 2022, algorithm 2): second order from two consecutive estimates of x0, deterministic.
-
-    With lambda = log(alpha / sigma) and h its step, x_next = sigma_next / sigma x - alpha_next (exp(-h) - 1) D, where D
-    is extrapolated from the last two estimates. A first step at zero SNR (lambda = -infinity) is taken at first order,
-    and so is the one after it, whose extrapolation weight is then 0; the last step returns the estimate itself. With a
-    dynamic rescale, x_t is alpha_t scale_t x_0 + sigma_t eps: alpha times scale takes the place of alpha, and the
-    result is x_0 itself, without the factor that `ddim` leaves. Arguments and result as for `ddim`.
-    """
-    alpha = schedule.alpha_bar.sqrt() * schedule.scale.double()
-    sigma = (1 - schedule.alpha_bar).clamp(min=0).sqrt()
-    level = torch.log(alpha / sigma)
-    x, before, step_before = start, None, math.inf
-    for number, t in enumerate(step_indices):
-        x0 = x0_and_eps(x, denoise(x, t), schedule.alpha[t], schedule.sigma[t], prediction)[0] / schedule.scale[t]
-        if number + 1 == len(step_indices):
-            return x0
-        following = step_indices[number + 1]
-        step = float(level[following] - level[t])
-        estimate = x0
-        if before is not None and math.isfinite(step_before):
-            weight = step / (2 * step_before)
-            estimate = (1 + weight) * x0 - weight * before
-        shrink = float(sigma[following] / sigma[t])
-        grow = float(alpha[following]) - shrink * float(alpha[t])  # = -alpha_next (exp(-h) - 1), also for h = infinity
-        x = shrink * x + grow * estimate
-        before, step_before = x0, step
-    return x
-
-
-SAMPLERS: dict[str, Callable[..., Tensor]] = {"ddim": ddim, "dpm_solver": dpm_solver}
-"""Every sampler by name. Each costs one denoiser pass per step (two with classifier-free guidance). A new one is a
-function that takes the positional arguments and `prediction` of `ddim`, and one row here and in `SAMPLER_SETTINGS`."""
-
-SAMPLER_SETTINGS: dict[str, tuple[str, ...]] = {"ddim": ("eta", "draw", "last"), "dpm_solver": ()}
-"""Sampler -> its further settings. Any other is refused by `check_sampler`, never ignored."""
-
-
-def check_sampler(sampler: str, settings: Iterable[str] = ()) -> None:
-    """UsageError unless there is such a sampler and it takes all `settings` (names of arguments)."""
-    if sampler not in SAMPLERS:
-        raise UsageError("unknown sampler", expected=", ".join(SAMPLERS), got=sampler)
-    for name in settings:
-        if name not in SAMPLER_SETTINGS[sampler]:
-            takers = ", ".join(other for other, taken in SAMPLER_SETTINGS.items() if name in taken)
-            what = f"the sampler {sampler} does not take the setting {name}"
-            expected = f"{name} with {takers}" if takers else ", ".join(SAMPLER_SETTINGS[sampler]) or "no settings"
-            remedy = f"leave {name} out, or choose a sampler that takes it"
-            raise UsageError(what, where=f"sampler {sampler}", expected=expected, got=name, remedy=remedy)

@@ -226,12 +226,8 @@ class DrawnCloud:
         """
         rules, sparse = self.rules, self.rules.project(self.cloud, self.tracks, view)
         valid, nearest = sparse.valid, nearest_pixels(sparse.valid)
-        color, depth, moving, ids = (
-            sparse.rgb,
-            torch.full_like(sparse.depth, rules.far_m),
-            sparse.moving,
-            sparse.semantics,
-        )
+        color, moving, ids = sparse.rgb, sparse.moving, sparse.semantics
+        depth = torch.full_like(sparse.depth, rules.far_m)
         if bool(valid.any()):
             here = (..., *nearest)
             color, depth, moving, ids = color[here], sparse.depth[here], moving[here], ids[here]
@@ -477,55 +473,27 @@ def build_conditions(
     rows = ((*part, *(getattr(r, x.name) for x in fields(RenderPlanes) if r is not None)) for part, r in made)
     color, depth, valid, warped, backdrop, ids, far_ids, *planes = stacked(rows, len(fine_views), folder)
     renders = RenderPlanes(*planes) if planes else None
-    fine = Condition(
-        fine_views,
-        color,
-        depth,
-        valid,
-        reference if size == (rules.width, rules.height) else backdrop[0],
-        warped,
-        backdrop,
-        ids,
-        far_ids,
-        renders,
-    )
-    if size == (rules.width, rules.height):
+    same_size = size == (rules.width, rules.height)
+    shown = reference if same_size else backdrop[0]
+    fine = Condition(fine_views, color, depth, valid, shown, warped, backdrop, ids, far_ids, renders)
+    if same_size:
         return fine, fine
-
-    def reduced(x: Tensor) -> Tensor:
-        return functional.interpolate(x.float(), size=(rules.height, rules.width), mode="area")
-
     small_size = (rules.height, rules.width)
+    reduced = lambda x: functional.interpolate(x.float(), size=small_size, mode="area")
     picked = lambda x: functional.interpolate(x, size=small_size, mode="nearest-exact")
-    small_renders = None
     if renders is not None:
-        small_renders = RenderPlanes(
-            reduced(renders.color),
-            picked(renders.depth),
-            reduced(renders.alpha),
-            reduced(renders.certainty),
-            picked(renders.semantics),
-        )
-    own = []
-    for n, (view, there) in enumerate(zip(small, picked(far_ids), strict=True)):
-        render = None if small_renders is None else small_renders.map(lambda x, n=n: x[n])
-        own.append(DrawnCloud(cloud, tracks, rules, None, vacated_at).look(view, there[0], render))
-    own = [o.with_hole(o.color, o.ids, there[0] > 0.5)[0] for o, there in zip(own, reduced(warped))]
+        how = {"depth": picked, "semantics": picked}
+        planes = {x.name: how.get(x.name, reduced)(getattr(renders, x.name)) for x in fields(RenderPlanes)}
+        renders = RenderPlanes(**planes)
+    warped, ids, far_ids = reduced(warped) > 0.5, picked(ids), picked(far_ids)
+    points, own = replace(points, render_at=None), []
+    for n, (view, there, found) in enumerate(zip(small, far_ids, warped, strict=True)):
+        here = points.look(view, there[0], None if renders is None else renders.map(lambda x, n=n: x[n]))
+        own.append(here.with_hole(here.color, here.ids, found[0])[0])
     scratch.rest_mapped()
-    own_depth, own_valid = (torch.stack([getattr(o, name) for o in own])[:, None] for name in ("depth", "measured"))
-    condition = Condition(
-        tuple(small),
-        reduced(color),
-        own_depth,
-        own_valid,
-        reference,
-        reduced(warped) > 0.5,
-        reduced(backdrop),
-        picked(ids),
-        picked(far_ids),
-        small_renders,
-    )
-    return condition, fine
+    depth, valid = (torch.stack([getattr(o, name) for o in own])[:, None] for name in ("depth", "measured"))
+    color, backdrop = reduced(color), reduced(backdrop)
+    return Condition(tuple(small), color, depth, valid, reference, warped, backdrop, ids, far_ids, renders), fine
 
 
 def _condition_of_view(

@@ -40,7 +40,7 @@ from mudg.base.run_folder import RunDir, VerbOutput
 from mudg.base.types import Clip
 from mudg.diffusion import city_clips, log_clips, model_files, models, parallel, score
 from mudg.diffusion.city_clips import CityClipRules
-from mudg.diffusion.clips import TrainingClips, class_weights, clips_at, shard_path
+from mudg.diffusion.clips import TrainingClips, clips_at, shard_path
 from mudg.diffusion.log_clips import LogClipRules, LogSource
 from mudg.diffusion.memory_plan import choose_bf16
 from mudg.diffusion.model import MDM, BatchPart, LossSettings
@@ -70,7 +70,7 @@ def train(config: LearnConfig, out: Path, output: VerbOutput, open_work: Callabl
     """
     torch.set_num_threads(config.threads)
     with parallel.join_processes(config.compute.device) as ranks:
-        model, fresh = starting_model(config)
+        model = starting_model(config)
         opened: list[RunDir] = []
 
         def open_run() -> str:
@@ -81,7 +81,7 @@ def train(config: LearnConfig, out: Path, output: VerbOutput, open_work: Callabl
         if path:
             work = opened[0] if ranks.leads else RunDir(out, Path(path), output, "", {})
             try:
-                _train(model, fresh, config, work, ranks)
+                _train(model, config, work, ranks)
             except KeyboardInterrupt:
                 if ranks.leads:
                     work.pause()
@@ -118,30 +118,27 @@ def files_read(config: LearnConfig, out: Path, overwrite: bool) -> dict[str, Pat
     return {**read, "clips": "" if own_clips else clips}
 
 
-def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir, ranks: Ranks) -> None:
+def _train(model: Model, config: LearnConfig, directory: RunDir, ranks: Ranks) -> None:
     """Clips, codec, network, scores."""
     out = directory.path
     bf16 = choose_bf16(config.precision, ranks.device)
     source, making = open_clips(config, model, out, ranks)
     with making:
-        if "codec" in fresh and isinstance(model, MDM):
+        if not config.start and isinstance(model, MDM):
             ranks.leader_does(lambda: models.train_codec(model.codec, source, directory, bf16, ranks.device))
             models.load_trained_codec(model.codec, out, ranks)
             models.draw_weights(model.net, config.seed, "weights")
-        for name in ("refiner", "finisher"):
-            part = getattr(model, name, None)
-            if name in fresh and part is not None:
-                models.draw_weights(part, config.seed, f"{name} weights")
-                part.reset()
+            for name, part in (("refiner", model.refiner), ("finisher", model.finisher)):
+                if part is not None:
+                    models.draw_weights(part, config.seed, f"{name} weights")
+                    part.reset()
         model.requires_grad_(False)
         model.trained_part().requires_grad_(True)
-        models.hold_finisher(model, fresh, source.have_patches())
+        models.hold_finisher(model, not config.start, source.have_patches())
         weights = _train_network(model, source, directory, bf16, ranks)
 
     def finish() -> None:
         made = models.rebuilt(model, weights)
-        if isinstance(made, MDM) and made.refiner is not None and config.loss.class_balance:
-            made.refiner.take_back(class_weights(source.shards, source.weighed(), config.loss.class_balance))
         request = SampleRequest(config.score.steps, config.seed, bf16=bf16)
         scores = score.score(made, source.to_score(), source.shards, request)
         store.write_json(out / "metrics.json", scores)
@@ -287,7 +284,6 @@ def log_rules(config: LearnConfig, multiple: int, points_alone: bool = False) ->
 def rules_of_size(config: LearnConfig, size: tuple[int, int], held_out_every: int, points_alone: bool) -> LogClipRules:
     """How clips of a size are cut from logs."""
     data = config.data
-    least_points = 1.0 if points_alone else LogClipRules.least_points
     return LogClipRules(
         *size,
         window=data.window,
@@ -296,8 +292,7 @@ def rules_of_size(config: LearnConfig, size: tuple[int, int], held_out_every: in
         held_out_every=held_out_every,
         seed=config.seed,
         published=points_alone,
-        depth=data.depth,
-        least_points=least_points if data.least_points is None else data.least_points,
+        least_points=1.0 if points_alone else LogClipRules.least_points,
     )
 
 
@@ -327,13 +322,12 @@ def clips_of_logs(config: LearnConfig, rules: LogClipRules, folder: Path, train:
     if not scored:
         log.warn("learn: no clip is held out; the scored clip was also trained on")
     condition = "the projected points and the first image" if rules.published else "images taken at other times"
-    elsewhere = ", and from labels elsewhere" if rules.depth == "annotated" else ""
     about = (
         f"{train} clips of {data.window} frames of {len(data.scenes)} recorded"
         f" {'log' if len(data.scenes) == 1 else 'logs'} at {rules.width}x{rules.height} pixels, seen from where"
-        f" they were\nrecorded, with {condition} as condition. Depth was learned where a sweep measured it{elsewhere}."
-        " The model this\none continues from has training data of its own. `held-out` below means every"
-        f" {data.held_out_every}. window of these logs."
+        f" they were\nrecorded, with {condition} as condition. Depth was learned where a sweep measured it,"
+        " and from labels elsewhere. The model this\none continues from has training data of its own. `held-out` below"
+        f" means every {data.held_out_every}. window of these logs."
     )
     to_score = [city_clips.HELD_OUT + n for n in range(scored)] if data.held_out_every else [0]
     return TrainingClips(config, folder, size, [size], range(train), train, to_score, about)
@@ -439,8 +433,7 @@ def _train_network(model: Model, source: TrainingClips, run_dir: RunDir, bf16: b
     """Train what the model names; returns the weights to use (the moving average), whole, in the leader."""
     config, out = source.config, run_dir.path / "steps"
     state, spread = _begin(model, config, out, ranks)
-    weights = class_weights(source.shards, source.weighed(), config.loss.class_balance).to(ranks.device)
-    settings = loss_settings(config, weights)
+    settings = LossSettings(config.loss.refined_share, config.data.reference_dropout)
 
     def draw(step: int) -> Drawn:
         frames, count, parts = _batch(config, ranks, step)
@@ -515,8 +508,3 @@ def _train_network(model: Model, source: TrainingClips, run_dir: RunDir, bf16: b
 
 def _picture(run_dir: RunDir, step: int) -> Path:
     return run_dir.path / "samples" / f"{step:07d}.png"
-
-
-def loss_settings(config: LearnConfig, weights: Tensor) -> LossSettings:
-    """What a configuration says about the loss."""
-    return LossSettings(weights, config.loss.refined_share, config.data.reference_dropout)

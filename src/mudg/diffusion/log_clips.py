@@ -20,7 +20,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -40,7 +39,6 @@ from mudg.scene.clouds import read_fused
 from mudg.scene.labels import photographs, read_label, read_trusted_classes
 from mudg.scene.read import read_image, read_points, read_scene
 
-DepthTruth = Literal["annotated", "sweep"]
 INDEX = "log_clips.json"
 SKY = palette.ID["sky"]
 
@@ -64,8 +62,6 @@ class LogClipRules:
     """Nearest usable image of a view: up to so many moments away (held-out windows: always 2, or this if less)."""
     least_points: float = 0.3
     """Smallest share of the cloud's points that a training window keeps."""
-    depth: DepthTruth = "annotated"
-    """What is learned as depth: the sweep taken with an image alone, or the scene's depth labels too."""
     label_confidence: float = 0.5
     """Labels with less confidence than this are no truth."""
     fine: int = 2
@@ -242,7 +238,7 @@ def _truth(log: OpenLog, frame: Frame, recorded: Photo, view: View) -> tuple[Ten
         ids = resize_nearest(recorded.semantics, height, width)
     depth, known = measured_depth(scene, view)
     confidence, sky = known.astype(np.float32), (ids == SKY) & ~known
-    if log.rules.depth == "annotated" and "depth" in frame.labels:
+    if "depth" in frame.labels:
         label = lambda name: resize_nearest(read_label(scene, frame, name), height, width)
         labelled = label("depth")
         sure = label("depth_confidence") if "depth_confidence" in frame.labels else np.float32(1)

@@ -98,12 +98,10 @@ class BatchPart:
 class LossSettings:
     """What a training run says about the loss.
 
-    class_weights      f32[19], weights of the classes in the cross-entropy; None = all 1
     refined_share      share of each side of the image on which the refiner is trained at a step
     reference_dropout  share of the clips that go without their reference image; the published kind
     """
 
-    class_weights: Tensor | None
     refined_share: float
     reference_dropout: float
 
@@ -283,13 +281,13 @@ class MDM(nn.Module):
         errors = {
             "rgb": losses.latent_error(stated["rgb"], truth.latents["rgb"], weight),
             "depth": losses.latent_depth_error(stated["depth"], truth.latents["depth"], weight, truth.depth_known),
-            "semantics": losses.share_cross_entropy(log_shares, truth.shares, settings.class_weights),
+            "semantics": losses.share_cross_entropy(log_shares, truth.shares),
         }
         terms = {m: float(error.detach()) for m, error in errors.items()}
         total = sum(LOSS_SHARES[m] * errors[m] for m in MODALITIES)
         if self.refiner is not None:
-            errors = self._refiner_terms(stated, encoded, truth.pixels, part, settings)
-            errors |= self._finisher_terms(stated, encoded, clips, settings)
+            errors = self._refiner_terms(stated, encoded, truth.pixels, part, settings.refined_share)
+            errors |= self._finisher_terms(stated, encoded, clips)
             terms |= {name: float(error.detach()) for name, error in errors.items()}
             total = total + sum(errors.values())
         return Losses(total, terms)
@@ -322,18 +320,18 @@ class MDM(nn.Module):
         encoded: ConditionLatents,
         truth: PixelTruth,
         part: BatchPart,
-        settings: LossSettings,
+        share: float,
     ) -> dict[str, Tensor]:
         """Weighted terms of the refiner in a rectangle of the image, at the denoiser's resolution."""
         frames, (h, w) = encoded.planes.shape[1], encoded.planes.shape[-2:]
-        cells = self._refined_window(part, settings.refined_share, h, w)
+        cells = self._refined_window(part, share, h, w)
         latents = {m: z[..., cells[0], cells[1]].flatten(0, 1) for m, z in stated.items()}
         tall, wide = (slice(s.start * self.codec.factor, s.stop * self.codec.factor) for s in cells)
         made = self.refine(latents, encoded.pixels.crop(tall, wide), frames)
-        return self._pixel_terms(made, truth.crop(tall, wide), settings, "pixel")
+        return self._pixel_terms(made, truth.crop(tall, wide), "pixel")
 
     def _finisher_terms(
-        self, stated: dict[Modality, Tensor], encoded: ConditionLatents, clips: Sequence[Clip], settings: LossSettings
+        self, stated: dict[Modality, Tensor], encoded: ConditionLatents, clips: Sequence[Clip]
     ) -> dict[str, Tensor]:
         """Weighted terms of the finisher on the patches that the clips have; denoiser and refiner learn nothing from
         them."""
@@ -350,7 +348,7 @@ class MDM(nn.Module):
             scale = torch.tensor(scales, device=made.rgb.device).repeat_interleave(frames)
         done = self.finisher(made, given, frames, scale)
         found = Refined(done.rgb, done.depth_code, class_scores(done), done.log_error)
-        return self._pixel_terms(found, truth, settings, "fine")
+        return self._pixel_terms(found, truth, "fine")
 
     def _enlarged(
         self, stated: dict[Modality, Tensor], encoded: ConditionLatents, number: int, patch: FinePatch
@@ -374,7 +372,7 @@ class MDM(nn.Module):
         ids = refined.scores.argmax(1, keepdim=True).to(torch.uint8)
         return Made(refined.rgb, refined.depth_code, ids, refined.log_error)
 
-    def _pixel_terms(self, refined: Refined, truth: PixelTruth, settings: LossSettings, name: str) -> dict[str, Tensor]:
+    def _pixel_terms(self, refined: Refined, truth: PixelTruth, name: str) -> dict[str, Tensor]:
         """Weighted terms of refined pixels; depth in the sky counts threefold."""
         codec = self.config.codec
         log_per_code = math.log(codec.far_m / codec.near_m) / 2
@@ -383,7 +381,7 @@ class MDM(nn.Module):
         return {
             f"{name}_rgb": losses.image_error(error, square=2.0, gradient=0.5),
             f"{name}_depth": losses.depth_code_error(refined.depth_code, truth.depth_code, counted, log_per_code),
-            f"{name}_semantics": 0.2 * losses.class_error(refined.scores, truth.ids, settings.class_weights),
+            f"{name}_semantics": 0.2 * losses.class_error(refined.scores, truth.ids),
             f"{name}_error": 0.05 * losses.stated_error(refined.log_error, error),
         }
 
@@ -425,8 +423,7 @@ class MDM(nn.Module):
 
     @staticmethod
     def check_request(request: SampleRequest) -> None:
-        """UsageError for a setting that does not apply to this kind of model, or to the sampler."""
-        request.sampler_settings()
+        """UsageError for a setting that does not apply to this kind of model."""
         if request.guidance is not None or request.guidance_rescale is not None:
             raise UsageError(
                 "only published-type models have guidance",

@@ -479,8 +479,7 @@ class PublishedMDM(nn.Module):
 
     @staticmethod
     def check_request(request: SampleRequest) -> None:
-        """UsageError for a setting that does not apply to this kind of model, or to the sampler."""
-        request.sampler_settings()
+        """UsageError for a setting that does not apply to this kind of model."""
         if request.start is not None:
             raise UsageError(
                 "only small models can begin from a given clip", where="start", remedy="choose another model"
@@ -543,8 +542,7 @@ class PublishedMDM(nn.Module):
         streams = [seeds.torch_generator(request.seed, request.index * 64, f"sample {m}") for m in names]
         draw = lambda: torch.cat([noise.video_noise(shape, g) for g in streams]).to(self.device)
         velocity = self._guided(encoded, names, tokens, request)
-        ends = {"last": "first_alpha"} if request.sampler == "ddim" else {}
-        x, estimates = denoised(velocity, draw, self.schedule, request, "v", **ends)
+        x, estimates = denoised(velocity, draw, self.schedule, request, "v", last="first_alpha")
         return {m: x[n] for n, m in enumerate(names)}, mean_change([e[0] for e in estimates], x[0])
 
     def _guided(

@@ -48,8 +48,7 @@ class SampleRequest:
         steps: denoiser passes; 1 is the regression of the clip on its condition. The published kind needs one pass for
             each modality, and twice as many with guidance.
         seed, index: all noise is drawn from (seed, index): same in, same out.
-        sampler: a row of `noise.SAMPLERS`.
-        eta: ddim: noise added between steps, 0 to 1 (None = the sampler's default).
+        eta: noise added between steps, 0 to 1 (None = 1).
         guidance: published kind: weight of the guided over the unguided prediction; 1 = none (None = the model's own).
         guidance_rescale: published kind: share of the guided prediction whose spread is pulled back (None = the model's
             own).
@@ -63,7 +62,6 @@ class SampleRequest:
     steps: int
     seed: int = 0
     index: int = 0
-    sampler: str = "ddim"
     eta: float | None = None
     guidance: float | None = None
     guidance_rescale: float | None = None
@@ -71,13 +69,6 @@ class SampleRequest:
     start: StartClip | None = field(default=None, repr=False)
     align: bool = True
     bf16: bool = False
-
-    def sampler_settings(self) -> dict[str, Any]:
-        """Settings of the sampler that were given; UsageError where there is no such sampler or it does not take
-        them."""
-        settings = {} if self.eta is None else {"eta": self.eta}
-        noise.check_sampler(self.sampler, settings)
-        return settings
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +159,7 @@ def denoised(
     prediction: Prediction,
     **settings: Any,
 ) -> tuple[Tensor, list[Tensor]]:
-    """Run the request's sampler from fresh noise.
+    """Sample with DDIM from fresh noise.
 
     Args:
         denoise: the network at one step. draw: makes noise of the sample's shape.
@@ -186,11 +177,8 @@ def denoised(
             estimates.append(noise.x0_and_eps(x, stated, schedule.alpha[t], schedule.sigma[t], prediction)[0])
         return stated
 
-    settings |= request.sampler_settings()
-    if "draw" in noise.SAMPLER_SETTINGS[request.sampler]:
-        settings["draw"] = draw
-    sampler = noise.SAMPLERS[request.sampler]
-    return sampler(watched, draw(), schedule, indices, prediction=prediction, **settings), estimates
+    settings |= {"prediction": prediction, "eta": 1.0 if request.eta is None else request.eta, "draw": draw}
+    return noise.ddim(watched, draw(), schedule, indices, **settings), estimates
 
 
 # confidence ---------------------------------------------------------------------------------------

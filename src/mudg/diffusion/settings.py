@@ -28,11 +28,8 @@ class SynthesizeConfig:
     steps: int = setting(default=2, ge=1, le=1000)
     """Denoising steps. More add texture and agree less with the truth pixel by pixel. Use 50 for published-type
     models."""
-    sampler: Literal["ddim", "dpm_solver"] = "ddim"
-    """Sampler of the diffusion model. ddim: first order, with fresh noise between steps. dpm_solver: second order and
-    deterministic, for many steps. Both cost one network pass per step."""
     eta: float | None = setting(default=None, ge=0, le=1)
-    """Sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not
+    """Noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not
     given: 1)."""
     condition: Literal["full", "reference", "points", "concat", "repair"] = "full"
     """Which parts of the model's condition are given, to measure what each brings. reference: the nearest recorded
@@ -109,9 +106,7 @@ class HarmonizeConfig:
 class ConvertConfig:
     """Convert a published checkpoint to a model folder."""
 
-    network: Literal["diffusion", "inception", "i3d", "dinov2", "clip", "lpips", "lpips-vgg", "lpips-squeeze"] = (
-        "diffusion"
-    )
+    network: Literal["diffusion", "inception", "i3d", "dinov2", "clip", "lpips", "lpips-vgg"] = "diffusion"
     """What the checkpoint holds: a diffusion model, or a network of the scores (docs/scores.md). The other settings
     apply to diffusion models only."""
     resolution: Literal["auto", "320x512", "576x1024"] = "auto"
@@ -197,12 +192,6 @@ class LearnData:
     """Logs: frames between the starts of two clips. Values below `window` give overlapping clips."""
     held_out_every: int = setting(default=5, ge=0)
     """Logs: every n-th clip is used for scoring only (0 = none)."""
-    depth: Literal["annotated", "sweep"] = "annotated"
-    """Logs: what is learned as depth. annotated: the sweep taken with an image where it measured, elsewhere the scene's
-    depth labels, weighted with their confidence. sweep: the sweep alone, which covers a few percent of the pixels."""
-    least_points: float | None = setting(default=None, gt=0, le=1)
-    """Logs: smallest share of the cloud's points in the condition of a training clip; the share is drawn between this
-    and 1 (not given: 0.3; published-type models: 1, all points, as in the paper)."""
 
 
 @settings
@@ -270,9 +259,6 @@ class LearnOptimizer:
 class LearnLoss:
     """Terms of the training loss."""
 
-    class_balance: float = setting(default=0.0, ge=0, le=1)
-    """Balance of rare classes in the semantic loss: 0 = as frequent as they are, 1 = all classes count the same. The
-    bias this gives the refiner's class scores is removed after training."""
     refined_share: float = setting(default=0.5, gt=0, le=1)
     """The refiner is trained on a crop whose sides are this share of the image's."""
 
@@ -335,9 +321,9 @@ class LearnConfig:
     from scratch)."""
     steps: int = setting(default=2800, ge=1)
     """Training steps of the network."""
-    frozen: Literal["nothing", "temporal_transformers", "temporal_layers", "denoiser"] = "nothing"
+    frozen: Literal["nothing", "temporal_transformers", "temporal_layers"] = "nothing"
     """Layers that keep their weights. temporal_transformers: as in the published second stage. temporal_layers: all
-    layers that mix frames. denoiser: train the refiner only."""
+    layers that mix frames."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Number format of the computation. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32
     elsewhere."""

@@ -116,7 +116,6 @@ def request_of(config: SynthesizeConfig, bf16: bool = False) -> SampleRequest:
     return SampleRequest(
         config.steps,
         config.seed,
-        sampler=config.sampler,
         eta=config.eta,
         guidance=config.guidance,
         guidance_rescale=config.guidance_rescale,

@@ -74,8 +74,6 @@ class ScoreConfig:
     at the same views as the perceptual distance (empty = not computed)."""
     lpips_vgg_weights: str = ""
     """The same for LPIPS with VGG-16 (empty = not computed)."""
-    lpips_squeeze_weights: str = ""
-    """The same for LPIPS with SqueezeNet 1.1 (empty = not computed)."""
     lpips_input: Literal["correct", "unscaled"] = "correct"
     """Range of the colours that LPIPS gets. unscaled: 0 to 1 where -1 to 1 belongs, as much published code of Gaussian
     scenes has it; only to compare with its numbers."""

@@ -11,12 +11,12 @@ goes on with a finished fit (``gaussians/storage.py``).
 
 from __future__ import annotations
 
-import contextlib
 import math
 import shutil
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,7 +50,7 @@ from mudg.gaussians.settings import METHODS, FitConfig
 from mudg.gaussians.storage import load_model as load_model
 from mudg.gaussians.storage import save_model as save_model
 from mudg.gaussians.trust import certainty_of, unseen_maps, unseen_rows
-from mudg.gaussians.views import StoredView, TrainView, ViewSet, load_recorded
+from mudg.gaussians.views import TrainView, ViewSet, load_recorded
 from mudg.scene.clouds import read_fused
 from mudg.scene.fuse import fused_without_boxes
 from mudg.scene.observations import ObservationSet
@@ -97,9 +97,8 @@ def write_fit(config: FitConfig, inputs: FitInputs, work: RunDir) -> dict[str, A
         config = storage.whole_run(config)
     with one_torch_thread(), memory_of(device, "fit"):
         state = _prepare(config, inputs, work.path).to(device)
-        with contextlib.closing(state.views):
-            optimise(state, config, work)
-            add_certainty(state, config)
+        optimise(state, config, work)
+        add_certainty(state, config)
     storage.save_model(state.model, work.path)
     storage.save_appearance(state.appearance, work.path)
     shutil.rmtree(work.path / "steps", ignore_errors=True)
@@ -172,14 +171,14 @@ def recorded_views(
     scratch: Path | None = None,
 ) -> tuple[ViewSet, tuple[int, ...]]:
     """The recorded views of a configuration, without virtual ones, and the train ids of the model's class channels
-    (those that ``virtual`` shows and ``start`` knows included). ``scratch``: keep them in a file in this folder, not in
+    (those that ``virtual`` shows and ``start`` knows included). ``scratch``: keep them in files in this folder, not in
     memory."""
     frames = views.training_frames(scene, config.cameras)
     classes = views.classes_of(scene, frames, virtual or {}) if config.semantics else ()
     classes = classes if start is None else storage.all_classes(start, classes)
     with_lidar = "lidar" in METHODS[config.method].supervision and config.loss.lidar_weight > 0
     loaded = load_recorded(scene, frames, classes, config.width_px, with_lidar)
-    return ViewSet(views.keep(loaded, len(frames), scratch), ()), classes
+    return ViewSet(views.keep(loaded, len(frames), scratch), filed=scratch is not None), classes
 
 
 def start_state(
@@ -208,7 +207,7 @@ def continued_state(config: FitConfig, start: storage.StartFit, shown: ViewSet, 
 
 
 def _nothing_corrected(config: FitConfig, shown: ViewSet) -> Appearance:
-    return Appearance.of_views([head.name for head in views.heads_of(shown.recorded)], config.appearance)
+    return Appearance.of_views([view.name for view in shown.recorded], config.appearance)
 
 
 def add_certainty(state: FitState, config: FitConfig) -> None:
@@ -233,26 +232,19 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
     virtual_from, pace = state.begun_at or virtual_from, checkpoint.Pace()
     sizes = views.HalvedViews(config.virtual.half_size * config.iterations, keep=not state.views.filed)
 
-    def choose(step: int) -> tuple[StoredView, ...]:
-        probability = config.virtual.probability if virtual_from < step <= virtual_to else 0.0
-        chosen = state.views.choose(config.seed, step, probability, config.virtual.beside)
-        return tuple(sizes.sized(view, step) for view in chosen)
-
-    with (
-        log.task(f"fit {config.method}", config.iterations, state.step) as bar,
-        Interruption() as interruption,
-        # The one way to the device; results come back in gaussians/rendering.py.
-        views.chosen_ahead(state.views, choose, range(state.step + 1, config.iterations + 1), state.device) as upcoming,
-    ):
+    with log.task(f"fit {config.method}", config.iterations, state.step) as bar, Interruption() as interruption:
         while state.step < config.iterations:
             began = time.perf_counter()
             step = state.step + 1
             if step - 1 <= virtual_from < step and state.views.virtual and config.virtual.gaussians:
                 start_unseen_gaussians(state, config, raster)
-            seen = next(upcoming)
+            probability = config.virtual.probability if virtual_from < step <= virtual_to else 0.0
+            chosen = state.views.choose(config.seed, step, probability, config.virtual.beside)
+            # The one way to the device; results come back in gaussians/rendering.py.
+            seen = [sizes.sized(view, step).as_tensors(state.device) for view in chosen]
             check = FiniteCheck(step, at_once=state.device.type == "cpu")
-            how = [LearnStep(config, raster, perception, check, step, first=view is seen[0]) for view in seen]
-            learnt = [_learn_from(state, view, of_view) for view, of_view in zip(seen, how)]
+            learn = partial(_learn_from, state, config=config, raster=raster, perception=perception, check=check)
+            learnt = [learn(view, step=step, first=view is seen[0]) for view in seen]
             check.refuse()
             adam_step(state.model, step, config.iterations, state.begun_at)
             rates = appearance_rates(step, config.iterations)
@@ -284,19 +276,6 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
                 interruption.stop_now()
 
 
-@dataclass(frozen=True)
-class LearnStep:
-    """What a step does with one of its views. ``check``: takes what must be finite. ``first``: whether it is the first
-    view of this step; terms that do not depend on the view count with it."""
-
-    config: FitConfig
-    raster: RasterConfig
-    perception: Perception
-    check: FiniteCheck
-    step: int
-    first: bool
-
-
 class LearntPicture(NamedTuple):
     """What a step rendered: colours f32[3, H, W] without the sky, and coverage f32[1, H, W]."""
 
@@ -304,11 +283,21 @@ class LearntPicture(NamedTuple):
     alpha: Tensor
 
 
-def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[LearntPicture, dict[str, Tensor]]:
+def _learn_from(
+    state: FitState,
+    view: TrainView,
+    *,
+    step: int,
+    first: bool,
+    config: FitConfig,
+    raster: RasterConfig,
+    perception: Perception,
+    check: FiniteCheck,
+) -> tuple[LearntPicture, dict[str, Tensor]]:
     """Render a view and add the gradients of its loss to the parameters'. Returns the picture (not all that was
-    rendered: that would stay in memory while the next view is), and the weighted loss terms."""
-    config, step, raster, recipe = how.config, how.step, how.raster, recipe_of(how.config.method)
-    recorded = view.kind == "recorded"
+    rendered: that would stay in memory while the next view is), and the weighted loss terms. ``first``: of the views of
+    this step; terms that do not depend on the view count with it."""
+    recipe, recorded = recipe_of(config.method), view.kind == "recorded"
     model = recipe.drawn_model(state.model, view, step, config) if recorded else state.model
     growing = recorded and isinstance(state.schedule, DensifySettings) and step <= state.schedule.stop
     with_classes = not recorded or step % config.loss.semantic_every == 0
@@ -319,13 +308,13 @@ def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[Learn
         terms = recorded_terms(state, render, view, recipe.common(config))
         terms |= recipe.terms(DrawnView(model, gaussians, render, view, step, config, raster))
     else:
-        terms = virtual_terms(state, render, view, config, how.perception)
-    if how.first and config.loss.opacity_weight:
+        terms = virtual_terms(state, render, view, config, perception)
+    if first and config.loss.opacity_weight:
         terms["opacity"] = config.loss.opacity_weight * gaussians.opacity.mean()
     terms |= correction_terms(state, gaussians, view, config, raster, step)
-    how.check.terms(view.name, terms)
+    check.terms(view.name, terms)
     torch.stack(list(terms.values())).sum().backward()
-    how.check.gradients(view.name, state.model, state.appearance)
+    check.gradients(view.name, state.model, state.appearance)
     if growing:
         camera = view.view.camera
         timed = state.model.table["tau"].grad if "tau" in state.model.table.columns else None

@@ -29,7 +29,7 @@ from mudg.core.table import Table
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import SYMMETRIC_LABELS, RigidNode, SkyNode, StaticNode, object_node
 from mudg.gaussians.settings import METHODS, FitConfig
-from mudg.gaussians.views import StoredView, heads_of
+from mudg.gaussians.views import StoredView
 
 SH_C0: Final = 0.28209479177387814
 START_OPACITY: Final = 0.1
@@ -170,7 +170,7 @@ def _static_columns(
     fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
 ) -> Mapping[str, torch.Tensor]:
     cloud = fused.static
-    centers = np.stack([head.view.center_world for head in heads_of(views)]).astype(np.float32)
+    centers = np.stack([stored.view.center_world for stored in views]).astype(np.float32)
     rows = thinned(cloud.xyz, centers, config)
     points = StartPoints(cloud.xyz[rows], cloud.rgb[rows], _labels(cloud)[rows], neighbour_scale(cloud.xyz[rows]))
     filled = fill_unreached(views, points.xyz, classes, fused.colors)
@@ -232,7 +232,7 @@ def fill_unreached(
     views: Sequence[StoredView], xyz: NDArray[np.float32], classes: tuple[int, ...], cameras: CameraColors
 ) -> StartPoints | None:
     """Points for what is visible but has no LiDAR; see the module's text. None without labels."""
-    labelled = [index for index, head in enumerate(heads_of(views)) if head.labelled]
+    labelled = [index for index, stored in enumerate(views) if stored.channels is not None]
     if not labelled or not classes:
         return None
     chosen = labelled[:: max(1, len(labelled) // FILL_FRAMES)]

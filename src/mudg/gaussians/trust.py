@@ -11,7 +11,7 @@ recorded view, or outside all their images, are *unseen*: ``unseen_rows`` makes 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ from mudg.gaussians.appearance import Appearance
 from mudg.gaussians.model import SceneModel, compose, compose_as_read, composite_sky
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.start import StartPoints, voxel_filter
-from mudg.gaussians.views import StoredView, TrainView, heads_of
+from mudg.gaussians.views import StoredView, TrainView
 
 # certainty ----------------------------------------------------------------------------------------
 #
@@ -54,24 +54,14 @@ ASSUMED_PIXELS = 0.1
 """Weight of that assumption, in pixels with LiDAR."""
 
 
-@dataclass(frozen=True, eq=False)
-class PhotoEvidence:
-    """Sums of blending weights per Gaussian, each f32[N], over views and pixels. ``views``: number of views that show
-    it. ``pixels``: weight, in pixels. ``color``: the same, each pixel times the mean difference of its three colours.
-    ``lidar``: weight, in pixels with LiDAR. ``depth``: the same, each times its relative difference of depth."""
-
-    views: Tensor
-    pixels: Tensor
-    color: Tensor
-    lidar: Tensor
-    depth: Tensor
-
-    def certainty(self) -> Tensor:
-        """Certainty of every Gaussian f32[N] in [0, 1]; 0 where no view shows it."""
-        color = self.color / self.pixels.clamp_min(1e-12)
-        depth = (self.depth + ASSUMED_PIXELS * DEPTH_ERROR) / (self.lidar + ASSUMED_PIXELS)
-        seen = self.views / (self.views + 1)
-        return seen * COLOR_ERROR / (COLOR_ERROR + color) * DEPTH_ERROR / (DEPTH_ERROR + depth)
+def certainty(views: Tensor, pixels: Tensor, color: Tensor, lidar: Tensor, depth: Tensor) -> Tensor:
+    """Certainty of every Gaussian f32[N] in [0, 1], 0 where no view shows it, from sums of blending weights f32[N] over
+    views and pixels. ``views``: number of views that show it. ``pixels``: weight, in pixels. ``color``: the same, each
+    pixel times the mean difference of its three colours. ``lidar``: weight, in pixels with LiDAR. ``depth``: the same,
+    each times its relative difference of depth."""
+    color = color / pixels.clamp_min(1e-12)
+    depth = (depth + ASSUMED_PIXELS * DEPTH_ERROR) / (lidar + ASSUMED_PIXELS)
+    return views / (views + 1) * COLOR_ERROR / (COLOR_ERROR + color) * DEPTH_ERROR / (DEPTH_ERROR + depth)
 
 
 def certainty_of(
@@ -90,7 +80,7 @@ def certainty_of(
         sums = weight_sums(model, views[int(index)].as_tensors(model.device), raster, appearance)
         total += torch.cat([(sums[:1] / (sums[:1] + 1)), sums])
     total *= len(views) / len(chosen)
-    return PhotoEvidence(*total).certainty().half()
+    return certainty(*total).half()
 
 
 def weight_sums(
@@ -158,9 +148,8 @@ def unseen_maps(
 
     Pixels without depth count as sky, far away. Depends on the geometry the model has by now.
     """
-    heads = heads_of(recorded)
-    chosen = np.unique(np.linspace(0, len(heads) - 1, min(WITNESSES, len(heads))).round().astype(int))
-    witnesses = [_witness(model, heads[i].view, raster) for i in chosen]
+    chosen = np.unique(np.linspace(0, len(recorded) - 1, min(WITNESSES, len(recorded))).round().astype(int))
+    witnesses = [_witness(model, recorded[i].view, raster) for i in chosen]
     objects = [(node.size_m, cache(node.pose_matrix)) for node in model.nodes if isinstance(node, RigidNode)]
     for stored in log.progress(virtual, len(virtual), "finding unseen surfaces"):
         yield stored, _unseen(stored, witnesses, objects)

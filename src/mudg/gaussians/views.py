@@ -1,8 +1,7 @@
 """The views a fit learns from: recorded frames with their LiDAR depths, and virtual observations.
 
-Everything is stored as bytes (8-bit colour and labels) and becomes tensors when a step asks for one view. Which view a
-step gets is a function of (run seed, step) alone. Where the bytes lie, in memory or in a file, is decided in
-``views.py``.
+Everything is stored as bytes (8-bit colour and labels), in memory or in files, and becomes tensors when a step asks for
+one view. Which view a step gets is a function of (run seed, step) alone.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, overload
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -27,7 +26,7 @@ from mudg.base import geometry, log, seeds
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.palette import ID, UNLABELLED
 from mudg.base.processes import GIB, computed_ahead
-from mudg.base.scratch import ScratchFile
+from mudg.base.scratch import mapped_array
 from mudg.base.types import Frame, FusedCloud, ObservationKind, Scene, Sweep, Track, View
 from mudg.core.fusion import largest_beam_gap
 from mudg.core.pictures import resize_area, resize_nearest
@@ -82,17 +81,6 @@ class TrainView:
 
 
 @dataclass(frozen=True)
-class ViewHead:
-    """What is known of a view without its pixels; ``labelled``: whether it has class channels."""
-
-    name: str
-    view: View
-    kind: ObservationKind
-    labelled: bool
-    readout: Readout | None = None
-
-
-@dataclass(frozen=True)
 class StoredView:
     """A ``TrainView`` in bytes: rgb u8[H, W, 3]; channels u8[H, W]; sky, mask bool[H, W]; depth f32[H, W]; confidence
     u8[H, W] (255 = 1). None where there is none; no mask: all pixels, no confidence: 1."""
@@ -108,11 +96,6 @@ class StoredView:
     depth: NDArray[np.float32] | None = None
     confidence: NDArray[np.uint8] | None = None
     readout: Readout | None = None
-
-    @property
-    def head(self) -> ViewHead:
-        """The view without its pixels."""
-        return ViewHead(self.name, self.view, self.kind, self.channels is not None, self.readout)
 
     def train_ids(
         self, row: NDArray[np.integer], column: NDArray[np.integer], classes: Sequence[int]
@@ -144,28 +127,13 @@ class StoredView:
         )
 
 
-def heads_of(views: Sequence[StoredView]) -> Sequence[ViewHead]:
-    """All views without their pixels; nothing is read."""
-    return views.heads if isinstance(views, ViewFile) else [view.head for view in views]
-
-
 @dataclass(frozen=True)
 class ViewSet:
-    """All views of a fit. ``virtual`` may be empty."""
+    """All views of a fit. ``virtual`` may be empty. ``filed``: they lie in files, not in memory."""
 
     recorded: Sequence[StoredView]
-    virtual: Sequence[StoredView]
-
-    @property
-    def filed(self) -> bool:
-        """Whether some views do not lie in memory."""
-        return any(isinstance(views, ViewFile) for views in (self.recorded, self.virtual))
-
-    def close(self) -> None:
-        """Give back the space of views that do not lie in memory."""
-        for views in (self.recorded, self.virtual):
-            if isinstance(views, ViewFile):
-                views.close()
+    virtual: Sequence[StoredView] = ()
+    filed: bool = False
 
     def choose(
         self, run_seed: int, step: int, virtual_probability: float, beside: bool = False
@@ -428,21 +396,15 @@ def lidar_pixels(view: View, xyz_world: NDArray[np.float32], gap_deg: float) -> 
 
 # ---- where views lie -----------------------------------------------------------------------------
 #
-# Small sets lie in memory, large ones in a scratch file, read ahead of the steps that need them. Decoded views of a
-# long log at full size need more memory than the fit itself: 1,000 of 1600 x 1066 pixels 8 to 11 GiB, 1,000 virtual
-# ones with dense depth 18. Above ``IN_MEMORY_BYTES`` they go to a file without a name in the folder of the fit, plane
-# by plane as they are (masks in bits), so that a view costs one read and no decoding, and what a step gets is the same
-# to the bit. The system keeps as much of the file in memory as it can spare. Which views a step gets is a function of
-# the step, so threads read those of the next steps beforehand.
+# Small sets lie in memory. Decoded views of a long log at full size need more than the fit itself: 1,000 of 1600 x 1066
+# pixels 8 to 11 GiB, 1,000 virtual ones with dense depth 18. Above ``IN_MEMORY_BYTES`` their planes are mapped from
+# files without names in the folder of the fit: the system keeps as much of them in memory as it can spare.
 
 IN_MEMORY_BYTES = GIB
 """Decoded views of up to this size stay in memory."""
-AHEAD_THREADS = 2
-"""Threads that read the views of later steps; each has two steps waiting."""
+FILE_BYTES = GIB // 4
 LIDAR_SHARE = 0.05
 """Assumed share of pixels with LiDAR, for the size of views that are not read yet."""
-_PLANES = ("depth", "rgb", "channels", "confidence", "sky", "mask")
-"""Depth first, so that it lies at a multiple of its element's size."""
 
 
 def recorded_bytes(frames: Sequence[Frame], width_px: int) -> int:
@@ -467,8 +429,8 @@ def virtual_bytes(sets: Mapping[str, ObservationSet]) -> int:
 
 
 def scratch_folder(count: int, needed: int, folder: Path) -> Path | None:
-    """Where ``count`` views of ``needed`` bytes are to be kept: in a file in this folder, or None: in memory. Says
-    which. ResourceError: the disk has less room than the file needs."""
+    """Where ``count`` views of ``needed`` bytes are to be kept: in files in this folder, or None: in memory. Says
+    which. ResourceError: the disk has less room than they need."""
     if needed <= IN_MEMORY_BYTES:
         return None
     free = shutil.disk_usage(folder).free
@@ -477,117 +439,35 @@ def scratch_folder(count: int, needed: int, folder: Path) -> Path | None:
         expected = f"{needed / GIB:.1f} GiB free for {count} views while the fit runs"
         remedy = "free disk space, choose --out on another disk, or lower --width-px"
         raise ResourceError(what, where=str(folder), expected=expected, got=f"{free / GIB:.1f} GiB", remedy=remedy)
-    place = f"kept in a scratch file in {folder}, gone when the fit ends"
+    place = f"kept in files without names in {folder}, gone when the fit ends"
     log.info(f"views: {count}, {needed / GIB:.1f} GiB decoded: {place}")
     return folder
 
 
-@dataclass(frozen=True)
-class _Slot:
-    """Where a view lies: its first byte, its planes (name, type, shape) in order, the number of LiDAR pixels (None:
-    none)."""
-
-    head: ViewHead
-    begins: int
-    size: int
-    planes: tuple[tuple[str, np.dtype[Any], tuple[int, ...]], ...]
-    lidar: int | None
-
-
-class ViewFile(Sequence[StoredView]):
-    """Views in a scratch file: asking for one reads it. Filled once; then any thread may read."""
-
-    def __init__(self, folder: Path, count: int) -> None:
-        self._file = ScratchFile(folder)
-        self._slots: list[_Slot | None] = [None] * count
-
-    def put(self, index: int, stored: StoredView) -> None:
-        """Write a view to its place."""
-        planes = [(name, array) for name in _PLANES if (array := getattr(stored, name)) is not None]
-        parts: list[NDArray[Any]] = []
-        if stored.lidar is not None:
-            parts += [stored.lidar.depth_m.numpy(), stored.lidar.pixel.numpy().astype(np.int32)]
-        parts += [np.packbits(array) if array.dtype == bool else array for _, array in planes]
-        content = np.concatenate([np.ascontiguousarray(part).reshape(-1).view(np.uint8) for part in parts])
-        lidar = None if stored.lidar is None else len(stored.lidar.pixel)
-        forms = tuple((name, array.dtype, array.shape) for name, array in planes)
-        self._slots[index] = _Slot(stored.head, self._file.append(content), len(content), forms, lidar)
-
-    def _slot(self, index: int) -> _Slot:
-        found = self._slots[index]
-        if found is None:
-            raise IndexError(f"view {index} was never written")
-        return found
-
-    @property
-    def heads(self) -> Sequence[ViewHead]:
-        """All views without their pixels."""
-        return [self._slot(index).head for index in range(len(self))]
-
-    def __len__(self) -> int:
-        return len(self._slots)
-
-    @overload
-    def __getitem__(self, index: int) -> StoredView: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[StoredView]: ...
-    def __getitem__(self, index: int | slice) -> StoredView | Sequence[StoredView]:
-        if isinstance(index, slice):
-            raise TypeError("views in a file are read one at a time")
-        slot = self._slot(index)
-        content, at, lidar = self._file.read(slot.begins, slot.size), 0, None
-        if slot.lidar is not None:
-            ends = 4 * slot.lidar, 8 * slot.lidar
-            pixel = torch.from_numpy(content[ends[0] : ends[1]].view(np.int32).astype(np.int64))
-            at, lidar = ends[1], LidarPixels(pixel, torch.from_numpy(content[: ends[0]].view(np.float32)))
-        planes: dict[str, NDArray[Any]] = {}
-        for name, kind, shape in slot.planes:
-            pixels = math.prod(shape)
-            size = -(-pixels // 8) if kind.kind == "b" else pixels * kind.itemsize
-            part, at = content[at : at + size], at + size
-            planes[name] = (np.unpackbits(part, count=pixels) if kind.kind == "b" else part).view(kind).reshape(shape)
-        head = slot.head
-        return StoredView(head.name, head.view, head.kind, lidar=lidar, readout=head.readout, **planes)
-
-    def __iter__(self) -> Iterator[StoredView]:
-        for index in range(len(self)):
-            yield self[index]
-
-    def close(self) -> None:
-        """Give the space back; nothing can be read any more."""
-        self._file.close()
-
-
 def keep(loaded: LoadedViews, count: int, folder: Path | None) -> Sequence[StoredView]:
-    """The views in their places: in a scratch file in ``folder``, or in memory."""
+    """The views in their places: mapped from files in ``folder``, or in memory."""
     with contextlib.closing(loaded) as pairs:
-        if folder is None:
-            places = dict(pairs)
-            return tuple(places[index] for index in range(count))
-        filed = ViewFile(folder, count)
-        try:
-            for index, stored in pairs:
-                filed.put(index, stored)
-        except BaseException:
-            filed.close()
-            raise
-        return filed
+        places = dict(pairs if folder is None else _mapped(pairs, folder))
+    return tuple(places[index] for index in range(count))
 
 
-@contextlib.contextmanager
-def chosen_ahead(
-    views: ViewSet, choose: Callable[[int], tuple[StoredView, ...]], steps: range, device: torch.device = CPU
-) -> Iterator[Iterator[tuple[TrainView, ...]]]:
-    """The views that ``choose`` gives for each of these steps, as tensors on a device.
-
-    Where views lie in a file, threads read those of a few steps beforehand; they end with the block. What goes wrong in
-    a thread is raised at its step. Tensors are made by the caller's thread: in another one, every large allocation
-    costs its page faults anew.
-    """
-    ahead = computed_ahead(lambda turn: choose(steps[turn]), len(steps), AHEAD_THREADS) if views.filed else None
-    chosen = ahead or (choose(step) for step in steps)
-    with contextlib.closing(chosen):
-        yield (tuple(view.as_tensors(device) for view in found) for found in chosen)
+def _mapped(loaded: LoadedViews, folder: Path) -> Iterator[tuple[int, StoredView]]:
+    """The same views with all their numbers in files without names."""
+    left = np.zeros(0, np.uint8)
+    for index, stored in loaded:
+        own = {name: plane for name, plane in vars(stored).items() if isinstance(plane, np.ndarray)}
+        if stored.lidar is not None:
+            own |= {name: values.numpy() for name, values in vars(stored.lidar).items()}
+        room = {name: -(-plane.nbytes // 8) * 8 for name, plane in own.items()}
+        if sum(room.values()) > len(left):
+            left = np.asarray(mapped_array(folder, (max(FILE_BYTES, sum(room.values())),), np.uint8))
+        for name, plane in own.items():
+            place, left = left[: plane.nbytes], left[room[name] :]
+            place = place.view(plane.dtype).reshape(plane.shape)
+            place[...] = plane
+            own[name] = place
+        lidar = stored.lidar and LidarPixels(*(torch.from_numpy(own.pop(name)) for name in vars(stored.lidar)))
+        yield index, replace(stored, lidar=lidar, **own)
 
 
 # ---- halved --------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
@@ -35,36 +36,34 @@ from mudg.core.pictures import class_colors, depth_colors, gray, resize_area
 from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import visible_depth
 from mudg.labels import street_net
-from mudg.labels.by_geometry import label_by_geometry, label_by_network
+from mudg.labels.by_geometry import label_by_network
 from mudg.labels.depth_networks import align_to_lidar, enough_returns, kind_of, load_depth_network
 from mudg.labels.ground import driven_path
 from mudg.labels.inputs import DepthInput, DepthNetwork, LabelInput, Labeller, Labels
 from mudg.labels.segmenters import Segmenter
 from mudg.labels.settings import AnnotateConfig
-from mudg.networks.folders import CPU, Compute, find, title
+from mudg.networks.folders import find, title
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points, read_scene, spread
 from mudg.scene.write import SceneWriter
 
 # labellers ----------------------------------------------------------------------------------------
 #
-# geometry: rules on LiDAR, tracked boxes and colour (`by_geometry.py`), without parameters. embedded: classes from the
-# small shipped network, which reads image and `evidence.py` (`street_net.py`). network: classes from a segmentation
-# network in a folder (`segmenters.py`). Depth and dynamic objects are found in the same way for all three.
+# embedded: classes from the small shipped network, which reads image and `evidence.py` (`street_net.py`). network:
+# classes from a segmentation network in a folder (`segmenters.py`). Depth and dynamic objects are found in the same way
+# for both (`by_geometry.py`).
 
 
-def _network(weights: str, compute: Compute) -> Labeller:
-    segmenter = Segmenter.load(weights, compute)
+def _network(weights: str, device: torch.device) -> Labeller:
+    segmenter = Segmenter.load(weights, device)
     return lambda given: label_by_network(given, *segmenter.classes(given.rgb))
 
 
-LABELLERS: Mapping[str, Callable[[str, Compute], Labeller]] = {
-    "geometry": lambda *_: label_by_geometry,
+LABELLERS: Mapping[str, Callable[[str, torch.device], Labeller]] = {
     "embedded": street_net.StreetLabeller.load,
     "network": _network,
 }
-"""Name -> what makes a labeller of one image from a folder of weights and a place to compute (unused by those that hold
-no parameters).
+"""Name -> what makes a labeller of one image from a folder of weights and a place to compute.
 
 Raises: ResourceError: weights, or the packages that read them, are missing."""
 
@@ -75,21 +74,18 @@ Raises: ResourceError: weights, or the packages that read them, are missing."""
 # it is marked by a small file beside its labels, warned of, and counted in the notes.
 
 
-def place(config: AnnotateConfig) -> Compute:
+def place(config: AnnotateConfig) -> torch.device:
     """Where the networks of a configuration compute."""
-    device = choose_device(config.device, "networks of annotate", NETWORK_KINDS)
-    return Compute(str(device), config.precision == "bfloat16")
+    return choose_device(config.device, "networks of annotate", NETWORK_KINDS)
 
 
 def placed(config: AnnotateConfig) -> AnnotateConfig:
-    """The configuration with its device chosen; of one without networks, only if it names a device.
+    """The configuration with its device chosen.
 
     Raises:
         UsageError: not a device for networks. ResourceError: it is not on this machine.
     """
-    if config.device == "auto" and config.labeller == "geometry" and not config.depth_network:
-        return replace(config, device="cpu")
-    return replace(config, device=place(config).device)
+    return replace(config, device=str(place(config)))
 
 
 def folders(config: AnnotateConfig) -> dict[str, Path]:
@@ -420,7 +416,7 @@ def _usual_processes(config: AnnotateConfig) -> int:
     """One per core; fewer where networks share a device: one with a pretrained network, which fills it, and a few with
     the shipped one, whose evidence is gathered on the CPU meanwhile."""
     cores = native.default_threads()
-    if config.device == "cpu" or (config.labeller == "geometry" and not config.depth_network):
+    if config.device == "cpu":
         return cores
     return 1 if config.labeller == "network" or config.depth_network else min(cores, _SHARING)
 
@@ -433,7 +429,7 @@ def label_into_staging(config: AnnotateConfig, scene: Scene, ids: Sequence[str],
     """Label these frames one after the other, write each to ``staging``, and name it when it is there."""
     if not ids:
         return
-    label = LABELLERS[config.labeller](config.weights, place(config) if config.labeller != "geometry" else CPU)
+    label = LABELLERS[config.labeller](config.weights, place(config))
     folder = config.depth_network
     network = load_depth_network(folder, place(config), config.depth_steps) if folder else None
     returns = NearbyReturns(scene, config.sweeps)

@@ -32,7 +32,7 @@ from mudg.core.pictures import resize_bicubic
 from mudg.labels.depthlab import DepthLab
 from mudg.labels.inputs import DepthInput, DepthNetwork, Prediction
 from mudg.networks import folders
-from mudg.networks.folders import CPU, Compute
+from mudg.networks.folders import CPU
 
 CUE_PX: Final = 256
 """Longest side of the small depth map that PromptDepthAnything is given (its training had 256x192)."""
@@ -86,18 +86,18 @@ class TransformersDepth:
     """A depth network of transformers, ready for use; ``with_lidar``: it reads a small depth map beside the image."""
 
     def __init__(
-        self, network: Any, preparation: Preparation, space: Space, *, with_lidar: bool, compute: Compute = CPU
+        self, network: Any, preparation: Preparation, space: Space, *, with_lidar: bool, device: torch.device = CPU
     ) -> None:
         self._network, self._preparation, self._space = network, preparation, space
-        self._with_lidar, self._compute = with_lidar, compute
+        self._with_lidar, self._device = with_lidar, device
 
     def __call__(self, inputs: DepthInput) -> Prediction:
         """Depth of one image at the image's size."""
         tensors = {"pixel_values": self._preparation.pixels(inputs.rgb)}
         if self._with_lidar:
             tensors["prompt_depth"] = lidar_cue(inputs)
-        with torch.inference_mode(), self._compute.autocast():
-            output = self._network(**{name: value.to(self._compute.device) for name, value in tensors.items()})
+        with torch.inference_mode():
+            output = self._network(**{name: value.to(self._device) for name, value in tensors.items()})
         return Prediction.resized(output.predicted_depth.float()[:, None], inputs, self._space)
 
 
@@ -126,18 +126,18 @@ def lidar_cue(inputs: DepthInput, longest_px: int = CUE_PX) -> Tensor:
     return small
 
 
-def _load_transformers(folder: Path, compute: Compute, *, with_lidar: bool) -> TransformersDepth:
+def _load_transformers(folder: Path, device: torch.device, *, with_lidar: bool) -> TransformersDepth:
     class_name = "PromptDepthAnythingForDepthEstimation" if with_lidar else "DepthAnythingForDepthEstimation"
     network_class = folders.member(folders.package("transformers"), class_name)
-    network: Any = folders.load_network(network_class, folder, compute)
+    network: Any = folders.load_network(network_class, folder, device)
     preparation = Preparation.read(folder, 756 if with_lidar else 518, int(network.config.patch_size))
     space: Space = "depth" if with_lidar or network.config.depth_estimation_type == "metric" else "disparity"
-    return TransformersDepth(network, preparation, space, with_lidar=with_lidar, compute=compute)
+    return TransformersDepth(network, preparation, space, with_lidar=with_lidar, device=device)
 
 
 # --- folders --------------------------------------------------------------------------------------
 
-KINDS: Final[Mapping[str, Callable[[Path, Compute, int], DepthNetwork]]] = {
+KINDS: Final[Mapping[str, Callable[[Path, torch.device, int], DepthNetwork]]] = {
     "prompt_depth_anything": lambda folder, place, _: _load_transformers(folder, place, with_lidar=True),
     "depth_anything": lambda folder, place, _: _load_transformers(folder, place, with_lidar=False),
     "depthlab": DepthLab.load,
@@ -166,15 +166,15 @@ def kind_of(folder: str | Path) -> str:
     raise ResourceError("the depth network's weights are missing", where=where, expected=expected, remedy=remedy)
 
 
-def load_depth_network(folder: str | Path, compute: Compute = CPU, steps: int = 0) -> DepthNetwork:
+def load_depth_network(folder: str | Path, device: torch.device = CPU, steps: int = 0) -> DepthNetwork:
     """A depth network of the table, read from its folder, or from the Hugging Face cache by its name
     (``folders.find``); ``steps``: of denoising, 0 = as the folder says.
 
     Raises:
-        ResourceError: folder, package or device is missing. InputError: another kind of network, or not all of it.
+        ResourceError: folder or package is missing. InputError: another kind of network, or not all of it.
     """
     path = folders.find(folder)
-    return KINDS[kind_of(path)](path, compute, steps)
+    return KINDS[kind_of(path)](path, device, steps)
 
 
 # --- alignment to LiDAR, for every network --------------------------------------------------------

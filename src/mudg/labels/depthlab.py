@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -40,7 +40,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.core.pictures import resize_bicubic
 from mudg.labels.inputs import DepthInput, Prediction
 from mudg.networks import clip, folders
-from mudg.networks.folders import CPU, Compute
+from mudg.networks.folders import CPU
 
 KIND: Final = "depthlab"
 SCHEMA: Final = 1
@@ -92,10 +92,8 @@ def part_configs(
     """
     plain = {name: value for name, value in unet.items() if not name.startswith("_")}
     encoder = {name: vision[name] for name in _VISION if name in vision}
-    try:
+    with records.understood("the networks of DepthLab", "DepthLab"):
         latent, width, embedding = vae["latent_channels"], plain["cross_attention_dim"], encoder["projection_dim"]
-    except KeyError as error:
-        raise InputError("a network's description lacks a number", where="DepthLab", expected=str(error)) from error
     if abs(float(vae.get("scaling_factor", LATENT_SCALE)) - LATENT_SCALE) > 1e-9:
         what = "the autoencoder scales its latents otherwise than DepthLab does"
         raise InputError(what, where="vae: scaling_factor", expected=str(LATENT_SCALE), got=str(vae["scaling_factor"]))
@@ -128,14 +126,9 @@ def blank_parts(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, nn.Module
         "image_encoder": lambda config: encoder(vision(**config)),
     }
     made: dict[str, nn.Module] = {}
-    name = ""
-    try:
-        with torch.device("meta"):
-            for name, make in makers.items():
-                made[name] = make(dict(configs[name]))
-    except (ValueError, TypeError, KeyError, AttributeError, RuntimeError, NotImplementedError) as error:
-        got = str(error)[:300]
-        raise InputError("a network cannot be made as it is described", where=f"DepthLab: {name}", got=got) from error
+    for name, make in makers.items():
+        with records.understood("the description of a network", f"DepthLab: {name}"), torch.device("meta"):
+            made[name] = make(dict(configs[name]))
     reference: Any = made["reference_unet"]
     reference.conv_norm_out, reference.conv_out = None, nn.Identity()
     return made
@@ -153,23 +146,19 @@ class DepthLabParts:
     scheduler: Any
 
 
-def read_parts(folder: Path, described: Mapping[str, Any], compute: Compute = CPU) -> DepthLabParts:
+def read_parts(folder: Path, described: Mapping[str, Any], device: torch.device = CPU) -> DepthLabParts:
     """The networks of a converted folder in float32 on their device, every file checked against its sha256.
 
     Raises:
         InputError: the description is not whole, or tensors do not fit it. IntegrityError: a file is missing or
             altered.
-        ResourceError: a package or the device is missing.
+        ResourceError: a package is missing.
     """
-    device, where = compute.ready(), folder / DESCRIPTION
-    try:
+    where = folder / DESCRIPTION
+    with records.understood("a DepthLab model", str(where)):
         configs = {name: dict(described["parts"][name]["config"]) for name in PARTS}
         files = {name: {str(f): str(d) for f, d in described["parts"][name]["files"].items()} for name in PARTS}
         schedule = dict(described["scheduler"])
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        what, got = "the description of a DepthLab model is not whole", repr(error)[:200]
-        raise InputError(what, where=str(where), got=got, remedy="convert the published files again") from error
-    with records.understood("a DepthLab model", str(where)):
         made = blank_parts(configs)
     for name, network in made.items():
         state = checkpoint.read_shards(folder / name, files[name], remedy="convert the published files again")
@@ -291,7 +280,8 @@ def prepare(inputs: DepthInput, sampling: DepthLabSampling, cell: int, crop_px: 
     Raises:
         InputError: no depth is known.
     """
-    size = working_size(inputs.rgb, sampling.processing_px)
+    height, width = inputs.rgb.shape[:2]
+    size = tuple(max(1, side * sampling.processing_px // max(height, width)) for side in (height, width))
     depth = known_depth(np.where(inputs.sky, np.float32(np.nan), inputs.measured), size)
     known = np.isfinite(depth)
     if not known.any():
@@ -308,12 +298,6 @@ def prepare(inputs: DepthInput, sampling: DepthLabSampling, cell: int, crop_px: 
     image = padded(scaled.transpose(2, 0, 1)) / 127.5 - 1
     nearest, linear = padded(values[tuple(index)][None]), padded(linear_fill(values)[None])
     return Prepared(image, clip_crop(inputs.rgb, crop_px), nearest, linear, padded(~known[None]), size, low, high)
-
-
-def working_size(rgb: NDArray[np.uint8], longest_px: int) -> tuple[int, int]:
-    """Height and width of an image u8[H, W, 3] whose longest side gets ``longest_px`` pixels."""
-    height, width = rgb.shape[:2]
-    return max(1, height * longest_px // max(height, width)), max(1, width * longest_px // max(height, width))
 
 
 def known_depth(measured: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
@@ -356,24 +340,24 @@ class DepthLab:
     """A DepthLab model ready for use; ``load`` makes one from a converted folder."""
 
     def __init__(
-        self, parts: DepthLabParts, sampling: DepthLabSampling = PUBLISHED_SAMPLING, compute: Compute = CPU
+        self, parts: DepthLabParts, sampling: DepthLabSampling = PUBLISHED_SAMPLING, device: torch.device = CPU
     ) -> None:
         """Raises: UsageError: more steps than the noise schedule has."""
         most = int(parts.scheduler.config.num_train_timesteps)
         if sampling.steps > most:
             where, got = "--depth-steps", str(sampling.steps)
             raise UsageError("too many denoising steps", where=where, expected=f"<= {most}", got=got)
-        self._parts, self._sampling, self._compute = parts, sampling, compute
+        self._parts, self._sampling, self._device = parts, sampling, device
         self._cell = 2 ** (len(parts.vae.config.block_out_channels) - 1)
         share_features(parts.reference_unet, parts.denoising_unet)
 
     @classmethod
-    def load(cls, folder: str | Path, compute: Compute = CPU, steps: int = 0) -> DepthLab:
+    def load(cls, folder: str | Path, device: torch.device = CPU, steps: int = 0) -> DepthLab:
         """Read a folder that ``mudg convert`` wrote; ``steps`` of denoising, 0 = as the folder says.
 
         Raises:
             InputError: not such a folder, or not of this version. IntegrityError: a file is missing or altered.
-            ResourceError: a package or the device is missing. UsageError: too few steps.
+            ResourceError: a package is missing. UsageError: too few steps.
         """
         file = Path(folder) / DESCRIPTION
         described = folders.read_settings(file)
@@ -383,7 +367,7 @@ class DepthLab:
             raise InputError(what, where=str(file), expected=f"kind {KIND}, schema {SCHEMA}", got=got, remedy=remedy)
         sampling = records.parse_dataclass(DepthLabSampling, described.get("sampling"), f"{file}: sampling")
         sampling = dataclasses.replace(sampling, steps=steps or sampling.steps)
-        return cls(read_parts(Path(folder), described, compute), sampling, compute)
+        return cls(read_parts(Path(folder), described, device), sampling, device)
 
     def __call__(self, inputs: DepthInput) -> Prediction:
         """Depth of one image at the image's size, near metres: it is to be aligned.
@@ -399,49 +383,44 @@ class DepthLab:
 
     def predict(self, prepared: Prepared, noise: Tensor) -> Tensor:
         """Depth f32[1, 1, h, w], 0..1 between least and greatest known (others go beyond), from noise [1, C, H, W]."""
-        parts, sampling, device = self._parts, self._sampling, self._compute.device
+        parts, sampling, device = self._parts, self._sampling, self._device
         noise = noise.to(device)
         with torch.inference_mode():
             planes = (prepared.nearest, prepared.linear, 2 * prepared.missing - 1, prepared.image)
             depth, known, mask, image = map(self._encoded, planes)
             # one pixel of every cell decides, as published
             missing = functional.interpolate(prepared.missing, size=noise.shape[2:], mode="nearest").to(device)
-            with self._compute.autocast():
-                embedding = parts.mapping_layer(parts.image_encoder(prepared.crop.to(device)).image_embeds[:, None])
-                parts.reference_unet(image, torch.zeros((), dtype=torch.int64), encoder_hidden_states=embedding)
+            embedding = parts.mapping_layer(parts.image_encoder(prepared.crop.to(device)).image_embeds[:, None])
+            parts.reference_unet(image, torch.zeros((), dtype=torch.int64), encoder_hidden_states=embedding)
             parts.scheduler.set_timesteps(sampling.steps)
             times = parts.scheduler.timesteps[sampling.steps - int(sampling.steps * sampling.strength) :]
             latent = parts.scheduler.add_noise(depth, noise, times[:1]) if sampling.strength < 1 else noise
             for i, t in enumerate(times):
-                with self._compute.autocast():
-                    seen = torch.cat([latent, mask, known], 1)
-                    output = parts.denoising_unet(seen, t, encoder_hidden_states=embedding, return_dict=False)[0]
-                latent = parts.scheduler.step(output.float(), t, latent).prev_sample
+                seen = torch.cat([latent, mask, known], 1)
+                output = parts.denoising_unet(seen, t, encoder_hidden_states=embedding, return_dict=False)[0]
+                latent = parts.scheduler.step(output, t, latent).prev_sample
                 if i + 1 < len(times):
                     as_known = parts.scheduler.add_noise(depth, noise, times[i + 1 : i + 2])
                     latent = missing * latent + (1 - missing) * as_known
-            with self._compute.autocast():
-                decoded = parts.vae.decode(latent / LATENT_SCALE, return_dict=False)[0]
-        found = decoded.float().mean(1, keepdim=True)[..., : prepared.size[0], : prepared.size[1]]
+            decoded = parts.vae.decode(latent / LATENT_SCALE, return_dict=False)[0]
+        found = decoded.mean(1, keepdim=True)[..., : prepared.size[0], : prepared.size[1]]
         return (found / sampling.normalize_scale + 1) / 2
 
     def _encoded(self, plane: Tensor) -> Tensor:
         """Latent f32 of an image [1, 3, H, W], or of one channel thrice."""
-        with self._compute.autocast():
-            latent = self._parts.vae.encode(plane.expand(-1, 3, -1, -1).to(self._compute.device)).latent_dist.mode()
-        return latent.float() * LATENT_SCALE
+        return self._parts.vae.encode(plane.expand(-1, 3, -1, -1).to(self._device)).latent_dist.mode() * LATENT_SCALE
 
 
 # conversion ---------------------------------------------------------------------------------------
 #
 #     FOLDER/
-#       DepthLab/                denoising_unet.pth, reference_unet.pth, mapping_layer.pth
-#       marigold-depth-v1-0/     model_index.json, scheduler, vae, and of unet the description alone
-#       CLIP-ViT-H-14-.../       config.json, and model.safetensors or pytorch_model.bin
+#       DepthLab/                             denoising_unet.pth, reference_unet.pth, mapping_layer.pth
+#       marigold-depth-v1-0/                  model_index.json, scheduler, vae, and of unet the description alone
+#       CLIP-ViT-H-14-laion2B-s32B-b79K/      config.json, and model.safetensors or pytorch_model.bin
 #
-# The three are recognised by what lies in them, not by their names. Tensors are compared with the networks that the
-# descriptions stand for, by name and shape, all of them before the first is written. The published code takes what the
-# pickle of the denoising U-Net or of the linear layer lacks from Marigold or leaves it random; here that is an error.
+# Tensors are compared with the networks that the descriptions stand for, by name and shape, all of them before the
+# first is written. The published code takes what the pickle of the denoising U-Net or of the linear layer lacks from
+# Marigold or leaves it random; here that is an error.
 
 PICKLES = {part: f"{part}.pth" for part in (*UNETS, "mapping_layer")}
 """Part -> the published file that holds it."""
@@ -449,114 +428,76 @@ LICENCE = (
     "Weights keep the terms of those who published them: DepthLab, Marigold (made from Stable Diffusion) and the CLIP"
     " image encoder. Read the pages they came from before any use."
 )
-_ENCODER_FILES = ("model.safetensors", "pytorch_model.bin")
-_ENCODER = ("vision_model.", "visual_projection.")
+_BASE, _ENCODER = "marigold-depth-v1-0", "CLIP-ViT-H-14-laion2B-s32B-b79K"
+_ENCODER_PARTS = ("vision_model.", "visual_projection.")
 _PLACES = "vision_model.embeddings.position_ids"
 """A table 0, 1, 2, ... that older files of CLIP hold."""
 _MAPPING = "mapping_layer."
 
 
-@dataclass(frozen=True, slots=True)
-class Sources:
-    """The folders that a DepthLab model is made of: the three pickles, Marigold, the image encoder."""
-
-    pickles: Path
-    base: Path
-    encoder: Path
-
-    def files(self) -> list[Path]:
-        """The weight files that are read."""
-        autoencoder = sorted((self.base / "vae").glob("*.safetensors"))
-        return [*(self.pickles / name for name in PICKLES.values()), *autoencoder, self.encoder_file()]
-
-    def encoder_file(self) -> Path:
-        """The image encoder's weight file; InputError if there is none."""
-        for name in _ENCODER_FILES:
-            if (self.encoder / name).is_file():
-                return self.encoder / name
-        where = str(self.encoder)
-        raise InputError("the image encoder has no weight file", where=where, expected=" or ".join(_ENCODER_FILES))
-
-
-def find(folder: Path) -> Sources:
-    """What is needed, in a folder or directly below it.
+def weight_files(folder: Path) -> dict[str, Path]:
+    """Part -> the published file, or folder, that holds its weights.
 
     Raises:
-        InputError: something is missing, or there twice.
+        InputError: something is missing.
     """
-    places = [folder, *sorted(place for place in folder.iterdir() if place.is_dir())]
-    published = [place for place in places if any((place / name).is_file() for name in PICKLES.values())]
-    pickles = _only(folder, published, f"the published files {', '.join(PICKLES.values())}")
-    for name in PICKLES.values():
-        if not (pickles / name).is_file():
-            raise InputError("a published file is missing", where=str(pickles), expected=name)
-    kinds = {place: _json_value(place / "model_index.json", "_class_name") for place in places}
-    marigolds = [place for place, kind in kinds.items() if kind in ("MarigoldPipeline", "MarigoldDepthPipeline")]
-    base = _only(folder, marigolds, "marigold-depth-v1-0, a folder of diffusers")
-    kinds = {place: _json_value(place / "config.json", "model_type") for place in places}
-    clips = [place for place, kind in kinds.items() if kind in ("clip", "clip_vision_model")]
-    encoder = _only(folder, clips, "CLIP-ViT-H-14-laion2B-s32B-b79K, a folder of transformers")
-    return Sources(pickles, base, encoder)
+    files = {part: folder / "DepthLab" / name for part, name in PICKLES.items()}
+    files["vae"] = folder / _BASE / "vae"
+    encoder = [folder / _ENCODER / name for name in ("model.safetensors", "pytorch_model.bin")]
+    files["image_encoder"] = next((file for file in encoder if file.is_file()), encoder[0])
+    needed = (*files.values(), folder / _BASE / "unet" / "config.json", folder / _ENCODER / "config.json")
+    missing = [file.relative_to(folder).as_posix() for file in needed if not file.exists()]
+    if missing:
+        remedy = "put the three folders into one under their own names, as DepthLab's page says, and give that folder"
+        raise InputError("a part of DepthLab is missing", where=str(folder), got=", ".join(missing), remedy=remedy)
+    return files
 
 
-def _only(folder: Path, found: list[Path], what_it_holds: str) -> Path:
-    if len(found) != 1:
-        what = "a part of DepthLab is missing" if not found else "a part of DepthLab was found more than once"
-        expected, got = f"one folder with {what_it_holds}", ", ".join(place.name for place in found) or "none"
-        remedy = "put the three folders into one, as DepthLab's page says, and give that folder"
-        raise InputError(what, where=str(folder), expected=expected, got=got, remedy=remedy)
-    return found[0]
+def source_files(folder: Path) -> list[Path]:
+    """The weight files that are read. InputError: something is missing."""
+    sources = weight_files(folder).values()
+    return [file for one in sources for file in (sorted(one.glob("*.safetensors")) if one.is_dir() else [one])]
 
 
-def _json_value(file: Path, key: str) -> object:
-    return folders.read_settings(file).get(key) if file.is_file() else None
-
-
-def described(sources: Sources) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
+def described(folder: Path) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
     """Configuration of every part, and the noise schedule.
 
     Raises:
         InputError: a description is missing or is of another kind.
     """
-    unet, vae = (folders.read_settings(sources.base / name / "config.json") for name in ("unet", "vae"))
-    clip = folders.read_settings(sources.encoder / "config.json")
-    vision = clip
-    if clip.get("model_type") == "clip":
-        vision = {**(clip.get("vision_config") or {})}
-        if "projection_dim" in clip:  # the whole model's number counts: old descriptions repeat a default inside
-            vision["projection_dim"] = clip["projection_dim"]
-    transformers = folders.package("transformers")
-    try:
-        vision_config = folders.member(transformers, "CLIPVisionConfig").from_dict(vision).to_dict()
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        where = str(sources.encoder / "config.json")
-        raise InputError("the image encoder has no description", where=where, got=str(error)[:300]) from error
-    file = sources.base / "scheduler" / "scheduler_config.json"
+    unet, vae = (folders.read_settings(folder / _BASE / name / "config.json") for name in ("unet", "vae"))
+    told = folders.read_settings(folder / _ENCODER / "config.json")
+    vision = told
+    if told.get("model_type") == "clip":
+        vision = {**(told.get("vision_config") or {})}
+        if "projection_dim" in told:  # the whole model's number counts: old descriptions repeat a default inside
+            vision["projection_dim"] = told["projection_dim"]
+    vision_class = folders.member(folders.package("transformers"), "CLIPVisionConfig")
+    with records.understood("the description of an image encoder", str(folder / _ENCODER / "config.json")):
+        vision = vision_class.from_dict(vision).to_dict()
+    file = folder / _BASE / "scheduler" / "scheduler_config.json"
     schedule = folders.read_settings(file)
     ddim_scheduler(schedule, str(file))
     if schedule.get("rescale_betas_zero_snr"):
         what = "this is the noise schedule of a later Marigold"
-        expected, remedy = "that of marigold-depth-v1-0, which DepthLab was made from", "take marigold-depth-v1-0"
+        expected, remedy = f"that of {_BASE}, which DepthLab was made from", f"take {_BASE}"
         raise InputError(what, where=str(file), got="rescale_betas_zero_snr: true", expected=expected, remedy=remedy)
-    return part_configs(unet, vae, vision_config), schedule
+    return part_configs(unet, vae, vision), schedule
 
 
-def read(sources: Sources, configs: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Tensor]]:
+def read(folder: Path, configs: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Tensor]]:
     """The tensors of every part, checked.
 
     Raises:
         InputError: a file cannot be read, or does not hold what its network needs.
     """
-    found = {part: weights.read_checkpoint(sources.pickles / PICKLES[part]) for part in UNETS}
-    mapping = weights.read_checkpoint(sources.pickles / PICKLES["mapping_layer"])
-    found["mapping_layer"] = {name.removeprefix(_MAPPING): value for name, value in mapping.items()}
+    files = weight_files(folder)
+    found = {part: dict(weights.read_checkpoint(file)) for part, file in files.items() if part != "vae"}
+    found["mapping_layer"] = {name.removeprefix(_MAPPING): value for name, value in found["mapping_layer"].items()}
+    encoder = found["image_encoder"]
+    found["image_encoder"] = {n: x for n, x in encoder.items() if n.startswith(_ENCODER_PARTS) and n != _PLACES}
     autoencoder = folders.member(folders.package("diffusers"), "AutoencoderKL")
-    found["vae"] = dict(folders.load_network(autoencoder, sources.base, subfolder="vae").state_dict())
-    encoder = weights.read_checkpoint(sources.encoder_file())
-    known = [name for name in encoder if name.startswith(_ENCODER) and name != _PLACES]
-    found["image_encoder"] = {name: encoder[name] for name in known}
-    files = {part: sources.pickles / name for part, name in PICKLES.items()}
-    files |= {"vae": sources.base / "vae", "image_encoder": sources.encoder_file()}
+    found["vae"] = dict(folders.load_network(autoencoder, folder / _BASE, subfolder="vae").state_dict())
     for part, network in blank_parts(configs).items():
         weights.match_exactly(found[part], weights.shapes_of(network), str(files[part]), f"DepthLab's {part}")
         weights.refuse_bad_values(found[part], str(files[part]))
@@ -573,29 +514,24 @@ def convert_folder(folder: Path, to: Path, dtype: torch.dtype | None, shard_byte
     Raises:
         InputError: something is missing or is not DepthLab. ResourceError: a package is missing, or the disk is full.
     """
-    sources = find(folder)
-    configs, schedule = described(sources)
-    found = read(sources, configs)
-    facts = {"sources": [_facts_of(path, folder) for path in sources.files()], "licence": LICENCE}
+    files = source_files(folder)
+    configs, schedule = described(folder)
+    found = read(folder, configs)
+    sources = [
+        {"file": f.relative_to(folder).as_posix(), "bytes": f.stat().st_size, "sha256": store.sha256_file(f)}
+        for f in files
+    ]
+    rows = "".join(f"| {source['file']} | {source['bytes']} | {source['sha256']} |\n" for source in sources)
+    card = (
+        "# DepthLab: depth inpainting, for `mudg annotate --depth-network`\n\n"
+        f"Converted from:\n\n| file | bytes | SHA-256 |\n|---|---|---|\n{rows}\n## Licence\n\n{LICENCE}\n"
+    )
     with store.atomic_directory(to) as partial:
         parts: dict[str, Any] = {part: {"config": configs[part]} for part in PARTS}
         for part, described_part in parts.items():
             described_part["files"] = checkpoint.write_shards(partial / part, found[part], shard_bytes, dtype)
-        store.write_text(partial / "MODEL_CARD.md", _card(facts))
+        store.write_text(partial / "MODEL_CARD.md", card)
         description = {"schema": SCHEMA, "kind": KIND, "parts": parts, "scheduler": schedule}
-        description |= {"sampling": asdict(PUBLISHED_SAMPLING), "facts": facts}
+        description |= {"sampling": asdict(PUBLISHED_SAMPLING), "facts": {"sources": sources, "licence": LICENCE}}
         store.write_json(partial / DESCRIPTION, description)
         store.sync_tree(partial)
-
-
-def _facts_of(file: Path, folder: Path) -> dict[str, Any]:
-    name, size = file.relative_to(folder).as_posix(), file.stat().st_size
-    return {"file": name, "bytes": size, "sha256": store.sha256_file(file)}
-
-
-def _card(facts: Mapping[str, Any]) -> str:
-    rows = "".join(f"| {source['file']} | {source['bytes']} | {source['sha256']} |\n" for source in facts["sources"])
-    return (
-        "# DepthLab: depth inpainting, for `mudg annotate --depth-network`\n\n"
-        f"Converted from:\n\n| file | bytes | SHA-256 |\n|---|---|---|\n{rows}\n## Licence\n\n{facts['licence']}\n"
-    )

@@ -20,7 +20,7 @@ from torch.nn import functional
 from mudg.base.errors import InputError, ResourceError
 from mudg.base.palette import CLASSES, UNLABELLED
 from mudg.networks import folders
-from mudg.networks.folders import CPU, Compute
+from mudg.networks.folders import CPU
 
 TILE_PX: Final = 1024
 OVERLAP: Final = 0.25
@@ -59,28 +59,28 @@ class Segmenter:
         train_ids: NDArray[np.intp],
         mean: Sequence[float],
         deviation: Sequence[float],
-        compute: Compute = CPU,
+        device: torch.device = CPU,
     ) -> None:
         """``train_ids`` [C]: our class of each of the network's, UNLABELLED = none; mean and deviation of colours in
         0..1."""
         self._network, self._becomes, self._train_ids = network, KINDS[kind][1], train_ids
         self._mean = torch.tensor(mean, dtype=torch.float32)[:, None, None]
         self._deviation = torch.tensor(deviation, dtype=torch.float32)[:, None, None]
-        self._compute = compute
+        self._device = device
 
     @classmethod
-    def load(cls, folder: str | Path, compute: Compute = CPU) -> Segmenter:
+    def load(cls, folder: str | Path, device: torch.device = CPU) -> Segmenter:
         """Read a network from a local folder, or from the Hugging Face cache by its name (``folders.find``).
 
         Raises:
-            ResourceError: the folder, the device or the transformers package is missing. InputError: another kind of
+            ResourceError: the folder or the transformers package is missing. InputError: another kind of
             network, one that lacks weights, or none of its class names is one of ours.
         """
         path = folders.find(folder)
         if not folder or not (path / "config.json").is_file():
             expected = "a folder with config.json and model.safetensors"
             given = "give the folder of a segmentation network with Cityscapes classes as --weights"
-            remedy = f"{given}, or its name in the Hugging Face cache, or use --labeller geometry"
+            remedy = f"{given}, or its name in the Hugging Face cache, or use --labeller embedded"
             what, where = "the labeller's weights are missing", str(folder) or "weights"
             raise ResourceError(what, where=where, expected=expected, remedy=remedy)
         settings = folders.read_settings(path / "config.json")
@@ -92,9 +92,9 @@ class Segmenter:
         prepared = path / "preprocessor_config.json"
         colors = folders.read_settings(prepared) if prepared.is_file() else {}
         network_class = folders.member(folders.package("transformers"), KINDS[kind][0])
-        network = folders.load_network(network_class, path, compute)
+        network = folders.load_network(network_class, path, device)
         mean, deviation = colors.get("image_mean", folders.MEAN), colors.get("image_std", folders.DEVIATION)
-        return cls(network, kind, train_ids, mean, deviation, compute)
+        return cls(network, kind, train_ids, mean, deviation, device)
 
     def classes(self, rgb: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Train ids u8[H, W] and the probability of each f32[H, W] of an image u8[H, W, 3]."""
@@ -116,9 +116,8 @@ class Segmenter:
         for first in range(0, len(corners), BATCH):
             chosen = corners[first : first + BATCH]
             tiles = torch.stack([image[:, y : y + tile[0], x : x + tile[1]] for y, x in chosen])
-            with torch.inference_mode(), self._compute.autocast():
-                output = self._network(pixel_values=tiles.to(self._compute.device))
             with torch.inference_mode():
+                output = self._network(pixel_values=tiles.to(self._device))
                 found = self._becomes(output, tile).cpu()
             for (y, x), probabilities in zip(chosen, found, strict=True):
                 window = total[:, y : y + tile[0], x : x + tile[1]]

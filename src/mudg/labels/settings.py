@@ -13,9 +13,9 @@ class AnnotateConfig:
     """Add the labels that a scene lacks: dense depth, semantic classes, sky and masks of dynamic objects, each with a
     confidence."""
 
-    labeller: Literal["embedded", "geometry", "network"] = "embedded"
-    """Source of classes and sky. embedded: the small shipped network, from image, heights and boxes. geometry: rules on
-    heights and boxes, without a network. network: a segmentation network from `weights`."""
+    labeller: Literal["embedded", "network"] = "embedded"
+    """Source of classes and sky. embedded: the small shipped network, from image, heights and boxes. network: a
+    segmentation network from `weights`."""
     weights: str = ""
     """labeller network: folder of a SegFormer or Mask2Former with Cityscapes classes in the transformers format,
     or its name in the Hugging Face cache (owner/name or owner/name@revision). labeller embedded: folder of a network
@@ -29,9 +29,6 @@ class AnnotateConfig:
     """DepthLab: denoising steps (0 = as in the model folder)."""
     device: DeviceName = "auto"
     """Device of the networks of labeller and `depth_network`: auto (CUDA if there is one), cpu, cuda, cuda:N, mps."""
-    precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Number format of these networks. auto is float32; bfloat16 is faster on some devices and rounds depth to 0.4
-    percent."""
     sweeps: int = setting(default=6, ge=1, le=100)
     """Number of sweeps per LiDAR, nearest in time, whose points are merged for dense depth."""
     dynamic: bool = True

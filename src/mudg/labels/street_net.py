@@ -29,7 +29,7 @@ from mudg.core.pictures import resize_area
 from mudg.labels.by_geometry import GRASS, GROUND_M, find_sky, greenness_of, label_by_network
 from mudg.labels.evidence import BOX_GROUPS, GROUP_OF, PLANE_COUNT, Evidence, encode, gather
 from mudg.labels.inputs import GAP_DEG, TRAIN_ID_OF, LabelInput, Labels
-from mudg.networks.folders import CPU, Compute
+from mudg.networks.folders import CPU
 
 # street net ---------------------------------------------------------------------------------------
 #
@@ -199,14 +199,14 @@ and dark treetops resemble what the network takes for sky."""
 class StreetLabeller:
     """A network ready for labelling; called with a ``LabelInput`` it returns ``Labels``."""
 
-    def __init__(self, net: StreetNet, compute: Compute = CPU) -> None:
-        """``compute``: where the network computes; evidence is gathered on the processor."""
-        self._net, self._compute = net.to(compute.ready()), compute
+    def __init__(self, net: StreetNet, device: torch.device = CPU) -> None:
+        """``device``: where the network computes; evidence is gathered on the processor."""
+        self._net = net.to(device)
 
     @classmethod
-    def load(cls, folder: Path | str = "", compute: Compute = CPU) -> StreetLabeller:
+    def load(cls, folder: Path | str = "", device: torch.device = CPU) -> StreetLabeller:
         """From a folder, or, without one, from the package; errors as in ``street_net.load``."""
-        return cls(load(folder or EMBEDDED), compute)
+        return cls(load(folder or EMBEDDED), device)
 
     def __call__(self, inputs: LabelInput) -> Labels:
         return label_by_network(inputs, *self.classes(inputs))
@@ -215,8 +215,7 @@ class StreetLabeller:
         """Train ids u8[H, W] and the probability of each f32[H, W]."""
         small = reduced(inputs, self._net.config.focal_px)
         evidence = gather(small)
-        with self._compute.autocast():
-            found = self._net.probabilities(small.rgb, encode(evidence))
+        found = self._net.probabilities(small.rgb, encode(evidence))
         found = settled(found, evidence, any(track.label in TRAIN_ID_OF for track in inputs.tracks))
         return at_size(settled_by_color(found, small.rgb, evidence), inputs.rgb.shape[0], inputs.rgb.shape[1])
 

@@ -16,12 +16,8 @@ The bank is differentiable, deterministic, and costs about as much as SSIM.
 
 from __future__ import annotations
 
-import itertools
-import math
 import threading
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from typing import Any, Final, Literal, NamedTuple
 
 import torch
@@ -29,8 +25,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from mudg.base.errors import InputError, UsageError
-from mudg.core.losses import distance_places, lpips_distance, unit_features
+from mudg.base.errors import InputError
+from mudg.core.losses import lpips_distance, unit_features
 from mudg.core.metrics import Pair
 from mudg.core.native_ops import box_mean
 from mudg.networks.codec import PatchCodec
@@ -119,18 +115,10 @@ class CodecFeatures(nn.Module):
     """
 
     SIZES: Final = 3
-    STEP: Final = 8
-    """Rows of the image that become one row of the smallest features."""
 
     def __init__(self, codec: PatchCodec) -> None:
         super().__init__()
         self.codec = codec
-
-    @property
-    def reach_rows(self) -> int:
-        """Rows of the image above and below a row that its features depend on, rounded up to ``STEP``: one convolution
-        and two per block, at the smallest size."""
-        return self.STEP * (2 + 2 * len(self.codec.blocks))
 
     def forward(self, rgb: Tensor) -> list[Tensor]:
         """Features of one image; sides that are no multiple of 8 are padded by repeating their last pixels."""
@@ -151,11 +139,9 @@ class CodecFeatures(nn.Module):
 
 
 WHOLE_PIXELS: Final = 2_500_000
-"""Images of up to this many pixels (1920 x 1280 is just below) are compared in one piece."""
-BAND_PIXELS: Final = 300_000
-LARGEST_PIXELS: Final = 2_500_000
-"""Larger images are halved until they have no more, before they are compared in the features of the codec."""
-LpipsTrunk = Literal["alex", "vgg", "squeeze"]
+"""Larger images (1920 x 1280 is just below) are halved until they have no more, before they are compared in the
+features of the codec."""
+LpipsTrunk = Literal["alex", "vgg"]
 LpipsInput = Literal["correct", "unscaled"]
 
 
@@ -170,32 +156,8 @@ class _Layer(NamedTuple):
     padding: int = 1
 
 
-class _Fire(NamedTuple):
-    """SqueezeNet's block: place in the trunk, channels in, between, and out of each of its two branches."""
-
-    place: str
-    into: int
-    between: int
-    each: int
-
-    def layers(self) -> tuple[_Layer, _Layer, _Layer]:
-        """What squeezes, and both branches."""
-        return (
-            _Layer(f"{self.place}.squeeze", self.between, self.into, 1, 1, 0),
-            _Layer(f"{self.place}.expand1x1", self.each, self.between, 1, 1, 0),
-            _Layer(f"{self.place}.expand3x3", self.each, self.between),
-        )
-
-
-class _Maximum(NamedTuple):
-    """Maxima over squares at every second place; ``whole``: squares that reach over the edge count, too."""
-
-    size: int
-    whole: bool = False
-
-
-_Stage = tuple[_Layer | _Fire | _Maximum, ...]
-_POOL, _SQUEEZE_POOL = _Maximum(3), _Maximum(3, whole=True)
+_Stage = tuple[_Layer | int, ...]
+"""Convolutions; a number stands for maxima over squares of that side at every second place."""
 
 
 def _vgg(first: int, channels: tuple[int, ...]) -> tuple[_Layer, ...]:
@@ -207,26 +169,17 @@ def _vgg(first: int, channels: tuple[int, ...]) -> tuple[_Layer, ...]:
 TRUNKS: Final[dict[LpipsTrunk, tuple[_Stage, ...]]] = {
     "alex": (
         (_Layer("0", 64, 3, 11, 4, 2),),
-        (_POOL, _Layer("3", 192, 64, 5, 1, 2)),
-        (_POOL, _Layer("6", 384, 192)),
+        (3, _Layer("3", 192, 64, 5, 1, 2)),
+        (3, _Layer("6", 384, 192)),
         (_Layer("8", 256, 384),),
         (_Layer("10", 256, 256),),
     ),
     "vgg": (
         _vgg(0, (3, 64, 64)),
-        (_Maximum(2), *_vgg(5, (64, 128, 128))),
-        (_Maximum(2), *_vgg(10, (128, 256, 256, 256))),
-        (_Maximum(2), *_vgg(17, (256, 512, 512, 512))),
-        (_Maximum(2), *_vgg(24, (512, 512, 512, 512))),
-    ),
-    "squeeze": (
-        (_Layer("0", 64, 3, 3, 2, 0),),
-        (_SQUEEZE_POOL, _Fire("3", 64, 16, 64), _Fire("4", 128, 16, 64)),
-        (_SQUEEZE_POOL, _Fire("6", 128, 32, 128), _Fire("7", 256, 32, 128)),
-        (_SQUEEZE_POOL, _Fire("9", 256, 48, 192)),
-        (_Fire("10", 384, 48, 192),),
-        (_Fire("11", 384, 64, 256),),
-        (_Fire("12", 512, 64, 256),),
+        (2, *_vgg(5, (64, 128, 128))),
+        (2, *_vgg(10, (128, 256, 256, 256))),
+        (2, *_vgg(17, (256, 512, 512, 512))),
+        (2, *_vgg(24, (512, 512, 512, 512))),
     ),
 }
 """Stages of each network; features are read after each. Places are those of torchvision's networks."""
@@ -236,23 +189,13 @@ def lpips_shapes(trunk: LpipsTrunk) -> dict[str, tuple[int, ...]]:
     """Name -> shape of the tensors of a network of LPIPS, as the lpips package names them."""
     shapes: dict[str, tuple[int, ...]] = {}
     for number, stage in enumerate(TRUNKS[trunk]):
-        width = 0
-        for step in stage:
-            width = step.out if isinstance(step, _Layer) else 2 * step.each if isinstance(step, _Fire) else width
-        for layer in _layers(stage):
+        layers = [step for step in stage if isinstance(step, _Layer)]
+        for layer in layers:
             named = f"net.slice{number + 1}.{layer.place}"
             shapes[f"{named}.weight"] = (layer.out, layer.into, layer.size, layer.size)
             shapes[f"{named}.bias"] = (layer.out,)
-        shapes[f"lin{number}.model.1.weight"] = (1, width, 1, 1)
+        shapes[f"lin{number}.model.1.weight"] = (1, layers[-1].out, 1, 1)
     return shapes
-
-
-def _layers(stage: _Stage) -> Iterator[_Layer]:
-    for step in stage:
-        if isinstance(step, _Layer):
-            yield step
-        elif isinstance(step, _Fire):
-            yield from step.layers()
 
 
 class LpipsFeatures(nn.Module):
@@ -262,7 +205,7 @@ class LpipsFeatures(nn.Module):
         state: ``net.slice1.0.weight``, ..., ``lin0.model.1.weight``, ..., as the lpips package names them; other
             entries are left alone.
         where: file name for errors.
-        trunk: AlexNet, VGG-16 or SqueezeNet 1.1.
+        trunk: AlexNet or VGG-16.
         given: correct: colours are brought to [-1, 1] first. unscaled: they stay in [0, 1], as in much published code
             of Gaussian scenes.
 
@@ -302,66 +245,19 @@ class LpipsFeatures(nn.Module):
         features = []
         for number, stage in enumerate(TRUNKS[self.trunk]):
             for step in stage:
-                if isinstance(step, _Maximum):
-                    x = F.max_pool2d(x, step.size, 2, ceil_mode=step.whole)
-                elif isinstance(step, _Fire):
-                    squeeze, *branches = step.layers()
-                    x = self._convolved(number, squeeze, x)
-                    x = torch.cat([self._convolved(number, branch, x) for branch in branches], 1)
-                else:
-                    x = self._convolved(number, step, x)
+                if isinstance(step, int):
+                    x = F.max_pool2d(x, step, 2)
+                    continue
+                path = f"net/slice{number + 1}/{step.place}"
+                kernel, bias = self.get_buffer(f"{path}/weight"), self.get_buffer(f"{path}/bias")
+                x = F.relu(F.conv2d(x, kernel, bias, step.stride, step.padding))
             features.append(x[0])
         return features
 
-    def _convolved(self, stage: int, layer: _Layer, x: Tensor) -> Tensor:
-        path = f"net/slice{stage + 1}/{layer.place.replace('.', '/')}"
-        kernel, bias = self.get_buffer(f"{path}/weight"), self.get_buffer(f"{path}/bias")
-        return F.relu(F.conv2d(x, kernel, bias, layer.stride, layer.padding))
-
-
-@dataclass(frozen=True)
-class _Band:
-    """Rows of a large image whose features are made together.
-
-    Args:
-        begins, ends: rows that count. above, below: rows that are read besides, for features at the border to be as in
-            the whole.
-    """
-
-    begins: int
-    ends: int
-    above: int
-    below: int
-
-    def features(self, network: CodecFeatures, rgb: Tensor) -> list[Tensor]:
-        """The features of the rows that count, per stage ``[C, h, w]``."""
-        made = network(rgb[:, self.begins - self.above : self.ends + self.below])
-        rows = self.ends - self.begins + self.above + self.below
-        places = [_places(stage.shape[-2], rows, network.STEP) for stage in made]
-        counted = _padded(self.ends - self.begins, network.STEP)
-        return [f[:, self.above // p :][:, : counted // p] for f, p in zip(made, places, strict=True)]
-
-
-def _places(count: int, rows: int, step: int) -> int:
-    """Rows of the image, padded to a multiple of ``step``, that one row of features stands for."""
-    return _padded(rows, step) // count
-
-
-def _padded(rows: int, step: int) -> int:
-    return rows + -rows % step
-
-
-def _bands(height: int, width: int, network: CodecFeatures) -> list[_Band]:
-    """An image cut so that a band takes less than 1 GB at any width."""
-    step, reach = network.STEP, network.reach_rows
-    rows = max(step, BAND_PIXELS // width // step * step)
-    cuts = [*range(0, height, rows), height]
-    return [_Band(a, b, min(a, reach), min(height - b, reach)) for a, b in itertools.pairwise(cuts)]
-
 
 def reduced(image: Tensor) -> Tensor:
-    """A large image ``[C, H, W]`` brought to at most ``LARGEST_PIXELS`` by halving it, areas averaged."""
-    while image.shape[-2] * image.shape[-1] > LARGEST_PIXELS:
+    """A large image ``[C, H, W]`` brought to at most ``WHOLE_PIXELS`` by halving it, areas averaged."""
+    while image.shape[-2] * image.shape[-1] > WHOLE_PIXELS:
         image = F.avg_pool2d(image[None], 2, ceil_mode=True, count_include_pad=False)[0]
     return image
 
@@ -383,84 +279,17 @@ class PerceptualDistance:
 
     def __call__(self, pair: Pair) -> float | None:
         """The distance, or None where colour is missing."""
-        if pair.rgb is None or pair.truth_rgb is None:
+        truth, mask = pair.truth_rgb, pair.mask
+        if pair.rgb is None or truth is None:
             return None
-        if self.in_bands(pair):
-            return self.of_all([pair], 1)[0]
+        made, halves = pair.rgb, isinstance(self._features, CodecFeatures)
         with torch.no_grad():
-            if getattr(self._known, "image", None) is not pair.truth_rgb:
-                self._known.features = unit_features(self._features(pair.truth_rgb.to(self._device)))
-                self._known.image = pair.truth_rgb
-            made, mask = self._features(pair.rgb.to(self._device)), pair.mask
+            if getattr(self._known, "image", None) is not truth:
+                image = (reduced(truth) if halves else truth).to(self._device)
+                self._known.features = unit_features(self._features(image))
+                self._known.image = truth
+            if halves:
+                made, mask = reduced(made), None if mask is None else reduced(mask.float())
+            found = self._features(made.to(self._device))
             mask = None if mask is None else mask.to(self._device)
-            distance = lpips_distance(made, self._known.features, mask, self._weights, over_weight=True)
-            return float(distance)
-
-    def in_bands(self, pair: Pair) -> bool:
-        """Whether images of this size are compared band by band, because all their features would not fit."""
-        if pair.rgb is None or pair.truth_rgb is None or not isinstance(self._features, CodecFeatures):
-            return False
-        return pair.rgb.shape[-2] * pair.rgb.shape[-1] > WHOLE_PIXELS
-
-    def of_all(self, pairs: Sequence[Pair], threads: int) -> list[float]:
-        """The distances of large images (``in_bands``) from one truth, whose features are made once for all of them.
-
-        Args:
-            pairs: of one truth and mask. threads: bands that are worked on at the same time; the values do not depend
-                on it.
-        """
-        network, truth, mask = self._features, pairs[0].truth_rgb, pairs[0].mask
-        if truth is None or not isinstance(network, CodecFeatures):
-            where = "PerceptualDistance.of_all"
-            raise UsageError("only distances in the features of the codec are made band by band", where=where)
-        images = [reduced(pair.rgb) for pair in pairs if pair.rgb is not None]
-        mask = None if mask is None else reduced(mask.float())
-        given = _Compared(network, self._device, images, reduced(truth), mask)
-        height, width = given.truth.shape[-2:]
-        with ThreadPoolExecutor(threads) as pool:
-            parts = list(pool.map(given.sums_of, _bands(height, width, network)))
-        return [_mean_of_stages(bands) for bands in zip(*parts, strict=True)]
-
-
-def _mean_of_stages(bands: Sequence[Sequence[tuple[float, float]]]) -> float:
-    """The distance of one image from sums of distances and weights by band and stage."""
-    stages = [[sum(numbers) for numbers in zip(*stage, strict=True)] for stage in zip(*bands, strict=True)]
-    return sum(apart / weight if weight else math.nan for apart, weight in stages) / len(stages)
-
-
-@dataclass(frozen=True)
-class _Compared:
-    """Images held against one truth band by band: ``[3, H, W]`` each, and the pixels that count f32[1, H, W]."""
-
-    network: CodecFeatures
-    device: torch.device
-    images: Sequence[Tensor]
-    truth: Tensor
-    mask: Tensor | None
-    shares: dict[tuple[int, int], Tensor] = field(default_factory=dict)
-
-    @torch.no_grad()
-    def sums_of(self, band: _Band) -> list[list[tuple[float, float]]]:
-        """Of every image and stage: sum of the weighted distances in a band, and of the weights."""
-        true = unit_features(band.features(self.network, self.truth.to(self.device)))
-        shares = [self._share(band, features) for features in true]
-        return [
-            [
-                (float((apart * share).double().sum()), float(share.expand_as(apart).double().sum()))
-                for apart, share in zip(
-                    map(distance_places, band.features(self.network, at), true), shares, strict=True
-                )
-            ]
-            for at in (image.to(self.device) for image in self.images)
-        ]
-
-    def _share(self, band: _Band, features: Tensor) -> Tensor:
-        """Weight of every place of a stage's features in a band."""
-        if self.mask is None:
-            return features.new_ones(())
-        step, height = self.network.STEP, self.truth.shape[-2]
-        per_row = _places(features.shape[-2], band.ends - band.begins, step)
-        size = (_padded(height, step) // per_row, features.shape[-1])
-        if size not in self.shares:
-            self.shares[size] = F.adaptive_avg_pool2d(self.mask.to(self.device, torch.float32), size)[0]
-        return self.shares[size][band.begins // per_row :][: features.shape[-2]]
+            return float(lpips_distance(found, self._known.features, mask, self._weights, over_weight=True))

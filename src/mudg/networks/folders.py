@@ -11,7 +11,6 @@ from __future__ import annotations
 import importlib
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final, Literal
@@ -22,7 +21,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from mudg.base import store
-from mudg.base.devices import NETWORK_KINDS, DeviceName, choose_device
 from mudg.base.errors import InputError, ResourceError
 
 # the check that every network of a score makes of its weights -------------------------------------
@@ -74,23 +72,7 @@ def checked_state(
 _REMEDY: Final = "pip install 'mudg[models]'"
 
 
-@dataclass(frozen=True, slots=True)
-class Compute:
-    """Device of a network (for `choose_device`), and whether it computes in bfloat16 (convolutions, products)."""
-
-    device: DeviceName = "cpu"
-    bf16: bool = False
-
-    def ready(self) -> torch.device:
-        """The device; UsageError, ResourceError where there is none of the kind."""
-        return choose_device(self.device, "networks of annotate", NETWORK_KINDS)
-
-    def autocast(self) -> torch.autocast:
-        """Context in which a network shall run."""
-        return torch.autocast(self.device.partition(":")[0], torch.bfloat16, enabled=self.bf16)
-
-
-CPU: Final = Compute()
+CPU: Final = torch.device("cpu")
 MEAN: Final = (0.485, 0.456, 0.406)
 DEVIATION: Final = (0.229, 0.224, 0.225)
 """Statistics of colours in 0..1 (ImageNet) where a folder names none."""
@@ -177,17 +159,16 @@ def read_settings(file: Path) -> dict[str, Any]:
     return content
 
 
-def load_network(network_class: Any, folder: Path, compute: Compute = CPU, subfolder: str = "") -> nn.Module:
+def load_network(network_class: Any, folder: Path, device: torch.device = CPU, subfolder: str = "") -> nn.Module:
     """A network with all its weights, in float32 on its device, ready for use; its parameters have no gradient.
 
     Args:
         network_class: class of transformers or diffusers. folder: as ``save_pretrained`` writes it.
-        compute: where it shall compute. subfolder: part of the folder that holds this network.
+        device: where it shall compute. subfolder: part of the folder that holds this network.
 
     Raises:
-        InputError: the folder does not hold this network, or not all of it. ResourceError: no such device.
+        InputError: the folder does not hold this network, or not all of it.
     """
-    device = compute.ready()
     where = str(folder / subfolder)
     options: dict[str, Any] = {"local_files_only": True, "use_safetensors": True, "output_loading_info": True}
     if subfolder:

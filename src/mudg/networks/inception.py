@@ -9,7 +9,7 @@ another network are not FID. How an image is brought to 299x299 is part of the d
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Final, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -40,10 +40,6 @@ ResizeRule = Literal["pytorch-fid", "tf1", "clean", "tm", "neurad"]
 * neurad: Pillow's bicubic on 8 bits. neurad-studio.
 """
 RULES: Final[tuple[ResizeRule, ...]] = get_args(ResizeRule)
-
-Tap = Literal["64", "192", "768", "2048", "logits_unbiased"]
-"""Where features are read, by their width: after the first and the second maximum pool and after Mixed_6e, averaged
-over places; the global average that FID uses; its classes without bias."""
 
 
 class _Unit(NamedTuple):
@@ -114,12 +110,12 @@ _STEM: Final[tuple[_Unit | str, ...]] = (
     _Unit("Conv2d_1a_3x3", 32, (3, 3), 2, False),
     _Unit("Conv2d_2a_3x3", 32, (3, 3), 1, False),
     _Unit("Conv2d_2b_3x3", 64, (3, 3), 1, True),
-    "64",
+    _MAXIMUM_HALF,
     _Unit("Conv2d_3b_1x1", 80, (1, 1), 1, False),
     _Unit("Conv2d_4a_3x3", 192, (3, 3), 1, False),
-    "192",
+    _MAXIMUM_HALF,
 )
-"""Convolutions from the image on; a tap's name stands for a maximum pool, 3x3 at every second place, and the tap."""
+"""Convolutions and pools from the image on."""
 
 _BLOCKS: Final[dict[str, tuple[_Branch, ...]]] = {
     "Mixed_5b": _block_a(32),
@@ -132,7 +128,6 @@ _BLOCKS: Final[dict[str, tuple[_Branch, ...]]] = {
     "Mixed_7b": _block_e(_AVERAGE),
     "Mixed_7c": _block_e(_MAXIMUM),
 }
-_MIDDLE_TAP: Final = "Mixed_6e"
 
 
 def tensor_shapes() -> dict[str, tuple[int, ...]]:
@@ -190,42 +185,17 @@ class InceptionFeatures(nn.Module):
         for name, value in checked_state(state, tensor_shapes(), where, "Inception", **words).items():
             self.register_buffer(name.replace(".", "/"), value)
 
-    def forward(self, images: Tensor, taps: Sequence[Tap] = ("2048",)) -> dict[str, Tensor]:
-        """Features of prepared images.
-
-        Args:
-            images: ``[n, 3, 299, 299]`` from ``prepared``. taps: what to return; nothing after the last one is
-                computed.
-
-        Returns:
-            Tap -> ``[n, width]``; ``logits_unbiased`` ``[n, 1008]``.
-        """
+    def forward(self, images: Tensor) -> Tensor:
+        """Features of FID, the average over all places: ``[n, 3, 299, 299]`` from ``prepared`` -> ``[n, 2048]``."""
         if images.shape[1:] != (3, SIDE_PX, SIDE_PX):
             expected = f"[n, 3, {SIDE_PX}, {SIDE_PX}]"
             raise InputError("FID's network takes images of one size", expected=expected, got=str(tuple(images.shape)))
-        found: dict[str, Tensor] = {}
-        for name, x in self._places(images):
-            if name in taps:
-                found[name] = x.mean((2, 3)) if x.dim() == 4 else x
-                if len(found) == len(set(taps)):
-                    break
-        return found
-
-    def _places(self, x: Tensor) -> Iterator[tuple[str, Tensor]]:
-        """Taps in the network's order."""
+        x = images
         for step in _STEM:
-            if isinstance(step, str):
-                x = F.max_pool2d(x, 3, 2)
-                yield step, x
-            else:
-                x = self._convolved(step.name, x)
+            x = _pooled(step, x) if isinstance(step, str) else self._convolved(step.name, x)
         for block in _BLOCKS:
             x = self.block(block, x)
-            if block == _MIDDLE_TAP:
-                yield "768", x
-        x = x.mean((2, 3))
-        yield "2048", x
-        yield "logits_unbiased", x @ self.get_buffer("fc/weight").T
+        return x.mean((2, 3))
 
     def block(self, name: str, x: Tensor) -> Tensor:
         """One of the blocks Mixed_5b to Mixed_7c: ``[n, C, h, w]`` -> ``[n, C', h', w']``."""

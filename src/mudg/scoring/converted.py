@@ -51,7 +51,6 @@ NETWORKS: Final[Mapping[str, ScoreNetwork]] = {
     "clip": ScoreNetwork("--clip-weights", clip_image.ClipImageFeatures, clip_image.with_openai_names, {}),
     "lpips": _lpips("alex", "--lpips-weights"),
     "lpips-vgg": _lpips("vgg", "--lpips-vgg-weights"),
-    "lpips-squeeze": _lpips("squeeze", "--lpips-squeeze-weights"),
 }
 """Networks by the name that ``mudg convert --network`` takes."""
 

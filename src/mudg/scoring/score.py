@@ -59,7 +59,6 @@ TRUTH: Final = "=truth"
 LPIPS_FILES: Final[Mapping[str, tuple[str, LpipsTrunk]]] = {
     "lpips_weights": ("lpips", "alex"),
     "lpips_vgg_weights": ("lpips_vgg", "vgg"),
-    "lpips_squeeze_weights": ("lpips_squeeze", "squeeze"),
 }
 """Setting that names a file -> row of the table and the network in the file."""
 DEPTH_LIMIT_M: Final = 80.0
@@ -292,28 +291,9 @@ def _measured(
     if _is_small(trajectory):  # whose views are measured at the same time
         measured = {name: metrics.measure(pair, wanted[name]) for name, pair in pairs.items()}
         return MeasuredView(truth, facts, seen, measured)
-    known = _in_bands(pairs, wanted)
     with ThreadPoolExecutor(native.threads()) as pool:
-        found = pool.map(lambda name: metrics.measure(pairs[name], wanted[name], known.get(name)), pairs)
+        found = pool.map(lambda name: metrics.measure(pairs[name], wanted[name]), pairs)
         return MeasuredView(truth, facts, seen, dict(zip(pairs, found, strict=True)))
-
-
-def _in_bands(
-    pairs: Mapping[str, metrics.Pair], wanted: Mapping[str, Mapping[str, metrics.Metric]]
-) -> dict[str, dict[Callable[[metrics.Pair], Any], Any]]:
-    """What is measured of all methods together, for the features of the truth are made once then: by method, source ->
-    value."""
-    found: dict[str, dict[Callable[[metrics.Pair], Any], Any]] = {name: {} for name in pairs}
-    sources = {metric.source: None for of in wanted.values() for metric in of.values()}
-    for source in sources:
-        if not isinstance(source, PerceptualDistance):
-            continue
-        asks = {name: source in {metric.source for metric in wanted[name].values()} for name in pairs}
-        asked = [name for name, pair in pairs.items() if asks[name] and source.in_bands(pair)]
-        values = source.of_all([pairs[name] for name in asked], native.threads()) if asked else ()
-        for name, value in zip(asked, values, strict=True):
-            found[name][source] = value
-    return found
 
 
 def evenly(items: Sequence[int], count: int) -> list[int]:

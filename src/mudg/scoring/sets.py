@@ -143,7 +143,7 @@ class FeatureFiles(EmbeddingFiles):
         network = inception.InceptionFeatures(state, str(weights)).to(device)
         prepare = functools.partial(inception.prepared, rule=rule)
         key = f"Inception {sha256} {rule}"
-        super().__init__(lambda batch: network(batch)["2048"], prepare, inception.WIDTH, key, folder, device)
+        super().__init__(network, prepare, inception.WIDTH, key, folder, device)
         self.rule: inception.ResizeRule = rule
         self.sha256, self.source_sha256 = sha256, source_sha256(weights)
 

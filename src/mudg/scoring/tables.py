@@ -22,7 +22,6 @@ WEIGHT_FLAGS: Final = {
     for flag, metrics in (
         ("--lpips-weights", "lpips"),
         ("--lpips-vgg-weights", "lpips_vgg"),
-        ("--lpips-squeeze-weights", "lpips_squeeze"),
         ("--fid-weights", "fid kid"),
         ("--fvd-weights", "fvd"),
         ("--dino-weights", "fd_dinov2 subject_consistency"),

@@ -199,6 +199,6 @@ class Convert(Step):
         if config.resolution != "auto" or config.towers:
             what, remedy = "--resolution and --towers do not apply to a DepthLab folder", "give a checkpoint file"
             raise UsageError(what, where=str(source), remedy=f"leave them out, or {remedy}")
-        files = depthlab.find(source).files()
+        files = depthlab.source_files(source)
         work = partial(depthlab.convert_folder, source, to, convert.DTYPES[config.dtype], convert.SHARD_BYTES)
         return work, convert.memory_limit(config, *files)

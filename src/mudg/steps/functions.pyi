@@ -10,7 +10,7 @@ def annotate(
     out: str | Path,
     overwrite: bool = False,
     config: str | Path | None = None,
-    labeller: Literal['embedded', 'geometry', 'network'] = 'embedded',
+    labeller: Literal['embedded', 'network'] = 'embedded',
     weights: str = '',
     depth: bool = True,
     depth_network: str = '',
@@ -29,7 +29,7 @@ def annotate(
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         config: YAML file of settings, read before those given here.
-        labeller: Source of classes and sky. embedded: the small shipped network, from image, heights and boxes. geometry: rules on heights and boxes, without a network. network: a segmentation network from `weights`.
+        labeller: Source of classes and sky. embedded: the small shipped network, from image, heights and boxes. network: a segmentation network from `weights`.
         weights: labeller network: folder of a SegFormer or Mask2Former with Cityscapes classes in the transformers format, or its name in the Hugging Face cache (owner/name or owner/name@revision). labeller embedded: folder of a network trained with tools/train_segmenter.py (empty = the shipped network).
         depth: Write dense depth, by default from the LiDAR points of several sweeps, filled with the image as guide.
         depth_network: Take dense depth from a network and align it to LiDAR: folder, or name in the Hugging Face cache, of a PromptDepthAnything or Depth Anything model (transformers); or folder of a DepthLab written by mudg convert.
@@ -131,7 +131,7 @@ def convert(
     to: str | Path,
     overwrite: bool = False,
     config: str | Path | None = None,
-    network: Literal['diffusion', 'inception', 'i3d', 'dinov2', 'clip', 'lpips', 'lpips-vgg', 'lpips-squeeze'] = 'diffusion',
+    network: Literal['diffusion', 'inception', 'i3d', 'dinov2', 'clip', 'lpips', 'lpips-vgg'] = 'diffusion',
     resolution: Literal['auto', '320x512', '576x1024'] = 'auto',
     dtype: Literal['keep', 'float32', 'float16', 'bfloat16'] = 'keep',
     towers: str = '',
@@ -510,7 +510,7 @@ def learn(
     seed: int = 0,
     start: str = '',
     steps: int = 2800,
-    frozen: Literal['nothing', 'temporal_transformers', 'temporal_layers', 'denoiser'] = 'nothing',
+    frozen: Literal['nothing', 'temporal_transformers', 'temporal_layers'] = 'nothing',
     precision: Literal['auto', 'float32', 'bfloat16'] = 'auto',
     threads: int = 1,
     data: Mapping[str, Any] = ...,
@@ -531,7 +531,7 @@ def learn(
         seed: Seed of the cities, the initial weights and all other random numbers.
         start: Model to continue from: a folder written by learn or convert, or "embedded" for the shipped model (empty = train from scratch).
         steps: Training steps of the network.
-        frozen: Layers that keep their weights. temporal_transformers: as in the published second stage. temporal_layers: all layers that mix frames. denoiser: train the refiner only.
+        frozen: Layers that keep their weights. temporal_transformers: as in the published second stage. temporal_layers: all layers that mix frames.
         precision: Number format of the computation. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere.
         threads: Threads of the training process. Results are repeatable for the same number of threads.
         data:
@@ -697,7 +697,6 @@ def score(
     perceptual_views: int = 8,
     lpips_weights: str = '',
     lpips_vgg_weights: str = '',
-    lpips_squeeze_weights: str = '',
     lpips_input: Literal['correct', 'unscaled'] = 'correct',
     fid_weights: str = '',
     fid_resize: Literal['pytorch-fid', 'tf1', 'clean', 'tm', 'neurad'] = 'pytorch-fid',
@@ -726,7 +725,6 @@ def score(
         perceptual_views: Number of views per trajectory, evenly spread, at which the perceptual distance is computed (0 = none). It costs more than all other metrics together.
         lpips_weights: Safetensors file with LPIPS weights (AlexNet, version 0.1, tensor names of the lpips package). LPIPS is computed at the same views as the perceptual distance (empty = not computed).
         lpips_vgg_weights: The same for LPIPS with VGG-16 (empty = not computed).
-        lpips_squeeze_weights: The same for LPIPS with SqueezeNet 1.1 (empty = not computed).
         lpips_input: Range of the colours that LPIPS gets. unscaled: 0 to 1 where -1 to 1 belongs, as much published code of Gaussian scenes has it; only to compare with its numbers.
         fid_weights: File with the weights of FID's Inception-v3 network (`pt_inception-2015-12-05-6726825d.pth`, or its tensors as safetensors). FID and KID then compare all views with the recorded frames of the same camera (empty = not computed).
         fid_resize: How FID's network gets its 299 x 299 pixels: as pytorch-fid, torch-fidelity (tf1), clean-fid (clean), torchmetrics (tm) or neurad-studio (neurad) do it. Numbers of different rules cannot be compared.

@@ -115,7 +115,7 @@ PRESETS: Final[Mapping[PresetName, Mapping[str, Value]]] = {
         **_of("ingest.city", n_frames=60, width=960, height=640),
         **_of("fuse", match_colors=False, occlusion_test=False, box_growth_m=0.0, floor_margin_m=0.25),
         **_of("fuse", moving_distance_m=0.5, min_object_points=100),
-        **_of("synthesize", model=NO_MODEL, steps=50, sampler="ddim", eta=1.0, guidance=7.5, guidance_rescale=0.7),
+        **_of("synthesize", model=NO_MODEL, steps=50, eta=1.0, guidance=7.5, guidance_rescale=0.7),
         **_of("synthesize", overlap=8, align_depth=False, full_size=False),
         **_of("fit", iterations=30_000, checkpoint_every=2500, preview_every=2500, sh_degree=3),
         **_of("fit.start", gaussians=10_000_000, voxel_m=0.15),
