@@ -58,7 +58,6 @@ def bench(
     sampler: Literal['ddim', 'dpm_solver'] = 'ddim',
     eta: float | None = None,
     precision: Literal['auto', 'float32', 'bfloat16', 'float16'] = 'auto',
-    harmonize: bool = False,
     threads: int = 1,
     seed: int = 0,
     list: Literal['development', 'reported'] = 'development',
@@ -75,32 +74,30 @@ def bench(
     shown: tuple[str, ...] = (),
     resolution: str = '',
     frames: str = '',
-    pose_iterations: int = 300,
+    edit_iterations: int = 300,
     device: str = 'auto',
     fuse: Mapping[str, Any] = ...,
     synthesize: Mapping[str, Any] = ...,
     fit: Mapping[str, Any] = ...,
     score: Mapping[str, Any] = ...,
 ) -> Any:
-    """Run a benchmark: mdm, poses, edit, shift or loop against exact truth, real on real logs, paper for tables of
-    papers.
+    """Run a benchmark: mdm, edit, shift or loop against exact truth, real on real logs, paper for tables of papers.
 
     Args:
-        name: Benchmark to run: mdm (diffusion model), poses (correction of box tracks), edit (edits of fitted scenes), shift (complete methods off the recorded path), loop (drives in fitted scenes), real (complete methods on real logs) or paper (a table of a paper).
-        sources: real, paper: folders of dataset logs, or scenes made by ingest. paper also takes city:reported or city:development, a list of generated cities. edit: folders of finished runs, whose drives are edited in place of generated cities.
+        name: Benchmark to run: mdm (diffusion model), edit (edits of fitted scenes), shift (complete methods off the recorded path), loop (drives in fitted scenes), real (complete methods on real logs) or paper (a table of a paper).
+        sources: real, paper: folders of dataset logs, or scenes made by ingest. paper also takes city:reported or city:development, a list of generated cities.
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         preset: shift, real, loop, paper: settings of clouds, generated views and fits to start from, as for mudg run (docs/presets.md). paper: the published set-up, with a published-type model.
         config: YAML file of settings, read before those given here.
         model: Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn or convert.
-        cities: mdm, poses, edit: list of cities. Choose settings on development; report results on reported, on which nothing was chosen.
-        count: mdm, poses, edit: number of cities taken from the list, 1 to 6. mdm: each gives four clips: shifted by 2, 3 and 4 m, and on the recorded path.
+        cities: mdm, edit: list of cities. Choose settings on development; report results on reported, on which nothing was chosen.
+        count: mdm, edit: number of cities taken from the list, 1 to 6. mdm: each gives four clips: shifted by 2, 3 and 4 m, and on the recorded path.
         steps: mdm: numbers of denoising steps to compare; each is measured on its own.
         sampler: mdm: sampler of the diffusion model. ddim: first order, with fresh noise between steps. dpm_solver: second order and deterministic, for many steps. Both cost one network pass per step. shift, real and paper have `--synthesize.sampler`, and likewise steps and eta.
         eta: mdm: sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given: 1).
         precision: Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere. float16: published-type models on CUDA devices (shift, real, paper).
-        harmonize: edit: add rows with the diffusion model: edited frames that it repaired, and fits that go on with them.
-        threads: mdm, poses, edit: number of torch threads.
+        threads: mdm, edit: number of torch threads.
         seed: Seed of all random numbers; the same seed gives the same result.
         list: shift, loop: list of logs. Choose settings on development; report results on reported, on which nothing was chosen.
         logs: shift, loop; paper with a list of cities: number of logs taken from the list, 1 to 8 (the development list has 4).
@@ -116,7 +113,7 @@ def bench(
         shown: real: cameras that the methods see in protocol camera; the first one gives the views beside the recorded path (empty = front, or the first camera).
         resolution: real, paper: image size of logs that are imported, as for ingest (empty = as recorded; paper: as the table says). paper with a list of cities: WIDTHxHEIGHT (empty = 384x256).
         frames: real, paper: frames of logs that are imported, FIRST:END without END itself, as for ingest (empty = all; paper: as the table says). paper with a list of cities: 0:END (empty = 0:24).
-        pose_iterations: poses, edit: optimisation steps of every fit.
+        edit_iterations: edit: optimisation steps of every fit.
         device: Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N.
         fuse: shift, real, paper: how the clouds of every log are made.
         synthesize: shift, real, paper: how views are generated. Model, number format, seed and device are the benchmark's own flags; where views are generated is the benchmark's matter (real: `--synthesize.shifts-m` for the views that fits learn from).
