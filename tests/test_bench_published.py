@@ -108,7 +108,6 @@ REFUSED = [
     ("shift", ["--eta", "0.5"], "--eta", "--synthesize.eta"),
     ("real", ["--sampler", "dpm_solver"], "--sampler", "--synthesize.sampler"),
     ("paper", ["--cities", "development"], "--cities", "leave it out"),
-    ("paper", ["--ablation"], "--ablation", "leave it out"),
     ("paper", ["--variant", "a=sh_degree:1"], "--variant", "leave it out"),
     ("paper", ["--protocols", "gap"], "--protocols", "leave it out"),
     ("real", ["--no-videos"], "--videos", "leave it out"),

@@ -150,12 +150,12 @@ def test_large_sets_have_an_error_and_an_extrapolation(monkeypatch: pytest.Monke
     rng = np.random.default_rng(0)
     a, b = rng.standard_normal((40, 3)), rng.standard_normal((64, 3))
     few = distributions.distances(a[:31], b)
-    assert few.kid_standard_error is not None
-    assert few.fid_at_infinity is None
-    assert distributions.distances(a[:24], b).kid_standard_error is None  # three blocks
+    assert few["kid_standard_error"] is not None
+    assert few["fid_at_infinity"] is None
+    assert distributions.distances(a[:24], b)["kid_standard_error"] is None  # three blocks
     monkeypatch.setattr(distributions, "FEWEST_TO_EXTRAPOLATE", 40)
-    assert distributions.distances(a, b).fid_at_infinity is not None
-    assert distributions.distances(a[:39], b).fid_at_infinity is None
+    assert distributions.distances(a, b)["fid_at_infinity"] is not None
+    assert distributions.distances(a[:39], b)["fid_at_infinity"] is None
 
 
 def test_without_weights_one_line_names_the_flags(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ from mudg.scene.read import read_scene
 from mudg.viewer import page as viewer_page
 from mudg.viewer import view
 from mudg.viewer.live import GROUND, FrameSource, VideoRequest
-from mudg.viewer.page import BLOCK, blob_of, chunk_rows, coverage, level_of, opacity_of, pack_scene, smallest_three
+from mudg.viewer.page import BLOCK, blob_of, coverage, level_of, opacity_of, pack_scene, smallest_three
 from mudg.viewer.server import token_for
 from mudg.viewer.settings import PageConfig
 
@@ -251,22 +251,6 @@ def test_what_a_page_takes_is_said_before_it_is_written(toy: Toy) -> None:
     assert said.count("500 Gaussians of 900 (") == 1
     assert f"{kept.layout.visible - 500} left out for the budget" in said
     assert page.graphics_bytes() == 500 * (5 * 16 + 4)  # degree 3: five texels
-
-
-def test_a_page_stays_within_the_memory_that_it_may_take(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
-    for degree in range(4):
-        for size in (64, 65_536):
-            for limit in (5_000, 60_000, 1_234_567, 300_000_000):
-                most = viewer_page.most_within(limit, degree, size)
-                taken = [sum(viewer_page.scene_bytes(n, chunk_rows(n, size), degree)) for n in (most, most + 1)]
-                assert taken[0] <= limit < taken[1]
-    shown = view.Shown(read_scene(toy[0] / "scene"), (("fit", toy[2]), ("fit", toy[2])))
-    monkeypatch.setattr(view, "MEGABYTE", 1e5)
-    page = view.page_of(PageConfig(images=0, memory_mb=1), shown)
-    assert 9e4 < page.graphics_bytes() + page.heap_bytes() <= 1e5
-    kept = page.scenes[0][1]
-    assert f"{kept.layout.visible - kept.kept} left out for the budget" in view.needs_text(page, "page.html", "")
-    assert view.page_of(PageConfig(images=0, memory_mb=1, budget=100), shown).scenes[0][1].kept == 100
 
 
 def whole_page(page: viewer_page.ViewerPage) -> bytes:

@@ -18,13 +18,14 @@ from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.benchmarks import cities, loop, paper, real, shift
-from mudg.benchmarks.rows import changed_settings, flag_of, generator_of
+from mudg.benchmarks.rows import changed_settings, generator_of
 from mudg.benchmarks.settings import BenchConfig, bench_preset
 from mudg.diffusion import model_files
 from mudg.diffusion.published import is_published
 from mudg.gaussians.settings import FitConfig
 from mudg.steps.pipeline import refuse_missing
 from mudg.steps.settings import PresetName
+from mudg.steps.step import flag_name
 
 _FILES = ("bench.json", "bench.md", "*.png", "clips/*", "cities/", "edited/", "fits/", "rows/*.json")
 EDIT, SHIFT, REAL, PAPER, LOOP = "edit", "shift", "real", "paper", "loop"
@@ -42,7 +43,7 @@ USED: Final[Mapping[str, tuple[str, ...]]] = {
         ((SHIFT, LOOP), "list"),
         ((SHIFT, PAPER, LOOP), "logs"),
         ((SHIFT, PAPER), "videos"),
-        ((SHIFT, REAL), "ablation variant"),
+        ((SHIFT, REAL), "variant"),
         ((REAL,), "protocols shown"),
         ((REAL, PAPER), "resolution frames"),
         ((PAPER,), "table score"),
@@ -112,10 +113,10 @@ def refuse_unused(name: str, config: BenchConfig, preset: PresetName) -> None:
                 f"mudg bench {name} does not use this setting",
                 " or ".join(map("mudg bench {}".format, users)),
             )
-            remedy = f"give {flag_of(group)}" if elsewhere else "leave it out"
-            raise UsageError(what, where=flag_of(setting), expected=expected, remedy=remedy)
+            remedy = f"give {flag_name(group)}" if elsewhere else "leave it out"
+            raise UsageError(what, where=flag_name(setting), expected=expected, remedy=remedy)
         if setting in OWN and (setting, name) != ("synthesize.shifts_m", REAL):
-            raise UsageError("the benchmark chooses this itself", where=flag_of(setting), remedy=OWN[setting])
+            raise UsageError("the benchmark chooses this itself", where=flag_name(setting), remedy=OWN[setting])
     if name in CHAINS:
         refuse_missing(generator_of(config), FitConfig(), "--model")
     if name == "mdm" and is_published(config.model):

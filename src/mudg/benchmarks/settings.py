@@ -60,9 +60,6 @@ class BenchOwn:
     """shift, real, loop, paper: optimisation steps of every fit without virtual views."""
     guided_share: float = setting(default=1.5, gt=0)
     """shift, real, loop, paper: steps of fits under virtual views, as a multiple of the others'."""
-    ablation: bool = False
-    """shift: add rows for mudg_s with only some virtual loss terms (colour; colour and depth; colour and classes), and
-    with exact views instead of generated ones. real: add street_gaussians-longer."""
     variant: tuple[str, ...] = ()
     """shift, real: add rows for mudg_s with other settings of fit, each as NAME=FIELD:VALUE,FIELD:VALUE, where FIELD is
     a setting such as virtual.color_weight. Both of its fits have them."""

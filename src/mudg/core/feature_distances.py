@@ -29,8 +29,6 @@ MIND_FACTOR: Final = 3.0
 INFINITY_SIZES: Final = 15
 CMMD_SIGMA: Final = 10.0
 CMMD_FACTOR: Final = 1000.0
-JEDI_DEGREE: Final = 2
-JEDI_FACTOR: Final = 100.0
 
 
 def frechet_distance(generated: ArrayLike, real: ArrayLike) -> float:
@@ -227,30 +225,6 @@ def cmmd_distance(generated: ArrayLike, real: ArrayLike) -> float:
         return float(np.exp(-np.maximum(squared, 0.0) / (2.0 * CMMD_SIGMA**2)).mean())
 
     return max(0.0, CMMD_FACTOR * (mean_kernel(a, a) + mean_kernel(b, b) - 2.0 * mean_kernel(a, b)))
-
-
-def polynomial_distance(generated: ArrayLike, real: ArrayLike) -> float:
-    """Squared maximum mean discrepancy with the kernel ``(x.y / d)^2``, times 100, as JEDi has it on features of
-    videos.
-
-    Biased: means over full kernel matrices, with their diagonals.
-
-    Args:
-        generated, real: ``[n, d]`` and ``[m, d]``, n, m >= 1.
-
-    Returns:
-        [0, inf); 0 for equal sets, and for sets with equal second moments. Symmetric; multiplied by c^4 when all
-        features are multiplied by c.
-
-    Raises:
-        InputError: as ``frechet_distance``.
-    """
-    a, b = _pair(generated, real, 1)
-
-    def mean_kernel(x: Features, y: Features) -> float:
-        return float(((x @ y.T / x.shape[1]) ** JEDI_DEGREE).mean())
-
-    return max(0.0, JEDI_FACTOR * (mean_kernel(a, a) + mean_kernel(b, b) - 2.0 * mean_kernel(a, b)))
 
 
 def _pair(generated: ArrayLike, real: ArrayLike, fewest: int) -> tuple[Features, Features]:

@@ -65,7 +65,6 @@ def bench(
     methods: tuple[str, ...] = ('nearest_fill', 'gs3d', 'street_gaussians', 'mudg_r', 'mudg_s'),
     iterations: int = 1000,
     guided_share: float = 1.5,
-    ablation: bool = False,
     variant: tuple[str, ...] = (),
     processes: int = 0,
     videos: bool = True,
@@ -104,7 +103,6 @@ def bench(
         methods: shift, real, loop: methods to compare: those of the default (loop: street_gaussians and mudg_s); pvg, s3gaussian, bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on until it has as many steps as mudg_s, without generated views. shift: also mudg_f, renders of mudg_s that the diffusion model repairs. paper: any of these of shift but mudg_f; with the default, all of them.
         iterations: shift, real, loop, paper: optimisation steps of every fit without virtual views.
         guided_share: shift, real, loop, paper: steps of fits under virtual views, as a multiple of the others'.
-        ablation: shift: add rows for mudg_s with only some virtual loss terms (colour; colour and depth; colour and classes), and with exact views instead of generated ones. real: add street_gaussians-longer.
         variant: shift, real: add rows for mudg_s with other settings of fit, each as NAME=FIELD:VALUE,FIELD:VALUE, where FIELD is a setting such as virtual.color_weight. Both of its fits have them.
         processes: shift, real, loop, paper: number of logs (real: also ways of hiding frames) processed at the same time, with one thread each (0 = one per core). Results do not depend on it.
         videos: shift, paper: also write videos of all methods side by side.
@@ -284,7 +282,6 @@ def export(
     overwrite: bool = False,
     config: str | Path | None = None,
     time_s: float | None = None,
-    animated: bool = False,
     nodes: tuple[str, ...] = (),
     axes: Literal['viewer', 'world'] = 'viewer',
     sky: Literal['keep', 'none', 'sphere'] = 'keep',
@@ -301,7 +298,6 @@ def export(
         overwrite: Replace the output if it exists.
         config: YAML file of settings, read before those given here.
         time_s: Moment at which moving objects are taken, on the scene's clock (not given: formats with motion hold all of it, others the middle of the log).
-        animated: Require that the file holds the motion: a format that cannot is refused.
         nodes: Track ids of the objects to write, and background for what stands (not given: everything).
         axes: viewer: axes that programs expect of the format. world: x forward, y left, z up in every format.
         sky: keep: a panorama, in formats that hold one. none: no sky. sphere: 6000 flat Gaussians 300 m away, in every format.
@@ -551,7 +547,6 @@ def page(
     config: str | Path | None = None,
     method: str = '',
     budget: int = 3000000,
-    memory_mb: int = 0,
     images: int = 150,
 ) -> Any:
     """Write a fitted scene as one HTML page: fly through it, any layer, any time, without a network.
@@ -565,7 +560,6 @@ def page(
         config: YAML file of settings, read before those given here.
         method: Fit of a run to show (empty = the best one: mudg_s, else street_gaussians).
         budget: Most Gaussians on the page (0 = all). Where a fit has more, those that the recorded cameras would see smallest and faintest are left out.
-        memory_mb: Most graphics memory and memory for sorting that the page may take in a browser, together, in megabytes (0 = no limit). Gaussians are left out as for the budget.
         images: Most recorded images on the page, taken evenly.
     """
     ...
@@ -702,7 +696,6 @@ def score(
     fvd_resize: Literal['videogpt', 'google', 'stylegan-v'] = 'videogpt',
     dino_weights: str = '',
     clip_weights: str = '',
-    video_features: str = '',
     detections: str = '',
     lanes: str = '',
     as_published: bool = False,
@@ -731,7 +724,6 @@ def score(
         fvd_resize: How FVD's network gets its 224 x 224 pixels: shorter side and crop (videogpt), or squashed (google, stylegan-v).
         dino_weights: File with the weights of DINOv2, ViT-S/14 or ViT-L/14 (`dinov2_vits14_pretrain.pth`, `dinov2_vitl14_pretrain.pth`, or their tensors as safetensors). FD-DINOv2 and the consistency of a video are then computed (empty = not computed).
         clip_weights: File with the image tower of CLIP ViT-L/14 at 336 pixels (`model.safetensors` of openai/clip-vit-large-patch14-336, or OpenAI's names). CMMD, CLIP-F and CLIP-V are then computed (empty = not computed).
-        video_features: Folder with features of clips that an extractor of your own made: METHOD/TRAJECTORY.safetensors and recorded/CAMERA.safetensors, each with a tensor `features` of [clips, values]. Frechet and polynomial distances are then computed (empty = not computed).
         detections: File with boxes that a detector found in the views, as COCO results. NTA-IoU is then computed (empty = not computed).
         lanes: Folder with lane masks that a detector made of the views, METHOD/TRAJECTORY/000000.png. NTL-IoU is then computed (empty = not computed). Generated cities only: prepared logs have no lane lines.
         as_published: NTA-IoU: project true boxes as the published score does, corners behind the camera included, instead of cutting them at the near plane.
