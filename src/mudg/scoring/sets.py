@@ -262,13 +262,10 @@ def set_entry(generated: Rows, reference: Rows, **distances: Callable[[Rows, Row
 
 
 class SetComparison:
-    """A distance of sets of images for every trajectory of a scene, whose recorded frames are the reference.
-
-    Args:
-        files: how images become features. compare: two sets of features to their numbers. facts: how these are made.
-        halves: two parts of the reference, whose distance is the floor where no truth is known, and what they are.
-        further: what else the features tell of a video, if anything.
-    """
+    """A distance of sets of images for every trajectory of a scene, whose recorded frames are the reference. ``files``:
+    how images become features. ``compare``: two sets of features to their numbers. ``facts``: how these are made.
+    ``halves``: two parts of the reference, whose distance is the floor where no truth is known, and what they are.
+    ``further``: what else the features tell of a video, if anything."""
 
     def __init__(
         self,

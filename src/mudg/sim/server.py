@@ -54,11 +54,8 @@ class Refused(Exception):
 
 
 class Renderer:
-    """Answers the requests of the wire; one at a time is drawn, because each uses all processors.
-
-    Args:
-        session: what is rendered. name: id of its scene.
-    """
+    """Answers the requests of the wire; one at a time is drawn, because each uses all processors. ``session``: what is
+    rendered. ``name``: id of its scene."""
 
     def __init__(self, session: Session, name: str) -> None:
         self.session, self.name, self.types = session, name, wire.messages()
@@ -232,11 +229,8 @@ class Renderer:
 
 
 def encoded(rgb: NDArray[np.uint8], image_format: int, quality: float) -> bytes:
-    """A picture u8[H, W, 3] as PNG, JPEG (of a quality of 1 to 100, 0 = 95), or three planes of bytes.
-
-    Raises:
-        Refused: another format.
-    """
+    """A picture u8[H, W, 3] as PNG, JPEG (of a quality of 1 to 100, 0 = 95), or three planes of bytes. Refused: another
+    format."""
     if image_format == wire.RGB_PLANAR:
         return np.ascontiguousarray(rgb.transpose(2, 0, 1)).tobytes()
     if image_format not in (wire.PNG, wire.JPEG):

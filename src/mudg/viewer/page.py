@@ -199,13 +199,10 @@ Sections = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True, slots=True)
 class Packed:
-    """A scene for the page; its chunks are made one at a time.
-
-    Args:
-        model: the scene, on the CPU. layout: which Gaussians of it are on the page.
-        sections: what belongs to all chunks, see the module's docstring. facts: JSON values that describe everything.
-        notes: sentences about what the page shows differently from the rasterizer.
-    """
+    """A scene for the page; its chunks are made one at a time. ``model``: the scene, on the CPU. ``layout``: which
+    Gaussians of it are on the page. ``sections``: what belongs to all chunks, see the module's docstring. ``facts``:
+    JSON values that describe everything. ``notes``: sentences about what the page shows differently from the
+    rasterizer."""
 
     model: SceneModel
     layout: Layout
@@ -244,16 +241,10 @@ class Packed:
 def pack_scene(
     model: SceneModel, begin_s: float, path: NDArray[np.floating] | None = None, most: int = 0, chunk_rows: int = CHUNK
 ) -> Packed:
-    """Prepare a fitted scene for the page.
-
-    Args:
-        model: on the CPU. begin_s: time that becomes 0 in all sections, seconds.
-        path: positions of the cameras f64[m, 3]; which Gaussians are worth keeping depends on how near they are.
-        most: number of Gaussians to keep (0 = all that can be drawn). chunk_rows: Gaussians per chunk.
-
-    Raises:
-        UsageError: more Gaussians than a page can hold.
-    """
+    """Prepare a fitted scene for the page. ``model``: on the CPU. ``begin_s``: time that becomes 0 in all sections,
+    seconds. ``path``: positions of the cameras f64[m, 3]; which Gaussians are worth keeping depends on how near they
+    are. ``most``: number of Gaussians to keep (0 = all that can be drawn). ``chunk_rows``: Gaussians per chunk.
+    UsageError: more Gaussians than a page can hold."""
     columns = _columns(model)
     layout = lay_out(columns, model.table.labels["node"].numpy(), path, most, chunk_rows)
     low, high = _color_range(columns["sh_dc"], layout, model.sh_degree)
