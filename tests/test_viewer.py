@@ -529,7 +529,7 @@ def test_a_page_in_chunks_shows_what_one_chunk_shows(
     # one file whose chunks are the same holds the same picture to the bit
     def open_one_file() -> None:
         config = PageConfig(images=3)
-        page = view.page_of(config, view.find_shown(config, toy[1], toy[0] / "scene", None))
+        page = view.page_of(config, view.find_sources(config, toy[1], toy[0] / "scene", None).read())
         (web[0] / "one.html").write_bytes(whole_page(page))
         fresh.open(f"file://{web[0] / 'one.html'}")
 
@@ -650,7 +650,7 @@ def test_other_machines_need_a_token() -> None:
 
 def test_fits_of_different_logs_are_not_compared(toy: Toy, tmp_path: Path) -> None:
     save_model(replace(toy[2], facts={**toy[2].facts, "scene": "another"}), tmp_path / "fit")
-    refused("another", view.find_shown, PageConfig(), toy[1], toy[0] / "scene", tmp_path / "fit")
+    refused("another", view.find_sources(PageConfig(), toy[1], toy[0] / "scene", tmp_path / "fit").read)
 
 
 # videos of exact frames ---------------------------------------------------------------------------

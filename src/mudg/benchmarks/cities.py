@@ -1,13 +1,11 @@
 """Measurements on generated cities, each one folder: ``mudg bench mdm`` and ``edit``.
 
-mdm: the diffusion model on held-out cities beside the recorded path, against exact truth, and the seam between windows
-of a longer video. edit: edits of fitted scenes against the city drawn again with the object elsewhere or gone, and
-vehicles of other cities (docs/research/edit.md)."""
+mdm: the diffusion model on held-out cities beside the recorded path, against exact truth. edit: edits of fitted scenes
+against the city drawn again with the object elsewhere or gone, and vehicles of other cities (docs/research/edit.md)."""
 
 from __future__ import annotations
 
 import itertools
-import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -42,12 +40,9 @@ from mudg.diffusion import city_clips as from_city
 from mudg.diffusion import model_files as mdm_files
 from mudg.diffusion import score as learn_score
 from mudg.diffusion.city_clips import CityClipRules, fit_city
-from mudg.diffusion.condition import ConditionRules, WarpSource, build_conditions
 from mudg.diffusion.memory_plan import choose_bf16
 from mudg.diffusion.model import MDM
-from mudg.diffusion.requests import SampleRequest, generated
-from mudg.diffusion.settings import SynthesizeConfig
-from mudg.diffusion.views import windows
+from mudg.diffusion.requests import SampleRequest
 from mudg.editing.apply import carry_out, complete_asset, drawer, write_asset
 from mudg.editing.model import linear_of
 from mudg.editing.script import parse_edits
@@ -60,11 +55,9 @@ from mudg.scene.labels import read_label
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
 
-SEAM_FRAMES, SEAM_SHIFT_M = 26, 3.0
-
 
 def measure_mdm(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
-    """Scores of the model at every number of steps, with and without classes, and its seam; numbers and tables."""
+    """Scores of the model at every number of steps, with and without classes; numbers and tables."""
     device = choose_device(config.device, "diffusion model", NETWORK_KINDS)
     bf16 = choose_bf16(config.precision, device)
     request = SampleRequest(1, config.seed, sampler=config.sampler, eta=config.eta, bf16=bf16)
@@ -89,52 +82,7 @@ def measure_mdm(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
             lines += [learn_score.table(scores), "```", ""]
             bar.update(title)
             bar.advance()
-    change = result["seam"] = seam(model, config, request)
-    lines += [
-        f"Seam: static surfaces change {change['across']:.3f} times as much as in the truth across the seams of"
-        f" windows, {change['inside']:.3f} times inside them (city {change['city']}, {SEAM_FRAMES} frames, 3 m,"
-        f" {change['steps']} steps).",
-        "",
-    ]
     return result, "\n".join(lines)
-
-
-def seam(model: MDM, config: BenchConfig, request: SampleRequest) -> dict[str, Any]:
-    """Change of static surfaces across the seams of overlapping windows, against that inside windows.
-
-    A video of `SEAM_FRAMES` frames 3 m beside the path of one city is made in windows and steps as synthesize takes
-    them by default, with the sampler of the request. Returned per place: the mean of (change made / change of the
-    truth) over pairs of frames; and the pairs themselves.
-    """
-    city, usual = from_city.LISTS[config.cities][0], SynthesizeConfig()
-    rules = CityClipRules(window=model.config.window)
-    record = from_city.make_log(rules, city, frames=SEAM_FRAMES)
-    views = [from_city.shifted_view(record.world, v, SEAM_SHIFT_M) for v in record.world.frame_views("front")]
-    small = [view.resized(rules.width, rules.height) for view in views]
-    truths = [record.world.render(view) for view in small]
-    sizes = ConditionRules(rules.width, rules.height, rules.width * rules.fine, rules.height * rules.fine)
-    sources: dict[int, WarpSource] = {}
-    frames: list[torch.Tensor] = []
-    tail: dict[Any, torch.Tensor] = {}
-    spans = windows(len(views), model.config.window, usual.overlap)
-    for number, span in enumerate(spans):
-        seen, shared = [views[i] for i in span], len(frames) - span.start
-        condition = build_conditions(record.cloud, record.world.tracks(), seen, record.recorded, sizes, sources)[0]
-        known = {m: z[-shared:] for m, z in tail.items()} if tail else None
-        made = generated(model, condition, replace(request, steps=usual.steps, index=number, known=known))
-        frames, tail = [*frames, *made.rgb[shared:]], dict(made.latents)
-    rgb = torch.stack([torch.from_numpy(t.rgb.copy()).permute(2, 0, 1) for t in truths])
-    depth = torch.stack([torch.from_numpy(t.depth.copy())[None] for t in truths]).clamp(max=1000.0)
-    ids = torch.stack([torch.from_numpy(t.semantics.astype("int64")) for t in truths])
-    true_frames = [metrics.TrueFrame.of(*one) for one in zip(small, depth, ids, strict=True)]
-    pairs = metrics.changes(torch.stack(frames), rgb, true_frames)
-    ratios = [m / t if t > 0 else math.nan for m, t in pairs]
-    seams = {span.start + usual.overlap - 1 for span in spans[1:-1]} | {spans[-2].stop - 1}
-    mean = lambda kept: sum(kept) / len(kept) if kept else math.nan
-    across = mean([r for i, r in enumerate(ratios) if i in seams])
-    within = mean([r for i, r in enumerate(ratios) if i not in seams])
-    change = {"city": city, "across": round(across, 4), "inside": round(within, 4), "steps": usual.steps}
-    return {**change, "seams": sorted(seams), "pairs": [round(r, 4) for r in ratios]}
 
 
 LISTS: dict[str, tuple[int, ...]] = {

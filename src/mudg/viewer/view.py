@@ -201,11 +201,6 @@ def find_sources(config: PageConfig, run: Path, scene: Path | None, compare: Pat
     return ShownSources(place, tuple(fits), parts.fused)
 
 
-def find_shown(config: PageConfig, run: Path, scene: Path | None, compare: Path | None) -> Shown:
-    """``find_sources``, read."""
-    return find_sources(config, run, scene, compare).read()
-
-
 def page_of(config: PageConfig, shown: Shown, report: str = "", live: dict[str, Any] | None = None) -> ViewerPage:
     """The page of what is shown."""
     scene, begin = shown.scene, pages.begin_of(shown.scene)
