@@ -129,7 +129,7 @@ def test_help_all_works_for_every_verb(verb: str) -> None:
 @pytest.mark.parametrize(
     ("page", "shown", "others"),
     [
-        ("batch status", ("--json",), ("--stages", "--preset", "--reason", "--shard")),
+        ("batch status", (), ("--stages", "--preset", "--reason", "--shard")),
         ("batch retry", ("--reason",), ("--stages", "--shard")),
         ("batch run", ("--list", "--stages", "--engine", "--set"), ("--reason",)),
         ("bench paper", ("--table", "--iterations"), ("--protocols", "--sampler", "--variant")),
