@@ -191,7 +191,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, help="PNG of the page when all has come")
     given = parser.parse_args()
     config = PageConfig(budget=given.budget, images=60)
-    shown = view.find_shown(config, given.run, None, None)
+    shown = view.find_sources(config, given.run, None, None).read()
     name, model = shown.fits[0]
     model, scene = long_street(model, shown.scene, given.gaussians)
     say(

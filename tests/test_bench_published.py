@@ -100,14 +100,13 @@ def test_a_preset_of_a_benchmark_is_that_of_a_run(preset):
 def test_every_setting_has_its_benchmarks():
     assert set(bench.USED) == {field.name for field in dataclasses.fields(BenchConfig)}
     for name, users in bench.USED.items():
-        assert set(users) <= {*bench.BENCHES, *bench.CHAINS, bench.RUNS}, name
+        assert set(users) <= {*bench.BENCHES, *bench.CHAINS}, name
 
 
 REFUSED = [
     ("paper", ["--steps", "50"], "--steps", "--synthesize.steps"),
     ("shift", ["--eta", "0.5"], "--eta", "--synthesize.eta"),
     ("paper", ["--cities", "development"], "--cities", "leave it out"),
-    ("paper", ["--ablation"], "--ablation", "leave it out"),
     ("paper", ["--variant", "a=sh_degree:1"], "--variant", "leave it out"),
     ("paper", ["--protocols", "gap"], "--protocols", "leave it out"),
     ("real", ["--no-videos"], "--videos", "leave it out"),
@@ -118,7 +117,6 @@ REFUSED = [
     ("mdm", ["--iterations", "5"], "--iterations", "leave it out"),
     ("mdm", ["--synthesize.steps", "5"], "--synthesize.steps", "leave it out"),
     ("mdm", ["--preset", "fast"], "--preset", "leave it out"),
-    ("poses", ["--model", "embedded-tiny"], "--model", "leave it out"),
     ("edit", ["--model", "embedded-tiny"], "--model", "leave it out"),
     ("edit", ["--precision", "float32"], "--precision", "leave it out"),
     ("shift", ["--fit.iterations", "5"], "--fit.iterations", "--iterations"),

@@ -421,13 +421,6 @@ def test_finished_work_is_reused_and_a_method_can_be_added(made, city, model):
     assert "fitted" not in store.read_json(split / "virtual" / "run.json")["inputs"]
 
 
-def test_an_ablation_adds_the_control():
-    rows = {
-        row.name: row for row in real_rows(BenchConfig(methods=("mudg_s",), ablation=True, variant=("a=sh_degree:1",)))
-    }
-    assert list(rows) == ["street_gaussians", "street_gaussians-longer", "mudg_s", "a"]
-
-
 CLASS_NAMES = {"5": "Road", "7": "Building"}
 
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from mudg.base import seeds, store
 from mudg.base.errors import InputError, UsageError
 from mudg.benchmarks import run as bench
 from mudg.benchmarks import shift
-from mudg.benchmarks.chain import ExactViews
 from mudg.benchmarks.rows import LONGER, shift_rows
 from mudg.benchmarks.settings import BenchConfig
 from mudg.city import logs as city_logs
@@ -83,20 +81,6 @@ def test_variants_change_fields_of_the_fit():
 def test_a_malformed_variant_is_refused(text):
     with pytest.raises(UsageError):
         shift_rows(BenchConfig(variant=(text,)))
-
-
-def test_ablation_brings_the_rows_it_is_compared_with():
-    rows = {r.name: r.fit for r in shift_rows(BenchConfig(methods=("mudg_r",), ablation=True))}
-    assert list(rows) == ["street_gaussians", "mudg_r", "mudg_s", "only_I", "only_I_D", "only_I_S", "exact"]
-    full = rows["mudg_s"]
-    no_depth, virtual = {"depth_weight": 0, "lidar_weight": 0}, full.virtual
-    expected = {
-        "only_I": dataclasses.replace(virtual, **no_depth, semantic_weight=0),
-        "only_I_D": dataclasses.replace(virtual, semantic_weight=0),
-        "only_I_S": dataclasses.replace(virtual, **no_depth),
-    }
-    assert all(rows[name] == dataclasses.replace(full, virtual=terms) for name, terms in expected.items())
-    assert rows["exact"] == full
 
 
 def test_rows_are_those_that_are_asked_for():
@@ -172,19 +156,6 @@ def made(tmp_path_factory):
     out = tmp_path_factory.mktemp("shift")
     config = BenchConfig(logs=1, iterations=30, processes=1, methods=("nearest_fill", "street_gaussians"))
     return shift.run(config, out, rules=TINY, distances_m=(3.0,)), config
-
-
-@pytest.mark.slow
-def test_exact_views_are_the_truth_beside_the_path_and_nothing_of_the_path(made, tmp_path):
-    truth = made[0] / str(city_logs.DEVELOPMENT[0]) / "truth"
-    names = sorted(path.name for path in truth.iterdir() if path.is_dir())
-    paths = [SimpleNamespace(name=name, origin="shifted" if "shift" in name else "recorded") for name in names]
-    out = ExactViews(truth=truth, paths=tuple(paths), out=tmp_path / "exact").run()
-    sets = list_observation_sets(out)
-    assert sorted(sets) == [name for name in names if "shift" in name] != names
-    seen, true = (read_observations(folder / "front_shift+3.0")[1] for folder in (out, truth))
-    assert seen.kind == "virtual"
-    assert torch.equal(seen.rgb, true.rgb) and torch.equal(seen.semantics, true.semantics)
 
 
 @pytest.mark.slow

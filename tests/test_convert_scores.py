@@ -18,7 +18,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.diffusion.settings import ConvertConfig
 from mudg.editing.settings import ScoreConfig
 from mudg.networks import i3d, inception
-from mudg.scoring import converted
+from mudg.scoring import sets as converted
 from mudg.steps.export import Convert
 from mudg.steps.render import Score
 

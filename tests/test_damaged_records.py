@@ -112,10 +112,7 @@ def written(name: str, value: object) -> Callable[[Path], Path]:
 
 
 MODEL = {"files": {"a.safetensors": ""}, "parts": {"unet": {"files": {"b.safetensors": ""}}}}
-BOXES = {
-    "images": [{"id": 1, "file_name": "a/000001.png", "width": 48, "height": 32}],
-    "annotations": [{"image_id": 1, "category_id": 3, "score": 0.9, "bbox": [1, 2, 3, 4]}],
-}
+BOXES = [{"image_id": "a/000001.png", "category_id": 3, "score": 0.9, "bbox": [1, 2, 3, 4]}]
 READERS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object]]] = {
     "interrupted run": (begun, small_run),
     "interrupted run, replaced": (begun, lambda folder: small_run(folder, 2, overwrite=True)),

@@ -11,8 +11,6 @@ import pytest
 from fit_settings import fit_config
 
 from mudg.base import geometry, store
-from mudg.benchmarks import run as bench
-from mudg.benchmarks.settings import BenchConfig
 from mudg.editing.settings import EditConfig
 from mudg.formats.settings import IngestConfig
 from mudg.labels.settings import AnnotateConfig
@@ -59,11 +57,3 @@ def test_the_lead_car_of_a_recorded_drive(drive: Path, tmp_path: Path, text: str
     became = store.read_json(out / "lidar.json")
     assert became["cleared"] > 100 and became["on_ground"] > 0
     assert (became["on_objects"] > 20) == text.startswith("- move")
-
-
-def test_the_benchmark_measures_edits_of_a_recorded_drive(drive: Path, tmp_path: Path) -> None:
-    out = bench.run("edit", BenchConfig(), tmp_path / "out", sources=[drive])
-    rows = {row["edit"]: row for row in store.read_json(out / "bench.json")["rows"]}
-    assert rows["remove"]["object"] == LEAD and rows["remove"]["outside"] < 0.03
-    assert rows["fog"]["lidar"] == rows["fog"]["lidar_before"] and 0 < rows["dusk"]["structure"] < 1
-    assert all(row["warp"] < 0.2 for row in rows.values()) and rows["move 3 m ahead"]["overlap"] > 0.3

@@ -1,4 +1,4 @@
-"""DINOv2, CLIP and features of videos: networks against second implementations, and what the scorer makes of them."""
+"""DINOv2 and CLIP: networks against second implementations, and what the scorer makes of them."""
 
 from __future__ import annotations
 
@@ -15,10 +15,8 @@ from torch.nn import functional
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Observation
-from mudg.core import feature_distances
 from mudg.editing.settings import ScoreConfig
 from mudg.networks import clip_image, dinov2
-from mudg.scoring import tables as score_tables
 from mudg.scoring.sets import subject_consistency
 from mudg.steps.render import Score
 
@@ -155,18 +153,7 @@ def test_prepared_images_have_the_statistics_of_the_networks() -> None:
 # ---- distances -----------------------------------------------------------------------------------
 
 
-def test_polynomial_distance_and_consistency_by_hand() -> None:
-    a, b = np.array([[2.0, 0.0]]), np.array([[0.0, 2.0]])
-    # Kernels: (4 / 2)^2 = 4 with itself, 0 across.
-    assert feature_distances.polynomial_distance(a, b) == pytest.approx(100 * 8)
-    rng = np.random.default_rng(0)
-    x, y = rng.standard_normal((7, 5)), rng.standard_normal((9, 5)) + 0.3
-    found = feature_distances.polynomial_distance(x, y)
-    assert found == pytest.approx(feature_distances.polynomial_distance(y, x))
-    assert feature_distances.polynomial_distance(x, x[::-1]) == pytest.approx(0, abs=1e-12)
-    assert feature_distances.polynomial_distance(2 * x, 2 * y) == pytest.approx(16 * found)
-    moments = x.T @ x / 7 - y.T @ y / 9  # a kernel of degree 2 without constant compares second moments
-    assert found == pytest.approx(100 * (moments**2).sum() / 25)
+def test_consistency_by_hand() -> None:
     rows = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
     # Neighbours at right angles: 0. With the first: 0 and max(0, -1).
     assert subject_consistency(rows) == 0
@@ -181,19 +168,14 @@ def darker(_index: int, seen: Observation) -> Observation:
     return dataclasses.replace(seen, rgb=seen.rgb * 0.5)
 
 
-def test_the_scorer_computes_what_weights_and_features_allow(tmp_path: Path) -> None:
+def test_the_scorer_computes_what_weights_allow(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene")
     methods = {"a": toy_views.write_views(scene, tmp_path / "a", "a", (2.0,))}
     methods["b"] = toy_views.write_views(scene, tmp_path / "b", "b", (2.0,), darker)
     store.write_safetensors(tmp_path / "dino.safetensors", toy_vit.dino_state())
     store.write_safetensors(tmp_path / "clip.safetensors", toy_vit.clip_state())
-    rng = np.random.default_rng(0)
-    clips = {"recorded/front": 0.0, "a/front_shift+2.0": 0.1, "truth/front_shift+2.0": 0.0}
-    for name, moved in clips.items():
-        rows = rng.standard_normal((6, 3)).astype(np.float32) + np.float32(moved)
-        store.write_safetensors(tmp_path / "video" / f"{name}.safetensors", {"features": rows})
     weights = {f"{name}_weights": str(tmp_path / f"{name}.safetensors") for name in ("dino", "clip")}
-    config = ScoreConfig(**weights, video_features=str(tmp_path / "video"), perceptual_views=0, error_pictures=False)
+    config = ScoreConfig(**weights, perceptual_views=0, error_pictures=False)
     out = Score(scene=scene, views=methods, out=tmp_path / "score", settings=config).run()
     document = store.read_json(out / "metrics.json")
     values = {r["method"]: r["values"] for r in document["results"]}
@@ -205,11 +187,7 @@ def test_the_scorer_computes_what_weights_and_features_allow(tmp_path: Path) -> 
     seen = torch.stack([clip_image.prepared(toy_views.colors(n), 42) for n in range(4)])
     units = functional.normalize(clip_image.ClipImageFeatures(toy_vit.clip_state())(seen), dim=1)
     assert values["a"]["clip_f"] == pytest.approx(float((units[1:] * units[:-1]).sum(1).mean()), abs=1e-5)
-    read = {name: store.read_safetensors(tmp_path / "video" / f"{name}.safetensors")["features"] for name in clips}
-    expected = feature_distances.frechet_distance(read["a/front_shift+2.0"], read["recorded/front"])
-    assert values["a"]["video_frechet"] == pytest.approx(expected, abs=1e-6)
-    assert values["b"]["video_frechet"] == values["b"]["video_mmd"] == score_tables.NO_FEATURES
-    for entry, metric in (("dinov2", "fd_dinov2"), ("clip", "cmmd"), ("video_features", "video_mmd")):
+    for entry, metric in (("dinov2", "fd_dinov2"), ("clip", "cmmd")):
         (floor,) = document[entry]["floors"]
         assert metric in floor and floor["trajectory"] == "front_shift+2.0"
     assert document["dinov2"]["weights_sha256"] == store.sha256_file(tmp_path / "dino.safetensors")
@@ -219,15 +197,3 @@ def test_the_scorer_computes_what_weights_and_features_allow(tmp_path: Path) -> 
     assert "Floor: the truth itself: FD-DINOv2" in text and "a network of 2 blocks of 128" in text
     # two networks, two methods; the recorded set is a's
     assert len(list((out / "features").glob("*.safetensors"))) == 4
-
-
-def test_programs_and_malformed_files_are_not_read_as_video_features(tmp_path: Path) -> None:
-    scene = toy_views.write_scene(tmp_path / "scene")
-    views = toy_views.write_views(scene, tmp_path / "a", "a", (2.0,))
-    file = tmp_path / "video" / "recorded" / "front.safetensors"
-    store.write_safetensors(file, {"features": np.zeros((3, 2, 2), np.float32)})
-    (tmp_path / "extractor.pt").write_bytes(b"PK")
-    for given, said in (("video", r"front.safetensors"), ("extractor.pt", "no such folder of features")):
-        config = ScoreConfig(video_features=str(tmp_path / given), perceptual_views=0)
-        with pytest.raises(InputError, match=said):
-            Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=config).run()

@@ -200,8 +200,6 @@ def test_nodes_edits_and_motion(fit: Path, tmp_path: Path) -> None:
     [
         ({}, "obj", "a.obj", "no export format 'obj'"),
         ({}, "ply", "a.spz", "does not fit its format"),
-        ({"animated": True}, "ply", "a.ply", "cannot hold motion"),
-        ({"animated": True, "time_s": 1.0}, "glb", "a.glb", "one moment or the motion"),
         ({"time_s": 1.0}, "alpasim", "a.usdz", "holds all moments"),
         ({"time_s": 1.0}, "colmap", "folder", "does not have this setting"),
         ({"nodes": ("car-7",)}, "ply", "a.ply", "no node 'car-7'"),

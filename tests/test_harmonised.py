@@ -24,8 +24,6 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Condition, FusedCloud, Observation, Photo, PointCloud, RenderPlanes, View
 from mudg.base.weather_settings import Conditions
-from mudg.benchmarks import run as bench
-from mudg.benchmarks.settings import BenchConfig
 from mudg.core.edit import Motion
 from mudg.core.pictures import to_bytes
 from mudg.core.weather import DriveFacts
@@ -470,25 +468,6 @@ def test_an_edited_run_with_repaired_images_is_fitted_on(run: Path, tmp_path: Pa
     alone = {"source": run / FITTED, "scene": run / "scene", "out": tmp_path / "alone"}
     with pytest.raises(UsageError, match="no images"):
         Edit(**alone, script=edits, settings=repaired).run()
-
-
-@pytest.mark.slow
-def test_the_benchmark_compares_ways_of_every_edit(tmp_path: Path) -> None:
-    """Every edit has its ways; what the model does stays inside the edit. (Which way is better, 60 steps do not
-    tell.)"""
-    config = BenchConfig(cities="development", count=1, pose_iterations=60, harmonize=True, device="cpu")
-    out = bench.run("edit", config, tmp_path / "out")
-    rows = {(row["edit"], row["way"]): row for row in store.read_json(out / "bench.json")["diffusion"]["rows"]}
-    ways, names = ("fit", "+ diffusion", "+ refit"), ("remove", "move 3 m ahead", "insert")
-    assert rows.keys() == {*((name, way) for name in names for way in ways), ("remove", "never there")}
-    for name in names:
-        plain, repaired = rows[name, "fit"], rows[name, "+ diffusion"]
-        assert repaired["inside"] != plain["inside"]
-        assert repaired["outside"] < plain["outside"] + 0.01
-    removed = [row for (edit, _), row in rows.items() if edit == "remove"]
-    assert all(np.isfinite(row[name]) for row in removed for name in ("inside", "uncovered", "perceptual"))
-    assert rows["remove", "never there"]["uncovered"] not in {rows["remove", way]["uncovered"] for way in ways}
-    assert "+ refit" in (out / "bench.md").read_text(encoding="utf-8")
 
 
 # -- published-type models -------------------------------------------------------------------------

@@ -95,10 +95,6 @@ def _fill(g: Given, v: int) -> Any:
     return partial(chain.FillViews, scene=g["scene"], fused=g["fused"], paths=_paths(g["scene"], v))
 
 
-def _exact(g: Given, v: int) -> Any:
-    return partial(chain.ExactViews, truth=g["views"], paths=_paths(g["scene"], 1)[: 3 - v])
-
-
 def _paths(scene: Path, v: int) -> tuple[Any, ...]:
     loaded = read_scene(scene)
     return trajectory.recorded(loaded, "front"), trajectory.shifted(loaded, "front", float(v))
@@ -117,7 +113,6 @@ STEPS: dict[str, tuple[tuple[str, ...], Callable[[Given, int], Any]]] = {
     "truth": (("city",), lambda g, v: partial(DrawTruth, scene=g["city"], trajectories=_paths(g["city"], v))),
     "film": (("views",), _film),
     "fill": (("scene", "fused"), _fill),
-    "exact": (("views",), _exact),
 }
 """Verb -> its inputs by name, and the step from these in variants 1 and 2, which differ in the settings."""
 VERBS: Final = {**{name: inputs for name, (inputs, _) in STEPS.items()}, "bench": ("model",)}

@@ -129,12 +129,12 @@ def test_help_all_works_for_every_verb(verb: str) -> None:
 @pytest.mark.parametrize(
     ("page", "shown", "others"),
     [
-        ("batch status", ("--watch-s",), ("--stages", "--preset", "--reason", "--shard")),
-        ("batch retry", ("--reason",), ("--stages", "--watch-s")),
-        ("batch run", ("--list", "--stages", "--engine", "--set"), ("--watch-s", "--reason")),
+        ("batch status", (), ("--stages", "--preset", "--reason", "--shard")),
+        ("batch retry", ("--reason",), ("--stages", "--shard")),
+        ("batch run", ("--list", "--stages", "--engine", "--set"), ("--reason",)),
         ("bench paper", ("--table", "--iterations"), ("--protocols", "--sampler", "--variant")),
         ("bench mdm", ("--steps", "--cities"), ("--table", "--protocols", "--score.width-px")),
-        ("bench real", ("--protocols", "--variant", "--ablation"), ("--table", "--videos", "--sampler")),
+        ("bench real", ("--protocols", "--variant"), ("--table", "--videos", "--sampler")),
         ("ingest kitti", ("--frames", "--resolution", "--boxes"), ("--city.width", "--format")),
         ("ingest city", ("--city.width", "--test-every"), ("--frames", "--boxes", "--format")),
         ("asset export", ("--scene", "--out"), ("--label", "--kind", "--axes")),

@@ -117,7 +117,7 @@ def test_a_still_video_does_not_flicker_and_missing_files_name_their_flags(log_s
     assert value(log_scores, "gray", HERE, "temporal_flickering") == 1.0
     assert 0.8 < value(log_scores, "right", HERE, "temporal_flickering") < 0.99
     text = score_tables.markdown(log_scores)
-    for flag in "detections lanes dino-weights clip-weights video-features lpips-vgg-weights".split():
+    for flag in "detections lanes dino-weights clip-weights lpips-vgg-weights".split():
         assert f"--{flag}" in text
 
 
@@ -162,19 +162,10 @@ def test_nta_iou_from_a_file_of_boxes(
     assert any("cut at the near plane" in rule for rule in document["rules"])
 
 
-def test_boxes_of_images_of_another_size_are_scaled(tmp_path: Path) -> None:
-    images = [{"id": 4, "file_name": "m/t/000001.jpg", "width": 960, "height": 320}]
-    boxes = [{"image_id": 4, "category_id": 5, "bbox": [100, 10, 20, 30], "score": 0.7}]
-    store.write_json(tmp_path / "boxes.json", {"images": images, "annotations": boxes})
-    ((name, (found,)),) = detections.read_detections(tmp_path / "boxes.json").items()
-    assert name == "m/t/000001"
-    assert found.box.tolist() == [50, 10, 60, 40]
-
-
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ({"boxes": []}, "malformed"),
+        ({"boxes": []}, "no list"),
         ([{"image_id": "a", "category_id": 2, "bbox": [1, 2, 3], "score": 1}], "record 0"),
         ([{"image_id": "a", "category_id": 2, "bbox": [1, 2, -3, 4], "score": 1}], "impossible"),
         ([{"image_id": "a", "category_id": 2, "bbox": [1, 2, 3, 4], "score": 7}], "impossible"),
@@ -242,7 +233,7 @@ def test_vehicles_and_lanes_of_a_city_have_ceilings(city_run: tuple[Path, dict])
     for metric, least in (("agent_iou", 0.5), ("lane_iou", 0.6)):
         beside = anchors(document, HERE, metric)
         assert value(document, "right", HERE, metric) == pytest.approx(beside["truth"], abs=0.02)
-        assert beside["truth"] > least and beside["recorded"] > least
+        assert beside["truth"] > least
         assert value(document, "gray", HERE, metric) < 0.05
     assert value(document, "right", HERE, "lane_correlation") > 0.99
     (row,) = (r for r in document["results"] if r["method"] == "right")

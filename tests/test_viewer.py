@@ -44,7 +44,7 @@ from mudg.scene.read import read_scene
 from mudg.viewer import page as viewer_page
 from mudg.viewer import view
 from mudg.viewer.live import GROUND, FrameSource, VideoRequest
-from mudg.viewer.page import BLOCK, blob_of, chunk_rows, coverage, level_of, opacity_of, pack_scene, smallest_three
+from mudg.viewer.page import BLOCK, blob_of, coverage, level_of, opacity_of, pack_scene, smallest_three
 from mudg.viewer.server import token_for
 from mudg.viewer.settings import PageConfig
 
@@ -251,22 +251,6 @@ def test_what_a_page_takes_is_said_before_it_is_written(toy: Toy) -> None:
     assert said.count("500 Gaussians of 900 (") == 1
     assert f"{kept.layout.visible - 500} left out for the budget" in said
     assert page.graphics_bytes() == 500 * (5 * 16 + 4)  # degree 3: five texels
-
-
-def test_a_page_stays_within_the_memory_that_it_may_take(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
-    for degree in range(4):
-        for size in (64, 65_536):
-            for limit in (5_000, 60_000, 1_234_567, 300_000_000):
-                most = viewer_page.most_within(limit, degree, size)
-                taken = [sum(viewer_page.scene_bytes(n, chunk_rows(n, size), degree)) for n in (most, most + 1)]
-                assert taken[0] <= limit < taken[1]
-    shown = view.Shown(read_scene(toy[0] / "scene"), (("fit", toy[2]), ("fit", toy[2])))
-    monkeypatch.setattr(view, "MEGABYTE", 1e5)
-    page = view.page_of(PageConfig(images=0, memory_mb=1), shown)
-    assert 9e4 < page.graphics_bytes() + page.heap_bytes() <= 1e5
-    kept = page.scenes[0][1]
-    assert f"{kept.layout.visible - kept.kept} left out for the budget" in view.needs_text(page, "page.html", "")
-    assert view.page_of(PageConfig(images=0, memory_mb=1, budget=100), shown).scenes[0][1].kept == 100
 
 
 def whole_page(page: viewer_page.ViewerPage) -> bytes:
@@ -545,7 +529,7 @@ def test_a_page_in_chunks_shows_what_one_chunk_shows(
     # one file whose chunks are the same holds the same picture to the bit
     def open_one_file() -> None:
         config = PageConfig(images=3)
-        page = view.page_of(config, view.find_shown(config, toy[1], toy[0] / "scene", None))
+        page = view.page_of(config, view.find_sources(config, toy[1], toy[0] / "scene", None).read())
         (web[0] / "one.html").write_bytes(whole_page(page))
         fresh.open(f"file://{web[0] / 'one.html'}")
 
@@ -666,7 +650,7 @@ def test_other_machines_need_a_token() -> None:
 
 def test_fits_of_different_logs_are_not_compared(toy: Toy, tmp_path: Path) -> None:
     save_model(replace(toy[2], facts={**toy[2].facts, "scene": "another"}), tmp_path / "fit")
-    refused("another", view.find_shown, PageConfig(), toy[1], toy[0] / "scene", tmp_path / "fit")
+    refused("another", view.find_sources(PageConfig(), toy[1], toy[0] / "scene", tmp_path / "fit").read)
 
 
 # videos of exact frames ---------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from mudg.base.layout import OBSERVATION_FILES, below
 from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import RunDir, is_temporary
 from mudg.base.types import Trajectory
-from mudg.benchmarks.rows import EXACT, FILL, FULL, LONGER, MIXED, REPAIRED, Row, usual_fit
+from mudg.benchmarks.rows import FILL, FULL, LONGER, MIXED, REPAIRED, Row, usual_fit
 from mudg.benchmarks.settings import BenchConfig
 from mudg.core.pictures import resize_area
 from mudg.core.raster.rasterize import drawing_device
@@ -254,27 +254,6 @@ class FillViews(Output):
                     for index, view in enumerate(path.views):
                         writer.skip(view) if index < writer.done else writer.add(fill(view))
                         bar.advance()
-        return self.key_settings()
-
-
-class ExactViews(Output):
-    """The truth of the shifted trajectories as if the diffusion model had painted it; nothing of the recorded path."""
-
-    verb_name = EXACT
-    version, files = 2, below("*", OBSERVATION_FILES)
-    truth: Path
-    paths: tuple[Trajectory, ...]
-
-    def key_settings(self) -> dict[str, Any]:
-        return {"trajectories": [path.name for path in self.paths if path.origin == "shifted"]}
-
-    def make(self, work: RunDir) -> dict[str, Any]:
-        for name in self.key_settings()["trajectories"]:
-            views = read_observations(self.truth / name)
-            with ObservationWriter(work.path / name, name, EXACT) as writer:
-                for index in range(len(views)):
-                    exact = replace(views[index], kind="virtual", source=EXACT)
-                    writer.skip(exact.view) if index < writer.done else writer.add(exact)
         return self.key_settings()
 
 

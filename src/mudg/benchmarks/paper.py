@@ -264,8 +264,8 @@ def pooled(logs: Sequence[Facts], out: Path) -> dict[str, dict[str, Values]]:
                     cells["fvd"] = {"mean": video_entry(made, reference)["values"]["fvd"], "standard_error": None}
                 else:
                     both = distances(made, reference)
-                    cells["fid"] = {"mean": round(both.fid, 6), "standard_error": None}
-                    cells["kid"] = {"mean": round(both.kid, 6), "standard_error": both.kid_standard_error}
+                    cells["fid"] = {"mean": round(both["fid"], 6), "standard_error": None}
+                    cells["kid"] = {"mean": round(both["kid"], 6), "standard_error": both["kid_standard_error"]}
     return result
 
 

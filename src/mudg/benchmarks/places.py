@@ -22,8 +22,8 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.layout import SCENE_FILES
 from mudg.base.run_folder import RunDir, refuse_overlap
 from mudg.base.types import Frame, Scene, Trajectory
-from mudg.benchmarks.chain import Chain, ExactViews, Film, run_step
-from mudg.benchmarks.rows import EXACT, FILL, RECORDED, SCENE_LISTS, PaperTable, Row, generator_of
+from mudg.benchmarks.chain import Chain, Film, run_step
+from mudg.benchmarks.rows import FILL, RECORDED, SCENE_LISTS, PaperTable, Row, generator_of
 from mudg.benchmarks.settings import BenchConfig
 from mudg.city import logs as city_logs
 from mudg.city.logs import STANDARD, LogRules
@@ -370,7 +370,7 @@ def _hidden_blocks(scene: Scene, length: int) -> HeldOut:
 TRUTH: Final = "truth"
 ALL_VIEWS: Final = 1_000_000
 PERCEPTUAL_VIEWS: Final = 12
-PER_LOG: Final = ("detections", "lanes", "video_features")
+PER_LOG: Final = ("detections", "lanes")
 """Settings of a score that name what was made of the views of one log."""
 
 
@@ -455,9 +455,7 @@ class Views:
                 folders.append(self.chain.generated(on_path, folder))
             return tuple(folders)
         virtual: tuple[Path, ...] = ()
-        if row.name == EXACT:
-            virtual = (self.chain.run(ExactViews(truth=self.truth, paths=self.paths, out=self.out / EXACT)),)
-        elif row.learns_virtual:
+        if row.learns_virtual:
             virtual = (self.chain.generated(self.off_path, self.out / self.virtual),)
         return (self.chain.rendered(row, virtual, self.drawn),)
 
@@ -493,7 +491,7 @@ def score_settings(config: BenchConfig, table: PaperTable) -> ScoreConfig:
 
 
 def of_log(config: ScoreConfig, log: str) -> ScoreConfig:
-    """How the rows of one log are scored: where a folder of detections, lanes or features has an entry of the log's
+    """How the rows of one log are scored: where a folder of detections or lanes has an entry of the log's
     name (or such a ``.json``), that one is taken."""
     own: dict[str, Any] = {}
     for name in PER_LOG:

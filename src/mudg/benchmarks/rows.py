@@ -4,7 +4,7 @@ which methods, with what settings of their fits."""
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -26,6 +26,7 @@ from mudg.scoring import score
 from mudg.scoring.tables import title_of
 from mudg.steps.pipeline import WITHOUT_DIFFUSION, refuse_missing
 from mudg.steps.settings import PresetName
+from mudg.steps.step import flag_name
 
 FILE: Final = Path(__file__).with_name("papers.yaml")
 RECORDED: Final = "0"
@@ -207,19 +208,9 @@ LONGER_TITLE: Final = title_of(BASE) + ", as many iterations"
 MIXED: Final = "mudg_f"
 """Renders of ``mudg_s``, each mixed with what the diffusion model makes of it (``mudg render --repair``)."""
 REPAIRED: Final = "difix"
-EXACT: Final = "exact"
-_NO_DEPTH: Final = {"depth_weight": 0.0, "lidar_weight": 0.0}
-_NO_CLASSES: Final = {"semantic_weight": 0.0}
-ABLATION: Final[dict[str, tuple[str, Mapping[str, float]]]] = {
-    "only_I": ("virtual colour", {**_NO_DEPTH, **_NO_CLASSES}),
-    "only_I_D": ("virtual colour and depth", _NO_CLASSES),
-    "only_I_S": ("virtual colour and classes", _NO_DEPTH),
-    EXACT: ("the truth in place of generated views", {}),
-}
-"""Rows beside the fit without virtual views and that with all terms, as in table 3 of the paper, and the most that
-virtual views can bring at this number of steps: row -> (what is learned from, settings ``virtual`` of the fit)."""
 PLACES: Final = ("cameras", "shifts_m", "paths", "condition", "processes")
 """Settings of generated views that are the benchmark's matter, not the user's."""
+_METHODS: Final = (FILL, "gs3d", BASE, LONGER, *PUBLISHED, DIFFUSION, FULL)
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
 
 
@@ -299,11 +290,6 @@ def changed_settings(config: BenchConfig, usual: BenchConfig) -> list[str]:
     return [line.partition(":")[0] for line in lines]
 
 
-def flag_of(name: str) -> str:
-    """The flag of a setting."""
-    return f"--{name.replace('_', '-')}"
-
-
 def refuse_unfit(
     config: BenchConfig, preset: PresetName, rows: Sequence[Row], generators: Sequence[SynthesizeConfig]
 ) -> None:
@@ -329,7 +315,7 @@ def refuse_unfit(
         for reason, unused in idle.items():
             if any(name == one or name.startswith(f"{one}.") for one in unused):
                 what = "this setting would change nothing"
-                raise UsageError(what, where=flag_of(name), got=reason, remedy="leave it out")
+                raise UsageError(what, where=flag_name(name), got=reason, remedy="leave it out")
     if generators or virtual:
         refuse_missing(generator_of(config), virtual[0] if virtual else FitConfig(), "--model")
     for generator in dict.fromkeys((*generators, *((generator_of(config),) if virtual else ()))):
@@ -340,26 +326,28 @@ def refuse_unfit(
 
 
 def shift_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row, ...]:
-    """The methods, ablation rows and variants of ``mudg bench shift``, in the order of the tables. UsageError: an
-    unknown method, one that does not know a setting beyond the preset, or a malformed or repeated variant."""
-    known = (FILL, "gs3d", BASE, LONGER, *PUBLISHED, DIFFUSION, FULL, MIXED)
-    wanted, usual = {*config.methods, *((BASE, FULL) if config.ablation else ())}, usual_fit(config)
-    _refuse_unknown(wanted, known)
-    rows = [_method_row(name, usual, preset) for name in known if name in wanted]
-    for name, (description, weights) in ABLATION.items() if config.ablation else ():
-        ablated = configuration.load(FitConfig, usual, overrides={"virtual": weights})
-        rows.append(Row(name, f"with {description}", FULL, ablated))
-    return _without_twins([*rows, *(variant_of(text, usual) for text in config.variant)])
+    """The methods and variants of ``mudg bench shift``, in the order of the tables. UsageError: an unknown method, one
+    that does not know a setting beyond the preset, or a malformed or repeated variant."""
+    return _without_twins([*_method_rows(config, preset, (*_METHODS, MIXED)), *_variants(config)])
 
 
 def real_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row, ...]:
     """The methods and variants of ``mudg bench real``. Raises as `shift_rows`."""
-    known, usual = (FILL, "gs3d", BASE, LONGER, *PUBLISHED, DIFFUSION, FULL), usual_fit(config)
-    wanted = {*config.methods, *((BASE, LONGER) if config.ablation else ())}
-    _refuse_unknown(wanted, known)
-    rows = [_method_row(name, usual, preset) for name in known if name in wanted]
-    variants = (variant_of(text, usual) for text in config.variant)
-    return _without_twins([*rows, *(replace(row, title=title_of(row.name)) for row in variants)])
+    variants = (replace(row, title=title_of(row.name)) for row in _variants(config))
+    return _without_twins([*_method_rows(config, preset, _METHODS), *variants])
+
+
+def _method_rows(config: BenchConfig, preset: PresetName, known: Sequence[str]) -> list[Row]:
+    """Rows of the methods that are asked for, in the order of ``known``."""
+    _refuse_unknown(config.methods, known)
+    usual, rows = usual_fit(config), list[Row]()
+    for name in (name for name in known if name in config.methods):
+        if name in (FILL, DIFFUSION):
+            rows.append(Row(name, title_of(name), "" if name == FILL else name))
+            continue
+        method, title = {LONGER: BASE, MIXED: FULL}.get(name, name), LONGER_TITLE if name == LONGER else title_of(name)
+        rows.append(Row(name, title, method, method_fit(usual, method, preset)))
+    return rows
 
 
 def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "default") -> tuple[Row, ...]:
@@ -393,28 +381,23 @@ def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "def
     return tuple(complete)
 
 
-def _method_row(name: str, usual: FitConfig, preset: PresetName) -> Row:
-    if name in (FILL, DIFFUSION):
-        return Row(name, title_of(name), "" if name == FILL else name)
-    method = {LONGER: BASE, MIXED: FULL}.get(name, name)
-    return Row(name, LONGER_TITLE if name == LONGER else title_of(name), method, method_fit(usual, method, preset))
-
-
-def variant_of(text: str, usual: FitConfig) -> Row:
-    """A row of ``mudg_s`` from ``NAME=FIELD:VALUE,FIELD:VALUE``; values as in YAML, a dot between a group and its
-    field. UsageError if malformed or no field of ``FitConfig``."""
-    name, separator, rest = text.partition("=")
-    fields: dict[str, Any] = {}
-    for part in rest.split(","):
-        setting, colon, value = part.partition(":")
-        if not (separator and colon and setting and _NAME.fullmatch(name)):
-            raise UsageError("malformed variant", where="--variant", expected="NAME=FIELD:VALUE,FIELD:VALUE", got=text)
-        try:
-            fields[setting.strip()] = parse_yaml(value, setting)
-        except InputError as error:
-            raise UsageError("malformed value", where=f"--variant {name}: {setting}", got=value) from error
-    changed = configuration.load(FitConfig, usual, overrides=configuration.nested(fields))
-    return Row(name, f"{name}: {rest}", FULL, changed, varied=True)
+def _variants(config: BenchConfig) -> Iterator[Row]:
+    """Rows of ``mudg_s`` from ``NAME=FIELD:VALUE,FIELD:VALUE``; values as in YAML, a dot between a group and its field.
+    UsageError if malformed or no field of ``FitConfig``."""
+    for text in config.variant:
+        name, separator, rest = text.partition("=")
+        fields: dict[str, Any] = {}
+        for part in rest.split(","):
+            setting, colon, value = part.partition(":")
+            if not (separator and colon and setting and _NAME.fullmatch(name)):
+                expected = "NAME=FIELD:VALUE,FIELD:VALUE"
+                raise UsageError("malformed variant", where="--variant", expected=expected, got=text)
+            try:
+                fields[setting.strip()] = parse_yaml(value, setting)
+            except InputError as error:
+                raise UsageError("malformed value", where=f"--variant {name}: {setting}", got=value) from error
+        changed = configuration.load(FitConfig, usual_fit(config), overrides=configuration.nested(fields))
+        yield Row(name, f"{name}: {rest}", FULL, changed, varied=True)
 
 
 def _refuse_unknown(names: Iterable[str], known: Sequence[str], some: bool = True) -> None:

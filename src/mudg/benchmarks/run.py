@@ -1,7 +1,7 @@
 """``mudg bench``: measurements that print a table, each from one command.
 
-``mdm``, ``poses`` and ``edit`` are one folder, with OUT/clips/ (or cities, fits, ...), OUT/bench.json, OUT/bench.md and
-pictures. ``shift``, ``real``, ``paper`` and ``loop`` compare rows (``benchmarks/rows.py``) on logs
+``mdm`` and ``edit`` are one folder, with OUT/clips/ (or cities, fits, ...), OUT/bench.json, OUT/bench.md and pictures.
+``shift``, ``real``, ``paper`` and ``loop`` compare rows (``benchmarks/rows.py``) on logs
 (``benchmarks/places.py``), worked on in one loop (``benchmarks/chain.py``), in folders of their steps."""
 
 from __future__ import annotations
@@ -17,38 +17,33 @@ from mudg.base.config import result_settings
 from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
-from mudg.benchmarks import cities, edit_runs, loop, paper, real, shift
-from mudg.benchmarks.rows import changed_settings, flag_of, generator_of
+from mudg.benchmarks import cities, loop, paper, real, shift
+from mudg.benchmarks.rows import changed_settings, generator_of
 from mudg.benchmarks.settings import BenchConfig, bench_preset
 from mudg.diffusion import model_files
 from mudg.diffusion.published import is_published
 from mudg.gaussians.settings import FitConfig
 from mudg.steps.pipeline import refuse_missing
 from mudg.steps.settings import PresetName
+from mudg.steps.step import flag_name
 
 _FILES = ("bench.json", "bench.md", "*.png", "clips/*", "cities/", "edited/", "fits/", "rows/*.json")
 EDIT, SHIFT, REAL, PAPER, LOOP = "edit", "shift", "real", "paper", "loop"
 CHAINS = (SHIFT, REAL, PAPER, LOOP)
 """Benchmarks of complete methods: they take the chain of `mudg run`, with its presets."""
-RUNS = "edit RUN"
-"""The benchmark edit of finished runs."""
 USED: Final[Mapping[str, tuple[str, ...]]] = {
     setting: tuple(users)
     for users, names in (
         (("mdm",), "steps eta"),
-        (("mdm", "poses", EDIT), "cities count"),
-        (("mdm", EDIT, *CHAINS), "model"),
-        (("mdm", *CHAINS), "precision"),
-        ((EDIT, RUNS), "harmonize"),
-        (("poses", EDIT), "pose_iterations"),
-        (("mdm", "poses", EDIT, RUNS), "threads"),
-        (("mdm", "poses", EDIT, *CHAINS), "seed"),
-        (("mdm", "poses", EDIT, RUNS, *CHAINS), "device"),
+        (("mdm", EDIT), "cities count threads"),
+        (("mdm", *CHAINS), "model precision"),
+        ((EDIT,), "edit_iterations"),
+        (("mdm", EDIT, *CHAINS), "seed device"),
         (CHAINS, "methods iterations guided_share processes fuse synthesize fit"),
         ((SHIFT, LOOP), "list"),
         ((SHIFT, PAPER, LOOP), "logs"),
         ((SHIFT, PAPER), "videos"),
-        ((SHIFT, REAL), "ablation variant"),
+        ((SHIFT, REAL), "variant"),
         ((REAL,), "protocols shown"),
         ((REAL, PAPER), "resolution frames"),
         ((PAPER,), "table score"),
@@ -76,23 +71,21 @@ def run(
     overwrite: bool = False,
 ) -> Path:
     """Run a benchmark; returns the folder with `bench.json` and `bench.md`. ``sources``: logs, for real; logs or a list
-    of cities, for paper; finished runs, for edit. ``preset``: what the configuration started from, for shift, real and
+    of cities, for paper. ``preset``: what the configuration started from, for shift, real and
     paper. UsageError: no such benchmark, a setting that it does not use, or logs for one that makes its own."""
     if name not in (*BENCHES, *CHAINS):
         raise UsageError("no such benchmark", expected=", ".join((*BENCHES, *CHAINS)), got=name)
-    refuse_unused(RUNS if name == EDIT and sources else name, config, preset)
+    refuse_unused(name, config, preset)
     if name == PAPER:
         return paper.run(config, sources, out, preset=preset, overwrite=overwrite)
     if name == REAL:
         return real.run(config, sources, out, preset=preset, overwrite=overwrite)
-    if name == EDIT and sources:
-        return edit_runs.run(config, sources, out, overwrite=overwrite)
     if sources:
         got = ", ".join(map(str, sources))
         raise UsageError("this benchmark makes its own logs", where=f"mudg bench {name}", got=got)
     if name in (SHIFT, LOOP):
         return (shift if name == SHIFT else loop).run(config, out, preset=preset, overwrite=overwrite)
-    inputs = {"model": model_files.digest(config.model)} if name == "mdm" else {}  # poses reads no diffusion model
+    inputs = {"model": model_files.digest(config.model)} if name == "mdm" else {}  # edit reads no diffusion model
     refuse_overlap(out, {"model": model_files.folder_of(config.model) if inputs else ""})
     choose_device(config.device, "benchmark", NETWORK_KINDS)  # refused before anything is written
     directory = RunDir.open(out, VerbOutput(f"bench {name}", 1, _FILES), result_settings(config), inputs, overwrite)
@@ -107,8 +100,8 @@ def run(
 
 
 def refuse_unused(name: str, config: BenchConfig, preset: PresetName) -> None:
-    """UsageError for a preset, or a setting that differs from it, of which a benchmark (`RUNS`: edits of finished runs)
-    makes no use, and where weights are missing."""
+    """UsageError for a preset, or a setting that differs from it, of which a benchmark makes no use, and where weights
+    are missing."""
     if name not in CHAINS and preset != "default":
         what = "only benchmarks of complete methods have presets"
         raise UsageError(what, where="--preset", expected=", ".join(CHAINS), got=name, remedy="leave it out")
@@ -120,13 +113,10 @@ def refuse_unused(name: str, config: BenchConfig, preset: PresetName) -> None:
                 f"mudg bench {name} does not use this setting",
                 " or ".join(map("mudg bench {}".format, users)),
             )
-            remedy = f"give {flag_of(group)}" if elsewhere else "leave it out"
-            raise UsageError(what, where=flag_of(setting), expected=expected, remedy=remedy)
+            remedy = f"give {flag_name(group)}" if elsewhere else "leave it out"
+            raise UsageError(what, where=flag_name(setting), expected=expected, remedy=remedy)
         if setting in OWN and (setting, name) != ("synthesize.shifts_m", REAL):
-            raise UsageError("the benchmark chooses this itself", where=flag_of(setting), remedy=OWN[setting])
-    if name == EDIT and config.model != BenchConfig().model and not config.harmonize:
-        what = "without --harmonize no diffusion model is used"
-        raise UsageError(what, where="--model", got=config.model, remedy="leave it out")
+            raise UsageError("the benchmark chooses this itself", where=flag_name(setting), remedy=OWN[setting])
     if name in CHAINS:
         refuse_missing(generator_of(config), FitConfig(), "--model")
     if name == "mdm" and is_published(config.model):
@@ -137,7 +127,6 @@ def refuse_unused(name: str, config: BenchConfig, preset: PresetName) -> None:
 
 BENCHES: dict[str, Callable[[BenchConfig, Path], tuple[dict[str, Any], str]]] = {
     "mdm": cities.measure_mdm,
-    "poses": cities.measure_poses,
     EDIT: cities.measure_edits,
 }
 """Every measurement that is one folder, by name."""

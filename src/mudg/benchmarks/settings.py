@@ -24,10 +24,10 @@ class BenchOwn:
     """Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn
     or convert."""
     cities: Literal["reported", "development"] = "reported"
-    """mdm, poses, edit: list of cities. Choose settings on development; report results on reported, on which nothing
+    """mdm, edit: list of cities. Choose settings on development; report results on reported, on which nothing
     was chosen."""
     count: int = setting(default=6, ge=1, le=6)
-    """mdm, poses, edit: number of cities taken from the list, 1 to 6. mdm: each gives four clips: shifted by 2, 3 and 4
+    """mdm, edit: number of cities taken from the list, 1 to 6. mdm: each gives four clips: shifted by 2, 3 and 4
     m, and on the recorded path."""
     steps: tuple[int, ...] = (1, 2, 8)
     """mdm: numbers of denoising steps to compare; each is measured on its own."""
@@ -37,10 +37,8 @@ class BenchOwn:
     precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
     """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32
     elsewhere. float16: published-type models on CUDA devices (shift, real, paper)."""
-    harmonize: bool = False
-    """edit: add rows with the diffusion model: edited frames that it repaired, and fits that go on with them."""
     threads: int = setting(default=1, ge=1)
-    """mdm, poses, edit: number of torch threads."""
+    """mdm, edit: number of torch threads."""
     seed: int = 0
     """Seed of all random numbers; the same seed gives the same result."""
     list: Literal["development", "reported"] = "development"
@@ -58,9 +56,6 @@ class BenchOwn:
     """shift, real, loop, paper: optimisation steps of every fit without virtual views."""
     guided_share: float = setting(default=1.5, gt=0)
     """shift, real, loop, paper: steps of fits under virtual views, as a multiple of the others'."""
-    ablation: bool = False
-    """shift: add rows for mudg_s with only some virtual loss terms (colour; colour and depth; colour and classes), and
-    with exact views instead of generated ones. real: add street_gaussians-longer."""
     variant: tuple[str, ...] = ()
     """shift, real: add rows for mudg_s with other settings of fit, each as NAME=FIELD:VALUE,FIELD:VALUE, where FIELD is
     a setting such as virtual.color_weight. Both of its fits have them."""
@@ -82,16 +77,16 @@ class BenchOwn:
     frames: str = ""
     """real, paper: frames of logs that are imported, FIRST:END without END itself, as for ingest (empty = all; paper:
     as the table says). paper with a list of cities: 0:END (empty = 0:24)."""
-    pose_iterations: int = setting(default=300, ge=1)
-    """poses, edit: optimisation steps of every fit."""
+    edit_iterations: int = setting(default=300, ge=1)
+    """edit: optimisation steps of every fit."""
     device: DeviceName = "auto"
     """Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N."""
 
 
 @settings
 class BenchConfig(BenchOwn):
-    """Measure the diffusion model, the correction of box tracks, or complete methods off the recorded path, all on
-    generated cities against exact ground truth; complete methods on real logs; or fill a table of a paper."""
+    """Measure the diffusion model, edits, or complete methods off the recorded path, all on generated cities against
+    exact ground truth; complete methods on real logs; or fill a table of a paper."""
 
     fuse: FuseConfig = setting(default_factory=FuseConfig)
     """shift, real, paper: how the clouds of every log are made."""

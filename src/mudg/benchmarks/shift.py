@@ -25,7 +25,6 @@ from mudg.benchmarks.places import Views, listed_cities, score_settings
 from mudg.benchmarks.rows import (
     BASE,
     DIFFUSION,
-    EXACT,
     FILL,
     FULL,
     RECORDED,
@@ -70,14 +69,6 @@ COMPARISONS: Final = (
 )
 """A method, that against which it is held, a place, and metrics."""
 VARIANT: Final = "psnr perceptual abs_rel miou"
-ABLATION_ROWS: Final = {
-    BASE: "none",
-    "only_I": "+ I",
-    "only_I_D": "+ I + D",
-    "only_I_S": "+ I + S",
-    FULL: "+ I + D + S",
-    EXACT: "exact views",
-}
 SHOWN: Final = (FILL, "gs3d", BASE, DIFFUSION, FULL)
 """Methods in the videos."""
 _PAGES: Final = ("bench.json", "bench.md", "page.html")
@@ -134,7 +125,6 @@ def run(
         "size_px": [rules.width, rules.height],
         "cameras": list(rules.cameras),
         "held_out_every": table.held_out_every,
-        "ablation": config.ablation,
         **chain_settings(config, preset),
     }
     fits = [None if row.fit is None else configuration.result_settings(row.fit) for row in rows]
@@ -259,12 +249,6 @@ def markdown(doc: Facts) -> str:
         rows = [[name, *_cells(doc["pooled"][name][place])] for name in names]
         lines += [f"## {_place_title(doc, place)}", "", *markdown_table(["method", *headings], rows), ""]
     lines += ["## Comparisons", "", *_comparison_table(doc["comparisons"]), ""]
-    if "only_I" in names:
-        metrics = ("psnr", "ssim", "perceptual", "abs_rel", "delta1", "miou")
-        heads = ["virtual terms", *(COLUMNS[metric][0] for metric in metrics)]
-        shown = {title: doc["pooled"][name][SHIFTED] for name, title in ABLATION_ROWS.items()}
-        rows = [[title, *_cells(values, metrics, with_error=True)] for title, values in shown.items()]
-        lines += ["## Which virtual term does what", "", *markdown_table(heads, rows), ""]
     for variant in doc["variants"]:
         lines += [f"## {variant['name']} against mudg_s", "", *_comparison_table(variant["against_mudg_s"]), ""]
     logs = doc["logs"]
@@ -319,12 +303,12 @@ def _place_title(doc: Facts, place: str) -> str:
     return f"{place} m to either side"
 
 
-def _cells(values: Facts, metrics: Sequence[str] = tuple(COLUMNS), with_error: bool = False) -> list[str]:
+def _cells(values: Facts, with_error: bool = False) -> list[str]:
     """Values by metric as text, pooled (with the standard error where that is wanted and known) or of one log; or the
     reason for none."""
     cells = []
-    for metric in metrics:
-        value, digits = values[metric], COLUMNS[metric][1]
+    for metric, (_, digits) in COLUMNS.items():
+        value = values[metric]
         if isinstance(value, Mapping):
             error = value["standard_error"]
             more = f" +- {error:.{digits}f}" if with_error and error is not None else ""

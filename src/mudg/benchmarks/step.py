@@ -16,22 +16,20 @@ if TYPE_CHECKING:
 
 
 class Bench(Output):
-    """Run a benchmark: mdm, poses, edit, shift or loop against exact truth, real on real logs, paper for tables of
-    papers."""
+    """Run a benchmark: mdm, edit, shift or loop against exact truth, real on real logs, paper for tables of papers."""
 
     examples = (
-        *("mudg bench mdm --out runs/bench", "mudg bench poses --out runs/poses"),
-        *("mudg bench edit --out runs/edits", "mudg bench edit runs/a runs/b --out runs/edited"),
-        *("mudg bench shift --list development --logs 1 --variant strong=virtual.probability:0.4 --out runs/shift",),
-        *("mudg bench loop --list reported --out runs/loop",),
-        *("mudg bench real logs/pandaset_002 --frames 32:56 --resolution 960 --protocols gap camera --out runs/real",),
-        *("mudg bench paper city:reported --table mudg1 --out runs/mudg1",),
-        *("mudg bench paper logs/* --table mudg2 --preset paper --model models/mudg_1024 --out runs/mudg2",),
+        "mudg bench mdm --out runs/bench",
+        "mudg bench edit --out runs/edits",
+        "mudg bench shift --list development --logs 1 --variant strong=virtual.probability:0.4 --out runs/shift",
+        "mudg bench loop --list reported --out runs/loop",
+        "mudg bench real logs/pandaset_002 --frames 32:56 --resolution 960 --protocols gap camera --out runs/real",
+        "mudg bench paper city:reported --table mudg1 --out runs/mudg1",
+        "mudg bench paper logs/* --table mudg2 --preset paper --model models/mudg_1024 --out runs/mudg2",
     )
     short = ("model", "seed", "device")
     parts = {
         "mdm": "Measure the diffusion model against exact truth.",
-        "poses": "Measure the correction of box tracks.",
         "edit": "Measure edits of fitted scenes.",
         "shift": "Measure complete methods off the recorded path, against exact truth.",
         "real": "Measure complete methods on real logs.",
@@ -39,13 +37,11 @@ class Bench(Output):
         "paper": "Fill a table of a paper.",
     }
     name: Annotated[str, Flag("BENCHMARK", "first")]
-    """Benchmark to run: mdm (diffusion model), poses (correction of box tracks), edit (edits of fitted scenes), shift
-    (complete methods off the recorded path), loop (drives in fitted scenes), real (complete methods on real logs) or
-    paper (a table of a paper)."""
+    """Benchmark to run: mdm (diffusion model), edit (edits of fitted scenes), shift (complete methods off the recorded
+    path), loop (drives in fitted scenes), real (complete methods on real logs) or paper (a table of a paper)."""
     sources: Annotated[tuple[Path, ...], Flag("[LOG ...]", "rest")] = ()
     """real, paper: folders of dataset logs, or scenes made by ingest. paper also takes city:reported or
-    city:development, a list of generated cities. edit: folders of finished runs, whose drives are edited in place of
-    generated cities."""
+    city:development, a list of generated cities."""
     preset: PresetName = "default"
     """shift, real, loop, paper: settings of clouds, generated views and fits to start from, as for mudg run
     (docs/presets.md). paper: the published set-up, with a published-type model."""

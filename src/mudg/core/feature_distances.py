@@ -27,8 +27,6 @@ Features = NDArray[np.float64]
 KID_DEGREE: Final = 3
 CMMD_SIGMA: Final = 10.0
 CMMD_FACTOR: Final = 1000.0
-JEDI_DEGREE: Final = 2
-JEDI_FACTOR: Final = 100.0
 
 
 def frechet_distance(generated: ArrayLike, real: ArrayLike) -> float:
@@ -131,13 +129,6 @@ def cmmd_distance(generated: ArrayLike, real: ArrayLike) -> float:
         return np.exp(-np.maximum(squared, 0.0) / (2.0 * CMMD_SIGMA**2))
 
     return CMMD_FACTOR * _biased(kernel, units[0], units[1])
-
-
-def polynomial_distance(generated: ArrayLike, real: ArrayLike) -> float:
-    """Squared maximum mean discrepancy with the kernel ``(x.y / d)^2``, times 100, as JEDi has it on features of
-    videos. Biased: means over full kernel matrices, with their diagonals. 0 for sets with equal second moments."""
-    a, b = _pair(generated, real, 1)
-    return JEDI_FACTOR * _biased(lambda x, y: (x @ y.T / x.shape[1]) ** JEDI_DEGREE, a, b)
 
 
 def _biased(kernel: Callable[[Features, Features], Features], a: Features, b: Features) -> float:

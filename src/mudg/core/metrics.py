@@ -604,8 +604,6 @@ METRICS: Final[dict[str, MetricRow]] = {
     "clip_v": MetricRow("CLIP-V", "", ("rgb", "CLIP weights"), "higher", None),
     "subject_consistency": MetricRow("consistency (DINOv2)", "", ("rgb", "DINOv2 weights"), "higher", None),
     "fvd": MetricRow("FVD", "", ("rgb", "I3D weights"), "lower", None),
-    "video_frechet": MetricRow("video Frechet", "", ("rgb", "video features"), "lower", None),
-    "video_mmd": MetricRow("video MMD", "", ("rgb", "video features"), "lower", None),
     "abs_rel": MetricRow("AbsRel", "", ("depth",), "lower", lambda: depth_error("abs_rel")),
     "rmse_m": MetricRow("RMSE", "m", ("depth",), "lower", lambda: depth_error("rmse_m")),
     "delta1": MetricRow("delta < 1.25", "", ("depth",), "higher", lambda: depth_error("delta1")),

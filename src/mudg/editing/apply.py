@@ -144,13 +144,8 @@ def with_background(model: SceneModel, other: SceneModel, world_from_other: NDAr
     """A copy whose background and sky are those of another scene; its objects stay.
 
     Classes are taken over by name, colours of degree 1 and more dropped: they hold the other scene's directions.
-
-    Args:
-        world_from_other: rigid 4x4, a turn about z and a translation.
-
-    Raises:
-        UsageError: a background that changes with time.
-    """
+    ``world_from_other``: rigid 4x4, a turn about z and a translation. UsageError: a background that changes with
+    time."""
     for scene in (model, other):
         if scene.nodes[0].kind != "static":
             what = "a background that changes with time cannot be exchanged"

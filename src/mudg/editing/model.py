@@ -312,11 +312,8 @@ def light_gain(here: Array | None, there: Array | None) -> Array:
     The surfaces of two streets are taken to reflect alike on the whole (the assumption of a grey world), so that the
     ratio of their mean light is that of illumination and exposure, but for what the streets are made of: hence the
     exponent, which is the slope of the true factor over the ratio, both as logarithms, for vehicles in 17 generated
-    cities. Kept within 1/4 to 4; 1 where either is not known.
-
-    Args:
-        here, there: mean light of surfaces f64[3], linear.
-    """
+    cities. Kept within 1/4 to 4; 1 where either is not known. ``here``, ``there``: mean light of surfaces f64[3],
+    linear."""
     if here is None or there is None:
         return np.ones(3)
     return ((there / np.maximum(here, 1e-4)) ** LIGHT_EXPONENT).clip(0.25, 4.0)
@@ -336,13 +333,10 @@ def with_shadow(model: SceneModel, name: str, strength: float, sun: Array | None
     Under an overcast sky the ground below a box loses the share of light that the box covers. Black flat Gaussians at
     the bottom of the box, in its frame and so with it at all times, take away ``strength`` of the light below it, less
     towards the edge, which is as wide as `SHADOW_BLUR` of the box's height. Where the sun shines, so does the ground
-    from which the box hides it. They carry no class and hardly any depth of their own.
-
-    Args:
-        strength: share of the (linear) light that is missing below the middle of the box.
-        sun: direction f64[3] of the world towards the sun, above the ground; None = none. The shadow turns with the
-            object: it is right for the heading in the middle of its path.
-    """
+    from which the box hides it. They carry no class and hardly any depth of their own. ``strength``: share of the
+    (linear) light that is missing below the middle of the box. ``sun``: direction f64[3] of the world towards the sun,
+    above the ground; None = none. The shadow turns with the object: it is right for the heading in the middle of its
+    path."""
     node = model.dynamic_object(name)
     toward, middle = None, len(node.times_s) // 2
     if sun is not None:
@@ -501,12 +495,8 @@ def without_traces(
 ) -> SceneModel:
     """A copy in which the street shows no traces of objects that are gone from their places, without the note.
 
-    A background that changes with time, and a scene that knows no ground, stay as they are.
-
-    Args:
-        model: `noted` when all objects were there. Those that are gone from their places may still be in it.
-        views: those of the note.
-    """
+    A background that changes with time, and a scene that knows no ground, stay as they are. ``model``: `noted` when all
+    objects were there. Those that are gone from their places may still be in it. ``views``: those of the note."""
     absent, gone = tuple(hidden), [one for one in hidden.values() if one.views]
     sky = model.sky
     if model.nodes[0].kind == "static" and gone and ground_rows(model).sum() >= LEAST_GROUND:

@@ -99,10 +99,6 @@ class ScoreConfig:
     """File with the image tower of CLIP ViT-L/14 at 336 pixels (`model.safetensors` of
     openai/clip-vit-large-patch14-336, or OpenAI's names). CMMD, CLIP-F and CLIP-V are then computed (empty = not
     computed)."""
-    video_features: str = ""
-    """Folder with features of clips that an extractor of your own made: METHOD/TRAJECTORY.safetensors and
-    recorded/CAMERA.safetensors, each with a tensor `features` of [clips, values]. Frechet and polynomial distances are
-    then computed (empty = not computed)."""
     detections: str = ""
     """File with boxes that a detector found in the views, as COCO results. NTA-IoU is then computed (empty = not
     computed)."""

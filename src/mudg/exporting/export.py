@@ -61,9 +61,8 @@ LOG_FOLDERS: Final = {"ros2": (1, (messages.BAG_METADATA, messages.BAG_FILE)), "
 def records_of(scene: Scene, fused: Any = None) -> messages.LogRecords:
     """The records of a scene on disk; pictures and points are read when they are asked for."""
     files = open_files(scene.root)
-    return messages.LogRecords(
-        scene, lambda frame: files.read(frame.image.path), lambda sweep: read_points(scene, sweep), fused
-    )
+    picture = lambda frame: files.read(frame.image.path)
+    return messages.LogRecords(scene, picture, lambda sweep: read_points(scene, sweep), fused)
 
 
 def refuse_missing(name: str) -> None:
@@ -74,42 +73,6 @@ def refuse_missing(name: str) -> None:
         ncore_package.package()
     elif name in ("mcap", "ros2"):
         messages.mcap_writer()
-
-
-def write_log(name: str, records: messages.LogRecords | None, splats: SplatScene | None, out: Path) -> dict[str, int]:
-    """Write a log as one file: ``mcap`` the records, ``rerun`` records and Gaussians; returns its size."""
-    if name == "rerun":
-        write_rerun(out, records, splats, records.scene.id if records is not None else "scene")
-    elif records is not None:
-        messages.write_mcap(out, messages.Ros2Messages(records))
-    contents = [] if records is None else [_counts(records)]
-    if splats is not None:
-        contents.append(f"{_count(splats)} Gaussians")
-    size = out.stat().st_size
-    log.info(f"export: {', '.join(contents)}, {size / 1e6:.2f} MB")
-    return {"bytes": size}
-
-
-def _counts(records: messages.LogRecords) -> str:
-    return f"{len(records.scene.frames)} pictures, {len(records.scene.sweeps)} sweeps"
-
-
-def write_messages(name: str, records: messages.LogRecords, out: Path) -> dict[str, Any]:
-    """Write a log as a folder, ``ros2`` or ``ncore``; returns a summary."""
-    if name == "ros2":
-        topics, span = messages.write_mcap(out / messages.BAG_FILE, messages.Ros2Messages(records))
-        store.atomic_write(out / messages.BAG_METADATA, messages.bag_metadata(topics, span))
-        largest, what, count = out / messages.BAG_FILE, "messages", sum(number for _, number in topics.values())
-    else:
-        rolling = ", ".join(
-            name for name, camera in records.scene.cameras.items() if ncore_package.unknown_shutter(camera)
-        )
-        if rolling:
-            unknown = f"the scene does not say which way the shutters of {rolling} roll"
-            log.warn(f"export: {unknown}; ncore says downwards")
-        largest, what, count = ncore.write_ncore(out, records)[0], "boxes", len(records.scene.tracks)
-    log.info(f"export: {_counts(records)}, {count} {what}, {largest.stat().st_size / 1e6:.2f} MB in {out}")
-    return {"format": name, what: count}
 
 
 # scenes -------------------------------------------------------------------------------------------
@@ -312,7 +275,7 @@ def write_folder(name: str, exported: Exported, recorded: Scene, work: RunDir) -
     """Write cameras, or a log over time, to the work folder; returns a summary."""
     out = work.path
     if name not in CAMERAS:
-        return write_messages(name, records_of(recorded, _points(exported)), out)
+        return _write_messages(name, records_of(recorded, _points(exported)), out)
     names = picture_names(recorded)
     with log.task("export", len(names)) as bar:
         for place, content in pictures(recorded):
@@ -327,19 +290,11 @@ def write_folder(name: str, exported: Exported, recorded: Scene, work: RunDir) -
 @one_torch_thread()
 def write_file(config: ExportConfig, name: str, exported: Exported, file: ResultFile) -> dict[str, Any]:
     """Write Gaussians, or a log over time, as one file; returns what the file is."""
-    about = (_messages if name in SUFFIXES else _gaussians)(config, name, exported, file.path)
+    about = _log(name, exported, file.path) if name in SUFFIXES else _gaussians(config, name, exported, file.path)
     return {"format": name, "mudg": version(), **about}
 
 
 def _refuse_settings(config: ExportConfig, name: str) -> None:
-    moves = name in FORMATS and "motion" in FORMATS[name].carries
-    if config.animated and config.time_s is not None:
-        what = "a file holds one moment or the motion"
-        raise UsageError(what, where="--animated, --time-s", remedy="leave one of them out")
-    if config.animated and not moves:
-        able = ", ".join(key for key, one in FORMATS.items() if "motion" in one.carries)
-        what = "this format cannot hold motion"
-        raise UsageError(what, where="--animated", got=name, expected=able, remedy="or give --time-s")
     if name == "alpasim" and config.time_s is not None:
         what = "a file of this format holds all moments"
         raise UsageError(what, where="--time-s", got=name, remedy="leave it out, or export ply")
@@ -429,14 +384,43 @@ def _count(scene: SplatScene) -> int:
 # -- cameras and messages --------------------------------------------------------------------------
 
 
-def _messages(_config: ExportConfig, name: str, exported: Exported, out: Path) -> dict[str, Any]:
-    """Write the log as messages over time; returns what the file is."""
-    splats, records = None, None
+def _log(name: str, exported: Exported, out: Path) -> dict[str, Any]:
+    """Write the log as one file: ``mcap`` its records, ``rerun`` records and Gaussians; returns its size."""
+    splats, records, contents = None, None, list[str]()
     if name == "rerun" and exported.model is not None:
         splats = splat_scene(exported.model, middle_s(exported.model, exported.log))
     if name != "rerun" or exported.log is not None:
         records = records_of(recorded_scene(exported), _points(exported) if splats is None else None)
-    return write_log(name, records, splats, out)
+        contents.append(_counts(records))
+    if splats is not None:
+        contents.append(f"{_count(splats)} Gaussians")
+    if name == "rerun":
+        write_rerun(out, records, splats, records.scene.id if records is not None else "scene")
+    elif records is not None:
+        messages.write_mcap(out, messages.Ros2Messages(records))
+    size = out.stat().st_size
+    log.info(f"export: {', '.join(contents)}, {size / 1e6:.2f} MB")
+    return {"bytes": size}
+
+
+def _write_messages(name: str, records: messages.LogRecords, out: Path) -> dict[str, Any]:
+    """Write the log as a folder, ``ros2`` or ``ncore``; returns a summary."""
+    if name == "ros2":
+        largest = out / messages.BAG_FILE
+        topics, span = messages.write_mcap(largest, messages.Ros2Messages(records))
+        store.atomic_write(out / messages.BAG_METADATA, messages.bag_metadata(topics, span))
+        what, count = "messages", sum(number for _, number in topics.values())
+    else:
+        cameras = records.scene.cameras.items()
+        if rolling := ", ".join(name for name, camera in cameras if ncore_package.unknown_shutter(camera)):
+            log.warn(f"export: the scene does not say which way the shutters of {rolling} roll; ncore says downwards")
+        largest, what, count = ncore.write_ncore(out, records)[0], "boxes", len(records.scene.tracks)
+    log.info(f"export: {_counts(records)}, {count} {what}, {largest.stat().st_size / 1e6:.2f} MB in {out}")
+    return {"format": name, what: count}
+
+
+def _counts(records: messages.LogRecords) -> str:
+    return f"{len(records.scene.frames)} pictures, {len(records.scene.sweeps)} sweeps"
 
 
 def recorded_scene(exported: Exported) -> Scene:

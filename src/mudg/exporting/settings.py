@@ -14,8 +14,6 @@ class ExportConfig:
     time_s: float | None = None
     """Moment at which moving objects are taken, on the scene's clock (not given: formats with motion hold all of it,
     others the middle of the log)."""
-    animated: bool = False
-    """Require that the file holds the motion: a format that cannot is refused."""
     nodes: tuple[str, ...] = ()
     """Track ids of the objects to write, and background for what stands (not given: everything)."""
     axes: Literal["viewer", "world"] = "viewer"

@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -61,53 +61,30 @@ class ViewImages:
 
 
 def read_detections(path: Path) -> dict[str, list[Detection]]:
-    """Boxes by image name, without those of a confidence of at most 0.5.
-
-    Understood are COCO's result form, a list whose boxes are in pixels of images resized to 480 x 320, as the published
-    score does it; and a mapping with ``images`` (id, file_name, width, height) and ``annotations``, whose boxes are in
-    pixels of these images. InputError: anything else."""
+    """Boxes by image name, without those of a confidence of at most 0.5: COCO's result form, a list whose boxes are in
+    pixels of images resized to 480 x 320, as the published score does it. InputError: anything else."""
     content = store.read_json(path)
-    sizes: dict[Any, tuple[str, float, float]] = {}
-    if isinstance(content, Mapping):
-        try:
-            for image in content["images"]:
-                scale = (
-                    street_scores.NTA_WIDTH_PX / float(image["width"]),
-                    street_scores.NTA_HEIGHT_PX / float(image["height"]),
-                )
-                sizes[image["id"]] = (str(image["file_name"]), *scale)
-            content = content["annotations"]
-        except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-            expected, got = "images (id, file_name, width, height) and annotations", repr(error)
-            raise InputError("malformed file of boxes", where=str(path), expected=expected, got=got) from error
     if not isinstance(content, list):
         raise InputError("a file of boxes holds no list", where=str(path), expected=_BOXES, got=type(content).__name__)
     found: dict[str, list[Detection]] = {}
-    for name, _, _ in sizes.values():
-        found.setdefault(image_name(name), [])
     for number, record in enumerate(content):
-        name, detection = _parsed(record, sizes, f"{path}: record {number}")
+        name, detection = _parsed(record, f"{path}: record {number}")
         kept = found.setdefault(name, [])
         if detection.score > street_scores.NTA_CONFIDENCE:
             kept.append(detection)
     return found
 
 
-def _parsed(record: Any, sizes: Mapping[Any, tuple[str, float, float]], where: str) -> tuple[str, Detection]:
+def _parsed(record: Any, where: str) -> tuple[str, Detection]:
     try:
-        given, category, score = record["image_id"], int(record["category_id"]), float(record.get("score", 1.0))
+        name, category, score = str(record["image_id"]), int(record["category_id"]), float(record.get("score", 1.0))
         x, y, width, height = (float(v) for v in record["bbox"])
-        name, across, down = sizes.get(given, (str(given), 1.0, 1.0))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError("a detected box is malformed", where=where, expected=_BOXES, got=repr(record)[:120]) from error
     if not all(map(math.isfinite, (x, y, width, height, score))) or width < 0 or height < 0 or not 0 <= score <= 1:
         expected = "finite numbers, sizes of at least 0, a score in 0..1"
         raise InputError("a detected box is impossible", where=where, expected=expected, got=repr(record)[:120])
-    if sizes and given not in sizes:
-        what, got = "a detected box belongs to no image", str(given)
-        raise InputError(what, where=where, got=got, expected="an id of the images")
-    box = np.array([x * across, y * down, (x + width) * across, (y + height) * down])
-    return image_name(name), Detection(box, category, score)
+    return image_name(name), Detection(np.array([x, y, x + width, y + height]), category, score)
 
 
 def image_name(given: str) -> str:

@@ -1,5 +1,4 @@
-"""Facts about views beside their true image: LiDAR points, vehicles, markings; and what recorded images score on
-them."""
+"""Facts about views beside their true image: LiDAR points, vehicles, markings; and the trajectories to score."""
 
 from __future__ import annotations
 
@@ -10,29 +9,22 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from mudg.base import geometry
 from mudg.base.errors import InputError
 from mudg.base.palette import ID, UNLABELLED
 from mudg.base.types import Frame, Observation, Scene, Track, View
-from mudg.city.world import CityTruth, CityWorld
 from mudg.core import metrics, street_scores
 from mudg.core.fusion import STATIC
-from mudg.core.metrics import LaneFacts, Pair, ViewFacts
+from mudg.core.metrics import LaneFacts, ViewFacts
 from mudg.core.street_scores import VEHICLE_LABELS, visible_agents
-from mudg.core.view_metrics import AgentIou, LaneIou
 from mudg.editing.settings import ScoreConfig
 from mudg.labels.ground import driven_path, ground_near
 from mudg.labels.inputs import box_outline
-from mudg.scene.labels import read_label
 from mudg.scene.observations import ObservationSet, list_observation_sets, read_observations
 from mudg.scene.read import read_image
 from mudg.scoring.truth import SAME_PLACE_M, SAME_TIME_S, LogPoints, Truth, ViewTruth, apart_m
-
-ANCHORED: Final = ("agent_iou", "lane_iou")
-"""Metrics that are also shown for the recorded images at recorded views."""
 
 
 def vehicles_of(scene: Scene) -> tuple[tuple[int, Track], ...]:
@@ -50,7 +42,6 @@ class FactMaker:
         self._points = LogPoints(scene)
         self._vehicles = vehicles_of(scene)
         self._path = driven_path(scene.ego.world_from_ego)
-        self._anchors: dict[str, dict[str, float]] = {}
 
     def of(self, view: View, truth: ViewTruth | None) -> ViewFacts:
         """What is known of a view; ``truth``: its exact or recorded truth, if there is one."""
@@ -59,17 +50,12 @@ class FactMaker:
         if truth is not None and truth.instance is not None:
             agents, seen, lanes = visible_agents(view, self._vehicles, truth.instance), truth.seen, None
             if truth.marking is not None and seen.semantics is not None and seen.depth is not None:
-                ids, depth, rgb = seen.semantics.numpy(), seen.depth[0].numpy(), seen.rgb.numpy()
-                lanes = exact_lanes(ids, depth, truth.marking, rgb)
+                depth = seen.depth[0].numpy()
+                road = (seen.semantics.numpy() == ID["road"]) & (depth > 0) & (depth < street_scores.LANE_FAR_M)
+                marking = truth.marking & road
+                lanes = LaneFacts(road, marking, street_scores.lane_band(marking), seen.rgb.numpy(), exact=True)
             return ViewFacts(points, agents, lanes, truth.instance)
         return ViewFacts(points, None, None if frame is None else self._carried_lanes(view, frame))
-
-    def recorded(self, camera: str) -> dict[str, float]:
-        """What the recorded images of a camera score at their own views, by metric; empty where exact truth is missing
-        there."""
-        if camera not in self._anchors:
-            self._anchors[camera] = self._recorded(camera) if self._scene.source.recipe is not None else {}
-        return self._anchors[camera]
 
     def frames_of(self, camera: str) -> tuple[Frame, ...]:
         """The recorded frames of a camera; none if the scene lacks it."""
@@ -109,34 +95,6 @@ class FactMaker:
             outline = None if pose is None else box_outline(view, pose, track.size_m)
             mask = mask if outline is None else mask | outline
         return mask
-
-    def _recorded(self, camera: str) -> dict[str, float]:
-        found: dict[str, AgentIou | LaneIou] = {"agent_iou": AgentIou(), "lane_iou": LaneIou()}
-        world = CityWorld.from_source(self._scene.source)
-        for frame in self._scene.frames_of(camera):
-            if not {"depth", "semantics", "instance"} <= frame.labels.keys():
-                return {}
-            depth, ids, instance = (read_label(self._scene, frame, name) for name in ("depth", "semantics", "instance"))
-            rgb = (np.asarray(read_image(self._scene, frame)) / np.float32(255)).astype(np.float32)
-            depth, ids = np.asarray(depth, np.float32), np.asarray(ids, np.uint8)
-            seen = CityTruth(rgb, depth, ids, np.asarray(instance, np.int32))
-            planes, classes = torch.from_numpy(rgb).permute(2, 0, 1), torch.from_numpy(ids.astype(np.int64))
-            lanes = exact_lanes(ids, depth, world.markings(frame.view, seen), planes.numpy())
-            facts = ViewFacts(agents=visible_agents(frame.view, self._vehicles, seen.instance), lanes=lanes)
-            pair = Pair(planes, None, classes, planes, None, None, classes, view=frame.view, facts=facts)
-            for metric in found.values():
-                metric.add(metric.source(pair))
-        values = {name: metric.value() for name, metric in found.items()}
-        return {name: round(value, 6) for name, value in values.items() if value is not None}
-
-
-def exact_lanes(
-    ids: NDArray[Any], depth: NDArray[np.float32], painted: NDArray[np.bool_], rgb: NDArray[np.float32]
-) -> LaneFacts:
-    """Markings of a view with exact classes and depth [H, W], paint bool[H, W] and colours f32[3, H, W]."""
-    road = (ids == ID["road"]) & (depth > 0) & (depth < street_scores.LANE_FAR_M)
-    marking = painted & road
-    return LaneFacts(road, marking, street_scores.lane_band(marking), rgb, exact=True)
 
 
 def known_of(facts: ViewFacts) -> set[str]:

@@ -49,9 +49,9 @@ from mudg.scoring.facts import (
     trajectories_of,
     vehicles_of,
 )
+from mudg.scoring.sets import BASELINE, anchors_of, set_scores_of
 from mudg.scoring.sweeps import sweep_scores
 from mudg.scoring.truth import ViewTruth, stored_truth, truth_of
-from mudg.scoring.whole_sets import BASELINE, anchors_of, set_scores_of
 
 BASELINE_DRAWING: Final = project.ProjectConfig(static_splat_px=2.5, object_splat_px=4.0, occluder_m=0.3)
 TRUTH: Final = "=truth"
@@ -101,7 +101,7 @@ def write_scores(
         name: {"title": row.title, "unit": row.unit, "better": row.better, "needs": list(row.needs)}
         for name, row in metrics.METRICS.items()
     }
-    made = {"depth_limit_m": DEPTH_LIMIT_M, "anchors": anchors_of(results, trajectories, reference)}
+    made = {"depth_limit_m": DEPTH_LIMIT_M, "anchors": anchors_of(results, trajectories)}
     made |= {"lpips": _lpips_record(config), **sets.records()}
     records, exact = [trajectory.record() for trajectory in trajectories], reference.truth.exact
     if sweeps := sweep_scores(recorded, methods):

@@ -1,8 +1,9 @@
-"""FID and KID of a method on a trajectory: its images as a set, against the recorded frames of the same camera.
+"""Distances of whole sets of views: FID, KID, FVD, FD-DINOv2, CMMD and CLIP scores; and the detectors and anchors that
+stand beside them.
 
-The reference is the recorded video, as in published tables, so there is a number off the recorded path of a driving
-log, too, where no other metric has a truth. Sets are small, and FID of small sets is mostly bias: every trajectory also
-gets a floor, what the truth itself would score.
+The reference is the recorded video of the same camera, as in published tables, so there is a number off the recorded
+path of a driving log, too, where no other metric has a truth. Sets are small, and FID of small sets is mostly bias:
+every trajectory also gets a floor, what the truth itself would score.
 
 Features are kept in the folder of the scores, in a file whose name is the hash of weights, rule and pixels: an
 interrupted run does not compute a set again.
@@ -22,20 +23,118 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mudg.base import seeds, store
+from mudg.base import log, seeds, store
 from mudg.base.devices import choose_device
 from mudg.base.errors import InputError
 from mudg.base.types import Frame, Scene, View
 from mudg.base.weights import read_checkpoint
 from mudg.core import feature_distances
-from mudg.core.feature_distances import cmmd_distance, frechet_distance, polynomial_distance
+from mudg.core.feature_distances import cmmd_distance, frechet_distance
 from mudg.core.pictures import resize_rgb, to_bytes
 from mudg.editing.settings import ScoreConfig
 from mudg.networks import clip_image, dinov2, i3d, inception
+from mudg.networks.featnets import LpipsFeatures, LpipsTrunk, lpips_shapes
+from mudg.scene.observations import ObservationSet, read_observations
 from mudg.scene.read import read_image
+from mudg.scoring import detections
 from mudg.scoring import tables as score_tables
-from mudg.scoring.converted import source_sha256
+from mudg.scoring.detections import BoxDetections, LaneDetections, ViewImages
+from mudg.scoring.facts import Reference, ScoredTrajectory
+from mudg.scoring.tables import SET_SIZES
 from mudg.scoring.truth import SAME_TIME_S
+
+# -- weights ---------------------------------------------------------------------------------------
+#
+# Of the networks of the scores: a published file -> a folder with ``weights.safetensors`` and its origin.
+
+WEIGHTS_FILE: Final = "weights.safetensors"
+DESCRIPTION_FILE: Final = "model.json"
+KIND: Final = "score network"
+_LISTED: Final = 8
+
+
+@dataclass(frozen=True)
+class ScoreNetwork:
+    """A network of the scores: what its files are called when they are used, and how its tensors are found in a
+    published file. ``flag``: of ``mudg score``. ``check``: tensors -> nothing, or an InputError. ``named``: tensors of
+    a file -> those of the network under the names that are written. ``published``: SHA-256 of published files -> their
+    names."""
+
+    flag: str
+    check: Callable[[Mapping[str, Tensor], str], object]
+    named: Callable[[Mapping[str, Tensor]], dict[str, Tensor]]
+    published: Mapping[str, str]
+
+
+def _lpips(trunk: LpipsTrunk, flag: str) -> ScoreNetwork:
+    named = lambda found: {name: found[name] for name in lpips_shapes(trunk) if name in found}
+    return ScoreNetwork(flag, lambda state, where: LpipsFeatures(state, where, trunk), named, {})
+
+
+_without_counts = lambda state: {name: own for name, own in state.items() if not name.endswith("num_batches_tracked")}
+_I3D_SHA256: Final = "bec6519f66ea534e953026b4ae2c65553c17bf105611c746d904657e5860a5e2"
+_FID_FILES: Final = {inception.KNOWN_SHA256: "pt_inception-2015-12-05-6726825d.pth"}
+
+NETWORKS: Final[Mapping[str, ScoreNetwork]] = {
+    "inception": ScoreNetwork("--fid-weights", inception.InceptionFeatures, _without_counts, _FID_FILES),
+    "i3d": ScoreNetwork("--fvd-weights", i3d.I3DFeatures, i3d.with_known_names, {_I3D_SHA256: "i3d_torchscript.pt"}),
+    "dinov2": ScoreNetwork("--dino-weights", dinov2.DinoFeatures, dict, {}),
+    "clip": ScoreNetwork("--clip-weights", clip_image.ClipImageFeatures, clip_image.with_openai_names, {}),
+    "lpips": _lpips("alex", "--lpips-weights"),
+    "lpips-vgg": _lpips("vgg", "--lpips-vgg-weights"),
+}
+"""Networks by the name that ``mudg convert --network`` takes."""
+
+
+def convert_weights(network: str, checkpoint: Path, to: Path) -> None:
+    """Write the folder ``to``: ``weights.safetensors`` in float32, and ``model.json`` with its origin. InputError: the
+    file is missing, damaged, or holds another network; nothing is written."""
+    kind, found = NETWORKS[network], read_checkpoint(checkpoint)
+    tensors = kind.named(found)
+    kind.check(tensors, str(checkpoint))
+    sha256 = store.sha256_file(checkpoint)
+    known = kind.published.get(sha256)
+    with store.atomic_directory(to) as partial:
+        written = {name: value.detach().float() for name, value in tensors.items()}
+        store.write_safetensors(partial / WEIGHTS_FILE, written)
+        files = {WEIGHTS_FILE: store.sha256_file(partial / WEIGHTS_FILE)}
+        source = {"file": checkpoint.name, "bytes": checkpoint.stat().st_size, "sha256": sha256, "published_as": known}
+        description = {"schema": 1, "kind": KIND, "network": network, "files": files, "source": source}
+        store.write_json(partial / DESCRIPTION_FILE, description)
+        store.sync_tree(partial)
+    # names that changed, where one tensor became one
+    places = {value.data_ptr(): name for name, value in found.items()}
+    pairs = ((places.get(value.data_ptr(), ours), ours) for ours, value in tensors.items())
+    renamed = [(theirs, ours) for theirs, ours in pairs if theirs != ours]
+    for theirs, ours in renamed[:_LISTED]:
+        log.info(f"convert: {theirs} -> {ours}")
+    more = f" ({len(renamed) - _LISTED} more names changed)" if len(renamed) > _LISTED else ""
+    other = "not a file whose hash is known" if kind.published else "no hash is on record"
+    origin = f"the published {known}" if known else other
+    log.info(f"convert: {len(tensors)} tensors{more}; SHA-256 of {checkpoint.name}: {sha256} ({origin})")
+    log.info(f"convert: use it with mudg score {kind.flag} {to / WEIGHTS_FILE}")
+
+
+def source_sha256(weights: Path) -> str:
+    """SHA-256 of the published file that weights were converted from, if their folder says so; else that of the file
+    itself."""
+    own, description = store.sha256_file(weights), weights.parent / DESCRIPTION_FILE
+    if weights.name != WEIGHTS_FILE or not description.is_file():
+        return own
+    content = store.read_json(description)
+    if not isinstance(content, Mapping) or content.get("kind") != KIND:
+        return own
+    try:
+        fits, source = content["files"][WEIGHTS_FILE] == own, str(content["source"]["sha256"])
+    except (KeyError, TypeError) as error:
+        what, got = "the description of converted weights is malformed", repr(error)
+        raise InputError(what, where=str(description), got=got) from error
+    return source if fits else own
+
+
+# -- images ----------------------------------------------------------------------------------------
+#
+# FID and KID of a method on a trajectory: its images as a set, against the recorded frames of the same camera.
 
 FEATURES_FOLDER: Final = "features"
 FEWEST: Final = 2
@@ -160,20 +259,11 @@ def set_entry(generated: Rows, reference: Rows, **distances: Callable[[Rows, Row
     return {"values": values, "n": len(generated), "n_reference": len(reference)}
 
 
-def floor_of(trajectory: str, how: str, entry: Entry) -> dict[str, Any]:
-    """What the truth itself scores on a trajectory, for metrics.json."""
-    sizes = {name: value for name, value in entry.items() if name != "values"}
-    return {"trajectory": trajectory, "how": how, **entry["values"], **sizes}
-
-
 class SetComparison:
-    """A distance of sets of images for every trajectory of a scene, whose recorded frames are the reference.
-
-    Args:
-        files: how images become features. compare: two sets of features to their numbers. facts: how these are made.
-        halves: two parts of the reference, whose distance is the floor where no truth is known, and what they are.
-        further: what else the features tell of a video, if anything.
-    """
+    """A distance of sets of images for every trajectory of a scene, whose recorded frames are the reference. ``files``:
+    how images become features. ``compare``: two sets of features to their numbers. ``facts``: how these are made.
+    ``halves``: two parts of the reference, whose distance is the floor where no truth is known, and what they are.
+    ``further``: what else the features tell of a video, if anything."""
 
     def __init__(
         self,
@@ -231,7 +321,8 @@ class SetComparison:
             pair = chosen(self._files.of(sets.truth.resized(sets.width, sets.height))), reference
             how = "true images of the same views"
         if min(map(len, pair)) >= FEWEST:
-            self._floors.append(floor_of(sets.name, how, self._compare(*pair)))
+            entry = self._compare(*pair)
+            self._floors.append({"trajectory": sets.name, "how": how, **entry.pop("values"), **entry})
         return found
 
     def record(self) -> dict[str, Any]:
@@ -274,7 +365,7 @@ def distributions(scene: Scene, files: FeatureFiles) -> SetComparison:
     return SetComparison(scene, files, entry, facts)
 
 
-def distances(generated: NDArray[np.float32], reference: NDArray[np.float32]) -> dict[str, float | None]:
+def distances(generated: Rows, reference: Rows) -> dict[str, float | None]:
     """FID and KID of two sets of features ``[n, d]``, at least two rows each, rows in order of time; ``n`` and
     ``n_reference`` rows, and from enough of them on the standard error of KID."""
     blocks = tuple(np.arange(len(rows)) // BLOCK_FRAMES for rows in (generated, reference))
@@ -354,76 +445,6 @@ def videos_of(config: ScoreConfig, scene: Scene, out: Path) -> SetComparison:
     return SetComparison(scene, files, video_entry, made, (halves, how))
 
 
-# -- video features --------------------------------------------------------------------------------
-#
-# Distances of videos in features that an extractor elsewhere made of their clips, such as V-JEPA (JEDi) or VideoMAE.
-# Extractors are not run here: a saved program (TorchScript, or an exported one) would be code from a file. What they
-# give is read: ``METHOD/TRAJECTORY.safetensors`` and ``recorded/CAMERA.safetensors``, each with one tensor ``features``
-# [clips, values].
-
-RECORDED: Final = "recorded"
-TRUTH: Final = "truth"
-
-
-class VideoFeatures:
-    """Frechet and polynomial distances of every trajectory. ``folder``: of the tables. InputError: there is no such
-    folder."""
-
-    def __init__(self, folder: Path) -> None:
-        if not folder.is_dir():
-            tables = "METHOD/TRAJECTORY.safetensors and recorded/CAMERA.safetensors"
-            expected = f"{tables}, each with a tensor features [clips, values]"
-            remedy = "run the extractor yourself and save what it gives; programs (TorchScript) are not read"
-            raise InputError("no such folder of features", where=str(folder), expected=expected, remedy=remedy)
-        self._folder, self._floors = folder, list[dict[str, Any]]()
-        self._width: int | None = None
-
-    def of(self, trajectory: str, camera: str, methods: Sequence[str]) -> dict[str, dict[str, Any] | str]:
-        """By method ``values`` and numbers of clips, or why there are none; the floor of the trajectory is noted for
-        ``record``."""
-        reference = self._read(f"{RECORDED}/{camera}")
-        if reference is None:
-            return dict.fromkeys(methods, score_tables.NO_FEATURES)
-        found: dict[str, dict[str, Any] | str] = {}
-        for method in methods:
-            made = self._read(f"{method}/{trajectory}")
-            found[method] = score_tables.NO_FEATURES if made is None else _compared(made, reference)
-        true = self._read(f"{TRUTH}/{trajectory}")
-        if true is not None and not isinstance(floor := _compared(true, reference), str):
-            self._floors.append(floor_of(trajectory, "true clips", floor))
-        return found
-
-    def record(self) -> dict[str, Any]:
-        """How the numbers were made, and the floors."""
-        return {
-            "features": "made elsewhere",
-            "width": self._width,
-            "folder_sha256": store.digest(self._folder),
-            "covariance": "n - 1",
-            "kernel": "(x.y / d)^2, biased, times 100",
-            "reference": "clips of the recorded video of the same camera",
-            "floors": self._floors,
-        }
-
-    def _read(self, name: str) -> NDArray[np.float64] | None:
-        path = self._folder / f"{name}.safetensors"
-        if not path.is_file():
-            return None
-        found = store.read_safetensors(path).get("features")
-        if found is None or found.ndim != 2 or not np.issubdtype(found.dtype, np.floating):
-            what, expected = "a table of video features is malformed", "one tensor features [clips, values]"
-            got = "no such tensor" if found is None else f"{found.dtype} {found.shape}"
-            raise InputError(what, where=str(path), expected=expected, got=got)
-        self._width = int(found.shape[1])
-        return found.astype(np.float64)
-
-
-def _compared(generated: NDArray[np.float64], reference: NDArray[np.float64]) -> Entry | str:
-    if min(len(generated), len(reference)) < FEWEST:
-        return score_tables.TOO_FEW
-    return set_entry(generated, reference, video_frechet=frechet_distance, video_mmd=polynomial_distance)
-
-
 # -- embeddings ------------------------------------------------------------------------------------
 #
 # Scores of images through one embedding each: FD-DINOv2 and consistency with DINOv2, CMMD, CLIP-F and CLIP-V with CLIP.
@@ -495,3 +516,156 @@ def clip_of(config: ScoreConfig, scene: Scene, out: Path) -> SetComparison:
     }
     compare = functools.partial(set_entry, cmmd=cmmd_distance)
     return SetComparison(scene, files, compare, made, further=("cmmd", _clip_values))
+
+
+# -- all that is computed of whole sets ------------------------------------------------------------
+
+BASELINE: Final = "nearest_fill"
+Scored = Sequence[dict[str, Any]]
+ENTRIES: Final = {"distributions": "distribution", "videos": "video"}
+"""Entry of metrics.json that says how numbers were made -> that of a result with their sizes, where it differs."""
+
+
+@dataclass(frozen=True)
+class SetScores:
+    """What is computed of whole sets, as far as its weights or files were given. ``comparisons``: entry of metrics.json
+    -> what compares images or clips. ``detected``: metric -> entry of a result, and what holds detections against the
+    truth."""
+
+    comparisons: Mapping[str, SetComparison]
+    detected: Mapping[str, tuple[str, BoxDetections | LaneDetections]]
+
+    def add_to(
+        self, results: Scored, trajectories: Sequence[ScoredTrajectory], reference: Reference, out: Path
+    ) -> None:
+        """Add to the results what compares whole sets of views."""
+        if not self.records():
+            return
+        with log.task("features", len(results)) as bar:
+            for trajectory in trajectories:
+                rows = [row for row in results if row["trajectory"] == trajectory.name]
+                bar.update(trajectory.name)
+                self._add(trajectory, rows, reference, out)
+                bar.advance(len(rows))
+
+    def _add(self, trajectory: ScoredTrajectory, rows: Scored, reference: Reference, out: Path) -> None:
+        counted, every = trajectory.counted(reference.held_out), range(len(trajectory.views))
+        for name, comparison in self.comparisons.items():
+            images = _sets_of(trajectory, reference, out, counted if name == "distributions" else every)
+            of_video = () if name in ENTRIES else (counted, trajectory.views)
+            _add_named(rows, ENTRIES.get(name, name), comparison.of(images, *of_video))
+        for metric, (entry, source) in self.detected.items():
+            _add_detected(rows, metric, entry, source, trajectory, counted, reference)
+
+    def records(self) -> dict[str, Any]:
+        """How the numbers were made, by entry of metrics.json."""
+        found = {name: comparison.record() for name, comparison in self.comparisons.items()}
+        if self.detected:
+            found["detections"] = {metric: source.record() for metric, (_, source) in self.detected.items()}
+        return found
+
+
+def set_scores_of(config: ScoreConfig, scene: Scene, out: Path) -> SetScores:
+    """What the given weights and files allow to compute. InputError: a file is missing, damaged, or holds another
+    network, or the log has no lane lines."""
+    makers = {
+        "distributions": (config.fid_weights, distributions_of),
+        "videos": (config.fvd_weights, videos_of),
+        "dinov2": (config.dino_weights, dino_of),
+        "clip": (config.clip_weights, clip_of),
+    }
+    comparisons = {name: make(config, scene, out) for name, (weights, make) in makers.items() if weights}
+    detected: dict[str, tuple[str, BoxDetections | LaneDetections]] = {}
+    if config.detections:
+        detected["nta_iou"] = ("nta", BoxDetections(scene, Path(config.detections), config.as_published))
+    if config.lanes:
+        detected["ntl_iou"] = ("ntl", LaneDetections(scene, Path(config.lanes)))
+    return SetScores(comparisons, detected)
+
+
+def anchors_of(results: Scored, trajectories: Sequence[ScoredTrajectory]) -> list[dict[str, Any]]:
+    """What stands beside a metric's values on a trajectory: the same of the true images (``truth``), of the recorded
+    images at their own views (``recorded``), and of ``nearest_fill``. Taken out of the results."""
+    found = []
+    for trajectory in trajectories:
+        rows = [row for row in results if row["trajectory"] == trajectory.name]
+        anchors: dict[str, dict[str, float]] = {}
+        for row in rows:
+            for name, value in row.pop("truth", {}).items():
+                anchors.setdefault(name, {})["truth"] = value
+            for name, own in row.pop("anchors", {}).items():
+                anchors.setdefault(name, {}).update(own)
+        for row in rows:
+            if row["method"] == BASELINE:
+                for name, own in anchors.items():
+                    if not isinstance(row["values"].get(name), str):
+                        own[BASELINE] = row["values"][name]
+        found += [{"trajectory": trajectory.name, "metric": name, **own} for name, own in sorted(anchors.items())]
+    return found
+
+
+def _sets_of(trajectory: ScoredTrajectory, reference: Reference, out: Path, counted: Sequence[int]) -> TrajectorySets:
+    """The images at the counted views of a trajectory whose views have been scored and written."""
+
+    def chosen(views: ObservationSet, indices: Sequence[int]) -> ImageSet:
+        return ImageSet(len(counted), lambda number: views.rgb_u8(indices[counted[number]]))
+
+    def true_image(number: int) -> NDArray[np.uint8]:
+        place = counted[number]
+        true = reference.truth.at_view(trajectory.views[place], trajectory.frames[place], trajectory.name)
+        if true is None:
+            raise InputError("a view has no ground truth", where=f"{trajectory.name}, view {place}")
+        return to_bytes(true.seen.rgb)
+
+    methods = {name: chosen(found, trajectory.indices[name]) for name, found in trajectory.sets.items()}
+    every = range(len(trajectory.views))
+    if reference.baseline is not None:
+        methods = {BASELINE: chosen(read_observations(out / BASELINE / trajectory.name), every), **methods}
+    truth = None
+    if reference.truth.exact and trajectory.shift_m != 0.0:
+        if reference.truth.stored:
+            truth = ImageSet(len(counted), true_image)
+        else:
+            truth = chosen(read_observations(out / "truth" / trajectory.name), every)
+    camera = trajectory.views[0].camera
+    return TrajectorySets(trajectory.name, trajectory.camera, camera.width, camera.height, methods, truth)
+
+
+def _add_named(rows: Scored, entry: str, found: Mapping[str, dict[str, Any] | str]) -> None:
+    """Values of several metrics by method, and what stands beside them, into the results of one trajectory."""
+    for row in rows:
+        of = found[row["method"]]
+        row["values"] |= dict(of["values"]) if not isinstance(of, str) else dict.fromkeys(SET_SIZES[entry], of)
+        if not isinstance(of, str) and "n" in of:
+            row[entry] = {name: value for name, value in of.items() if name != "values"}
+
+
+def _add_detected(
+    rows: Scored,
+    metric: str,
+    entry: str,
+    source: BoxDetections | LaneDetections,
+    trajectory: ScoredTrajectory,
+    counted: Sequence[int],
+    reference: Reference,
+) -> None:
+    """NTA-IoU or NTL-IoU into the results of one trajectory, with its anchors."""
+    views = tuple(trajectory.views[n] for n in counted)
+    frames = reference.facts.frames_of(trajectory.camera)
+    recorded = f"{detections.RECORDED}/{trajectory.camera}"
+    there = {
+        "truth": ViewImages(f"{detections.TRUTH}/{trajectory.name}", tuple(counted), views),
+        "recorded": ViewImages(recorded, tuple(range(len(frames))), tuple(frame.view for frame in frames)),
+    }
+    beside = {name: value["value"] for name, images in there.items() if not isinstance(value := source.of(images), str)}
+    for row in rows:
+        indices = trajectory.indices.get(row["method"], tuple(range(len(trajectory.views))))
+        images = ViewImages(f"{row['method']}/{trajectory.name}", tuple(indices[n] for n in counted), views)
+        value = source.of(images)
+        row["values"][metric] = value if isinstance(value, str) else value["value"]
+        row.setdefault("anchors", {})[metric] = beside
+        if isinstance(value, str):
+            continue
+        row[entry] = {k: v for k, v in value.items() if k != "value"}
+        if isinstance(source, LaneDetections):
+            row[entry]["against_detector"] = source.against(images, there["truth"])

@@ -16,7 +16,6 @@ NOT_COMPUTED: Final = "not computed"
 TOO_FEW: Final = "too few views"
 UNEQUAL: Final = "unequal n"
 NO_DETECTIONS: Final = "no detections"
-NO_FEATURES: Final = "no features"
 WEIGHT_FLAGS: Final = {
     metric: flag
     for flag, metrics in (
@@ -26,20 +25,13 @@ WEIGHT_FLAGS: Final = {
         ("--fvd-weights", "fvd"),
         ("--dino-weights", "fd_dinov2 subject_consistency"),
         ("--clip-weights", "cmmd clip_f clip_v"),
-        ("--video-features", "video_frechet video_mmd"),
         ("--detections", "nta_iou"),
         ("--lanes", "ntl_iou"),
     )
     for metric in metrics.split()
 }
 """Metric -> the flag of ``mudg score`` that names the weights or files it needs."""
-SET_SIZES: Final = {
-    "distribution": ("fid", "kid"),
-    "video": ("fvd",),
-    "dinov2": ("fd_dinov2",),
-    "clip": ("cmmd",),
-    "video_features": ("video_frechet", "video_mmd"),
-}
+SET_SIZES: Final = {"distribution": ("fid", "kid"), "video": ("fvd",), "dinov2": ("fd_dinov2",), "clip": ("cmmd",)}
 """Entry of a result with the sizes of its sets -> their metrics."""
 _MADE: Final = {"distribution": "distributions", "video": "videos"}
 SET_METRICS: Final = {metric: _MADE.get(entry, entry) for entry, metrics in SET_SIZES.items() for metric in metrics}

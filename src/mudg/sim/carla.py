@@ -43,11 +43,8 @@ class MudgRenderer(Renderer):
     coordinate_frame = "right_handed"
 
     def load_world(self, world: WorldInfo) -> None:
-        """Load the run that the options name, whatever the map is called.
-
-        Raises:
-            UsageError: an unknown or missing option, or an object that the scene does not have. As ``Session``.
-        """
+        """Load the run that the options name, whatever the map is called. UsageError: an unknown or missing option, or
+        an object that the scene does not have. As ``Session``."""
         unknown = sorted(set(self.options) - set(OPTIONS))
         if unknown or "run" not in self.options:
             got = ", ".join(unknown) or "no run"

@@ -24,15 +24,10 @@ OPAQUE: Final = 0.5
 
 
 class Cockpit:
-    """A session with a vehicle in it.
-
-    Args:
-        session: of a run, whose log tells the road. cameras: names of the log's cameras (empty: the first one).
-        width_px: of their pictures (0 = as recorded). layers: of ``session.LAYERS``, without motion.
-
-    Raises:
-        InputError: a fit without its log, or a log that stands still. UsageError: no such camera.
-    """
+    """A session with a vehicle in it. ``session``: of a run, whose log tells the road. ``cameras``: names of the log's
+    cameras (empty: the first one). ``width_px``: of their pictures (0 = as recorded). ``layers``: of
+    ``session.LAYERS``, without motion. InputError: a fit without its log, or a log that stands still. UsageError: no
+    such camera."""
 
     def __init__(
         self, session: Session, cameras: str | Sequence[str] = (), width_px: int = 0, layers: Sequence[Layer] = ("rgb",)
@@ -64,11 +59,7 @@ class Cockpit:
 
     def drive(self, time_s: float | None = None, shift_m: float = 0.0, traffic: Traffic = "log") -> Drive:
         """A drive that begins where the recorded vehicle was, moved to the left, at its speed. ``time_s``: None: as
-        early as objects and vehicle were recorded.
-
-        Raises:
-            UsageError: a time outside the log.
-        """
+        early as objects and vehicle were recorded. UsageError: a time outside the log."""
         first = max(self.session.time_range_s[0], float(self.ego.times_s[0]))
         begin = first if time_s is None else time_s
         pose = self.ego.pose_at(begin)

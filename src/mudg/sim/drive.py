@@ -244,11 +244,7 @@ class Drive:
         return self._followers.get(name)
 
     def step(self, controls: Controls, step_s: float) -> None:
-        """Everybody moves for a step.
-
-        Raises:
-            UsageError: controls that are no finite numbers.
-        """
+        """Everybody moves for a step. UsageError: controls that are no finite numbers."""
         if not (math.isfinite(controls.acceleration_mps2) and math.isfinite(controls.steer_rate_radps)):
             raise UsageError("controls are not finite", where="action", got=str(controls))
         now = self.boxes()

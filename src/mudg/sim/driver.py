@@ -32,15 +32,9 @@ QUALITY: Final = 95
 
 
 class Policy:
-    """A session with a policy's server.
-
-    Args:
-        server: ``HOST:PORT``, or an open gRPC channel. name, camera, mount: of the camera whose pictures it gets;
-            mount f64[4, 4]: vehicle-from-camera. scene: name that the policy is told. seed: of the policy.
-
-    Raises:
-        ResourceError: grpcio is missing. InputError: no policy answers.
-    """
+    """A session with a policy's server. ``server``: ``HOST:PORT``, or an open gRPC channel. ``name``, ``camera``,
+    ``mount``: of the camera whose pictures it gets; mount f64[4, 4]: vehicle-from-camera. ``scene``: name that the
+    policy is told. ``seed``: of the policy. ResourceError: grpcio is missing. InputError: no policy answers."""
 
     def __init__(
         self, server: Any, name: str, camera: Camera, mount: NDArray[np.float64], scene: str = "mudg", seed: int = 0
@@ -82,11 +76,7 @@ class Policy:
 
     def plan(self, sight: DriverView) -> NDArray[np.float64]:
         """The policy's plan f64[N, 4] in the vehicle's frame: seconds from now (positive), x and y in metres, heading
-        in radians; no rows: it wants to stop.
-
-        Raises:
-            InputError: the policy failed, or its plan is not one.
-        """
+        in radians; no rows: it wants to stop. InputError: the policy failed, or its plan is not one."""
         types, now = self._types, self._micros(sight.time_s)
         at = types.PoseAtTime(pose=wire.pose_of(sight.pose), timestamp_us=now)
         state = types.DynamicState(linear_velocity=types.Vec3(x=sight.speed_mps))

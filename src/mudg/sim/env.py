@@ -103,11 +103,7 @@ class Env(gym.Env[Observation, NDArray[np.float32]]):
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin a drive. ``options``: ``time_s`` where in the log it begins, ``shift_m`` how far to the left of the
-        path. Nothing is drawn at random.
-
-        Raises:
-            UsageError: an unknown option, or a time outside the log.
-        """
+        path. Nothing is drawn at random. UsageError: an unknown option, or a time outside the log."""
         super().reset(seed=seed)
         unknown = sorted(set(options or {}) - {"time_s", "shift_m"})
         if unknown:
@@ -116,11 +112,8 @@ class Env(gym.Env[Observation, NDArray[np.float32]]):
         return self._look(self.drive)
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Drive for a step. Actions beyond the limits are cut to them.
-
-        Raises:
-            UsageError: no drive has begun, or the action is not two finite numbers.
-        """
+        """Drive for a step. Actions beyond the limits are cut to them. UsageError: no drive has begun, or the action is
+        not two finite numbers."""
         drive = self._driving()
         asked = np.asarray(action, np.float64)
         if asked.shape != (2,) or not np.isfinite(asked).all():

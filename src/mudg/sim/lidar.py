@@ -40,13 +40,9 @@ MOST_MOMENTS: Final = 4096
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BeamTable:
-    """The beams of one sweep, in firing order.
-
-    Args:
-        directions: unit vectors f64[B, 3] in the sensor's frame (x forward, y left, z up). ring: u16[B], row of the
-            sensor. share: f64[B] in [0, 1], when in the sweep a beam is fired.
-        range_m: nearest and farthest distance that is measured, metres.
-    """
+    """The beams of one sweep, in firing order. ``directions``: unit vectors f64[B, 3] in the sensor's frame (x forward,
+    y left, z up). ``ring``: u16[B], row of the sensor. ``share``: f64[B] in [0, 1], when in the sweep a beam is fired.
+    ``range_m``: nearest and farthest distance that is measured, metres."""
 
     directions: Floats
     ring: NDArray[np.uint16]
@@ -72,11 +68,8 @@ class BeamTable:
         range_m: tuple[float, float] = (0.5, 120.0),
         clockwise: bool = True,
     ) -> BeamTable:
-        """A sensor that turns once, from backwards to backwards.
-
-        Args:
-            elevations_deg: of the rows, degrees above the horizon. azimuth_step_deg: between firings of one row.
-        """
+        """A sensor that turns once, from backwards to backwards. ``elevations_deg``: of the rows, degrees above the
+        horizon. ``azimuth_step_deg``: between firings of one row."""
         elevations = np.radians(np.asarray(elevations_deg, np.float64).reshape(-1))
         if not (np.isfinite(azimuth_step_deg) and 0.01 <= azimuth_step_deg <= 90):
             expected = "0.01 to 90 degrees"

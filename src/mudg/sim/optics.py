@@ -38,12 +38,9 @@ FACES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Pinhole:
-    """A pinhole camera with the lens distortion of OpenCV.
-
-    Args:
-        width, height: pixels. fx, fy, cx, cy: pixels.
-        radial: k1 to k6 of the rational model, missing ones 0. tangential: p1, p2. thin_prism: s1 to s4.
-    """
+    """A pinhole camera with the lens distortion of OpenCV. ``width``, ``height``: pixels. ``fx``, ``fy``, ``cx``,
+    ``cy``: pixels. ``radial``: k1 to k6 of the rational model, missing ones 0. ``tangential``: p1, p2. ``thin_prism``:
+    s1 to s4."""
 
     width: int
     height: int
@@ -107,11 +104,8 @@ class Pinhole:
 @dataclass(frozen=True, slots=True)
 class Fisheye:
     """The equidistant lens of OpenCV: a ray at angle a from the axis falls r = a (1 + k1 a^2 + k2 a^4 + ...) from the
-    centre.
-
-    Args:
-        width, height: pixels. fx, fy, cx, cy: pixels. radial: k1 to k4. max_angle: radians; beyond it nothing is seen.
-    """
+    centre. ``width``, ``height``: pixels. ``fx``, ``fy``, ``cx``, ``cy``: pixels. ``radial``: k1 to k4. ``max_angle``:
+    radians; beyond it nothing is seen."""
 
     width: int
     height: int
@@ -185,11 +179,7 @@ Optics = Pinhole | Fisheye | FTheta
 
 
 def check_optics(optics: Optics, positive: Sequence[float], numbers: Sequence[float]) -> None:
-    """Refuse what is no camera.
-
-    Raises:
-        UsageError: sizes or numbers that no camera has.
-    """
+    """Refuse what is no camera. UsageError: sizes or numbers that no camera has."""
     where = type(optics).__name__
     if not (optics.width > 0 and optics.height > 0 and optics.width * optics.height <= MOST_PIXELS):
         expected = f"1x1 to {MOST_PIXELS} pixels"
@@ -246,12 +236,8 @@ def around_axis(x: Floats, y: Floats, angle: Floats, max_angle: float) -> Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Face:
-    """A pinhole view that some rays fall into.
-
-    Args:
-        camera: its size and intrinsics. cam_from_face: rotation f64[3, 3].
-        pixels: i64[n], which rays it shows, flat. uv: f64[n, 2], where, in its pixels.
-    """
+    """A pinhole view that some rays fall into. ``camera``: its size and intrinsics. ``cam_from_face``: rotation
+    f64[3, 3]. ``pixels``: i64[n], which rays it shows, flat. ``uv``: f64[n, 2], where, in its pixels."""
 
     camera: Camera
     cam_from_face: Floats
@@ -260,12 +246,8 @@ class Face:
 
 
 def faces_of(rays: Floats, focal_px: float) -> list[Face]:
-    """Pinhole views that together show all rays f64[..., 3], each cropped to what it must show.
-
-    Args:
-        focal_px: focal length of the faces, pixels per radian on their axes; at most what keeps a face below
-            ``MOST_FACE_PX``.
-    """
+    """Pinhole views that together show all rays f64[..., 3], each cropped to what it must show. ``focal_px``: focal
+    length of the faces, pixels per radian on their axes; at most what keeps a face below ``MOST_FACE_PX``."""
     flat = rays.reshape(-1, 3)
     with np.errstate(invalid="ignore"):
         along = np.stack([flat @ turn[:, 2] for turn in FACES.values()])

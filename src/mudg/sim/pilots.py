@@ -81,10 +81,7 @@ def pursue(target: Matrix, sight: DriverView, car: Car) -> float:
 @dataclass(slots=True)
 class RoutePilot:
     """Follows the route by pure pursuit, and keeps its distance to what it sees ahead by the intelligent driver model.
-
-    Args:
-        rule: how fast, and how near. shift_m: to drive this far to the left of the route. car: the vehicle.
-    """
+    ``rule``: how fast, and how near. ``shift_m``: to drive this far to the left of the route. ``car``: the vehicle."""
 
     rule: Following
     shift_m: float = 0.0
@@ -162,12 +159,8 @@ class EdgePilot(RoutePilot):
 
 @dataclass(slots=True)
 class PlanPilot:
-    """Drives along the plans of a policy.
-
-    Args:
-        policy: what answers a `DriverView` with a plan f64[N, 4]: seconds from now, x and y in metres and heading in
-            radians in the vehicle's frame.
-    """
+    """Drives along the plans of a policy. ``policy``: what answers a `DriverView` with a plan f64[N, 4]: seconds from
+    now, x and y in metres and heading in radians in the vehicle's frame."""
 
     policy: Any
     car: Car = field(default_factory=Car)

@@ -56,11 +56,8 @@ GONE_M: Final = 0.3
 
 
 class Looks:
-    """Where a sensor looks, and where it loses beams whatever is there, as behind the vehicle's own body.
-
-    Args:
-        sweeps: beams of some of its sweeps.
-    """
+    """Where a sensor looks, and where it loses beams whatever is there, as behind the vehicle's own body. ``sweeps``:
+    beams of some of its sweeps."""
 
     def __init__(self, sweeps: Sequence[Beams]) -> None:
         shape = tuple((np.array([360, 180]) / CELL_DEG).astype(int))
@@ -90,11 +87,8 @@ class Looks:
 
 
 class LogReturns:
-    """What the sweeps of a log's sensor tell. They are read when they are asked for.
-
-    Args:
-        scene: the log. sweeps: of the sensor, that may be learnt from. gone: what an edit took away of the world.
-    """
+    """What the sweeps of a log's sensor tell. They are read when they are asked for. ``scene``: the log. ``sweeps``: of
+    the sensor, that may be learnt from. ``gone``: what an edit took away of the world."""
 
     def __init__(self, scene: Scene, sweeps: Sequence[Sweep], gone: Gone | None = None) -> None:
         self._scene, self.sweeps, self._gone = scene, tuple(sweeps), gone
@@ -131,11 +125,8 @@ class LogReturns:
     def meet(
         self, beams: Floats, station: Floats, time_s: float, poses: Mapping[str, Floats], without: Sweep | None = None
     ) -> Met:
-        """What beams f64[B, 3] of the sensor meet; ``nearest`` numbers ``names``, -1: nothing.
-
-        Args:
-            station: world-from-sensor f64[4, 4]. poses: world-from-box of the objects. without: a sweep not to meet.
-        """
+        """What beams f64[B, 3] of the sensor meet; ``nearest`` numbers ``names``, -1: nothing. ``station``:
+        world-from-sensor f64[4, 4]. ``poses``: world-from-box of the objects. ``without``: a sweep not to meet."""
         near, far = self._nearest(station, time_s, poses, without)
         met = self._meet(near, beams, station, poses)
         rest = np.flatnonzero(np.isnan(met.range_m))
@@ -231,15 +222,8 @@ class LogReturns:
 
 def learn_returns(scene: Scene, sensor: str = "", gone: Gone | None = None) -> LogReturns | None:
     """What the sweeps of a log's sensor tell, those of held-out frames left out; None without sweeps. The same log
-    gives the same numbers.
-
-    Args:
-        sensor: empty: the log's first. Others lie centimetres beside it, and their intensity means something else.
-        gone: what an edit took away of the world.
-
-    Raises:
-        UsageError: the log has no such sensor.
-    """
+    gives the same numbers. ``sensor``: empty: the log's first. Others lie centimetres beside it, and their intensity
+    means something else. ``gone``: what an edit took away of the world. UsageError: the log has no such sensor."""
     known = list(dict.fromkeys(sweep.sensor for sweep in scene.sweeps))
     if sensor and sensor not in known:
         raise UsageError("the log has no such LiDAR", expected=", ".join(known) or "none", got=sensor[:80])
@@ -284,11 +268,8 @@ def _regression(features: Floats, answers: NDArray[np.bool_]) -> Floats | None:
 
 
 def places_gone(before: Floats, after: Floats) -> Gone | None:
-    """Which places f64[N, 3] belong to what an edit took out of the background; None: it took nothing.
-
-    Args:
-        before, after: places of the background's Gaussians f64[N, 3].
-    """
+    """Which places f64[N, 3] belong to what an edit took out of the background; None: it took nothing. ``before``,
+    ``after``: places of the background's Gaussians f64[N, 3]."""
     rows = lambda block: np.ascontiguousarray(block).view([("", block.dtype)] * 3).reshape(-1)
     gone = ~np.isin(rows(before), rows(after))
     if not gone.any():

@@ -57,12 +57,8 @@ class SensorRequest(Protocol[Reply]):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Instant:
-    """Where a sensor and the objects are.
-
-    Args:
-        time_s: on the scene's clock. world_from_sensor: f64[4, 4].
-        objects: poses world-from-box f64[4, 4] by object; an object that is not listed is absent. None: as recorded.
-    """
+    """Where a sensor and the objects are. ``time_s``: on the scene's clock. ``world_from_sensor``: f64[4, 4].
+    ``objects``: poses world-from-box f64[4, 4] by object; an object that is not listed is absent. None: as recorded."""
 
     time_s: float
     world_from_sensor: Matrix
@@ -264,31 +260,22 @@ class Session:
 
     def log_returns(self, sensor: str = "") -> LogReturns | None:
         """What the sweeps of a LiDAR of the log (empty: its first) tell about surfaces, intensity and lost beams,
-        learnt at the first call (half a minute); None without a log or its sweeps.
-
-        Raises:
-            UsageError: the log has no such LiDAR.
-        """
+        learnt at the first call (half a minute); None without a log or its sweeps. UsageError: the log has no such
+        LiDAR."""
         if sensor not in self._returns and self.scene is not None and self.scene.sweeps:
             self._returns[sensor] = learn_returns(self.scene, sensor, self._gone)
         return self._returns.get(sensor)
 
     def render(self, requests: Iterable[SensorRequest[Reply]]) -> list[Reply]:
-        """What cameras and LiDARs measure, in the order of the requests.
-
-        Raises:
-            UsageError: an object that the scene does not have.
-        """
+        """What cameras and LiDARs measure, in the order of the requests. UsageError: an object that the scene does not
+        have."""
         return [request.answer(self) for request in requests]
 
     # -- a moment ----------------------------------------------------------------------------------
 
     def at(self, moment: Instant) -> SceneModel:
-        """The scene with its objects where the moment puts them; it shares all Gaussians.
-
-        Raises:
-            UsageError: an object that the scene does not have.
-        """
+        """The scene with its objects where the moment puts them; it shares all Gaussians. UsageError: an object that
+        the scene does not have."""
         if moment.objects is None:
             return self.model
         unknown = sorted(set(moment.objects) - set(self._nodes))
@@ -376,11 +363,8 @@ class Session:
     # -- a picture ---------------------------------------------------------------------------------
 
     def picture(self, request: CameraRequest) -> CameraReply:
-        """What a camera sees.
-
-        Raises:
-            UsageError: an object that the scene does not have, or a picture that the session cannot repair.
-        """
+        """What a camera sees. UsageError: an object that the scene does not have, or a picture that the session cannot
+        repair."""
         width, height = request.optics.width, request.optics.height
         plain = request.optics.camera if isinstance(request.optics, Pinhole) else None
         if self._mixer is not None and (plain is None or request.end is not None or request.start.objects is not None):

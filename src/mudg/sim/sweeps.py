@@ -38,11 +38,8 @@ class WantedSweeps:
 
 
 def wanted_sweeps(name: str, scene: Scene) -> WantedSweeps:
-    """What ``--lidar`` asks for: a sensor of the scene, the name of a table, or a JSON file.
-
-    Raises:
-        UsageError: none of them, or a scene without sweeps. InputError: a malformed file.
-    """
+    """What ``--lidar`` asks for: a sensor of the scene, the name of a table, or a JSON file. UsageError: none of them,
+    or a scene without sweeps. InputError: a malformed file."""
     sensors = list(dict.fromkeys(sweep.sensor for sweep in scene.sweeps))
     if not sensors:
         what, remedy = "the log has no LiDAR sweeps to take poses and times from", "leave --lidar out"
@@ -62,11 +59,7 @@ MountedLidar = tuple[WantedSweeps, BeamTable, NDArray[np.float64]]
 
 def mounted(scene: Scene, lidar: str) -> MountedLidar:
     """A LiDAR by name: what is wanted, its beams, and vehicle-from-LiDAR f64[4, 4], of the first sweep of the sensor
-    for which the log has a pose of the vehicle.
-
-    Raises:
-        UsageError: no such LiDAR, or no pose of the vehicle.
-    """
+    for which the log has a pose of the vehicle. UsageError: no such LiDAR, or no pose of the vehicle."""
     wanted = wanted_sweeps(lidar, scene)
     for sweep in (one for one in scene.sweeps if one.sensor == wanted.sensor):
         ego = scene.ego.pose_at(sweep.time_s)

@@ -51,11 +51,8 @@ class TableFile(StrictRecord):
 
 
 def read_table(path: Path) -> BeamTable:
-    """The table in a JSON file (docs/simulator.md).
-
-    Raises:
-        InputError: no such file, or fields that make no sense. UsageError: numbers that no sensor has.
-    """
+    """The table in a JSON file (docs/simulator.md). InputError: no such file, or fields that make no sense. UsageError:
+    numbers that no sensor has."""
     found = parse_record(TableFile, store.read_json(path), str(path))
     elevations, limits = np.array(found.elevations_deg), (found.range_m[0], found.range_m[1])
     if found.field_deg < 360:

@@ -127,11 +127,7 @@ DRIVER_METHODS: Final = {
 
 
 def package() -> Any:
-    """The module ``grpc``.
-
-    Raises:
-        ResourceError: it is not installed.
-    """
+    """The module ``grpc``. ResourceError: it is not installed."""
     try:
         return importlib.import_module("grpc")
     except ImportError as error:
@@ -171,11 +167,8 @@ def pose_of(matrix: NDArray[np.float64]) -> Any:
 
 
 def matrix_of(pose: Any, where: str) -> NDArray[np.float64]:
-    """f64[4, 4] of a pose on the wire; float32 quaternions are brought to length 1.
-
-    Raises:
-        UsageError: not finite, or a quaternion far from length 1.
-    """
+    """f64[4, 4] of a pose on the wire; float32 quaternions are brought to length 1. UsageError: not finite, or a
+    quaternion far from length 1."""
     quaternion = np.array([pose.quat.w, pose.quat.x, pose.quat.y, pose.quat.z])
     place, length = np.array([pose.vec.x, pose.vec.y, pose.vec.z]), float(np.linalg.norm(quaternion))
     if not (np.isfinite(place).all() and 0.99 < length < 1.01):

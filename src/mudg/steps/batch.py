@@ -97,16 +97,14 @@ class BatchProgress(Step):
     """Show how far a batch is, what failed and what it took."""
 
     verb_name = "batch status"
-    examples = ("mudg batch status runs --watch-s 60",)
+    examples = ("mudg batch status runs",)
     out: Annotated[str, OUT]
     """Folder or address of a batch."""
-    watch_s: float = 0.0
-    """Show it again every so many seconds, until nothing is left (0 = once)."""
 
     def act(self) -> dict[str, Any]:
         from mudg.steps import batching
 
-        return batching.show_status(self.out, self.watch_s)
+        return batching.show_status(self.out)
 
 
 class BatchRetry(Step):

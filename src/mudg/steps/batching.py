@@ -161,15 +161,10 @@ def _with_absolute_paths(values: Any) -> Any:
     return os.path.abspath(values) if is_path else values
 
 
-def show_status(out: str, every_s: float = 0.0) -> dict[str, Any]:
-    """How far a batch is, what has failed and what it took; every so many seconds until nothing is left (0: once)."""
-    while True:
-        state = status.read_status(BatchFolder(Location.of(out)))
-        result: dict[str, Any] = {**state.record(), "text": status.text_of(state)}
-        if every_s <= 0 or not result["left"]:
-            return result
-        log.info(*result["text"].splitlines())
-        time.sleep(every_s)
+def show_status(out: str) -> dict[str, Any]:
+    """How far a batch is, what has failed and what it took."""
+    state = status.read_status(BatchFolder(Location.of(out)))
+    return {**state.record(), "text": status.text_of(state)}
 
 
 def settings_of(preset: PresetName, config: Path | None, given: Sequence[str]) -> RunConfig:

@@ -182,7 +182,7 @@ class Convert(Step):
         """What converts this checkpoint to a folder, and the address space that it may take."""
         from mudg.diffusion import convert
         from mudg.labels import depthlab
-        from mudg.scoring.converted import convert_weights
+        from mudg.scoring.sets import convert_weights
 
         config, source = self.settings, self.checkpoint
         if config.network != "diffusion":

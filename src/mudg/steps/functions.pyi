@@ -58,7 +58,6 @@ def bench(
     sampler: Literal['ddim', 'dpm_solver'] = 'ddim',
     eta: float | None = None,
     precision: Literal['auto', 'float32', 'bfloat16', 'float16'] = 'auto',
-    harmonize: bool = False,
     threads: int = 1,
     seed: int = 0,
     list: Literal['development', 'reported'] = 'development',
@@ -66,7 +65,6 @@ def bench(
     methods: tuple[str, ...] = ('nearest_fill', 'gs3d', 'street_gaussians', 'mudg_r', 'mudg_s'),
     iterations: int = 1000,
     guided_share: float = 1.5,
-    ablation: bool = False,
     variant: tuple[str, ...] = (),
     processes: int = 0,
     videos: bool = True,
@@ -75,39 +73,36 @@ def bench(
     shown: tuple[str, ...] = (),
     resolution: str = '',
     frames: str = '',
-    pose_iterations: int = 300,
+    edit_iterations: int = 300,
     device: str = 'auto',
     fuse: Mapping[str, Any] = ...,
     synthesize: Mapping[str, Any] = ...,
     fit: Mapping[str, Any] = ...,
     score: Mapping[str, Any] = ...,
 ) -> Any:
-    """Run a benchmark: mdm, poses, edit, shift or loop against exact truth, real on real logs, paper for tables of
-    papers.
+    """Run a benchmark: mdm, edit, shift or loop against exact truth, real on real logs, paper for tables of papers.
 
     Args:
-        name: Benchmark to run: mdm (diffusion model), poses (correction of box tracks), edit (edits of fitted scenes), shift (complete methods off the recorded path), loop (drives in fitted scenes), real (complete methods on real logs) or paper (a table of a paper).
-        sources: real, paper: folders of dataset logs, or scenes made by ingest. paper also takes city:reported or city:development, a list of generated cities. edit: folders of finished runs, whose drives are edited in place of generated cities.
+        name: Benchmark to run: mdm (diffusion model), edit (edits of fitted scenes), shift (complete methods off the recorded path), loop (drives in fitted scenes), real (complete methods on real logs) or paper (a table of a paper).
+        sources: real, paper: folders of dataset logs, or scenes made by ingest. paper also takes city:reported or city:development, a list of generated cities.
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         preset: shift, real, loop, paper: settings of clouds, generated views and fits to start from, as for mudg run (docs/presets.md). paper: the published set-up, with a published-type model.
         config: YAML file of settings, read before those given here.
         model: Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn or convert.
-        cities: mdm, poses, edit: list of cities. Choose settings on development; report results on reported, on which nothing was chosen.
-        count: mdm, poses, edit: number of cities taken from the list, 1 to 6. mdm: each gives four clips: shifted by 2, 3 and 4 m, and on the recorded path.
+        cities: mdm, edit: list of cities. Choose settings on development; report results on reported, on which nothing was chosen.
+        count: mdm, edit: number of cities taken from the list, 1 to 6. mdm: each gives four clips: shifted by 2, 3 and 4 m, and on the recorded path.
         steps: mdm: numbers of denoising steps to compare; each is measured on its own.
         sampler: mdm: sampler of the diffusion model. ddim: first order, with fresh noise between steps. dpm_solver: second order and deterministic, for many steps. Both cost one network pass per step. shift, real and paper have `--synthesize.sampler`, and likewise steps and eta.
         eta: mdm: sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given: 1).
         precision: Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere. float16: published-type models on CUDA devices (shift, real, paper).
-        harmonize: edit: add rows with the diffusion model: edited frames that it repaired, and fits that go on with them.
-        threads: mdm, poses, edit: number of torch threads.
+        threads: mdm, edit: number of torch threads.
         seed: Seed of all random numbers; the same seed gives the same result.
         list: shift, loop: list of logs. Choose settings on development; report results on reported, on which nothing was chosen.
         logs: shift, loop; paper with a list of cities: number of logs taken from the list, 1 to 8 (the development list has 4).
         methods: shift, real, loop: methods to compare: those of the default (loop: street_gaussians and mudg_s); pvg, s3gaussian, bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on until it has as many steps as mudg_s, without generated views. shift: also mudg_f, renders of mudg_s that the diffusion model repairs. paper: any of these of shift but mudg_f; with the default, all of them.
         iterations: shift, real, loop, paper: optimisation steps of every fit without virtual views.
         guided_share: shift, real, loop, paper: steps of fits under virtual views, as a multiple of the others'.
-        ablation: shift: add rows for mudg_s with only some virtual loss terms (colour; colour and depth; colour and classes), and with exact views instead of generated ones. real: add street_gaussians-longer.
         variant: shift, real: add rows for mudg_s with other settings of fit, each as NAME=FIELD:VALUE,FIELD:VALUE, where FIELD is a setting such as virtual.color_weight. Both of its fits have them.
         processes: shift, real, loop, paper: number of logs (real: also ways of hiding frames) processed at the same time, with one thread each (0 = one per core). Results do not depend on it.
         videos: shift, paper: also write videos of all methods side by side.
@@ -116,7 +111,7 @@ def bench(
         shown: real: cameras that the methods see in protocol camera; the first one gives the views beside the recorded path (empty = front, or the first camera).
         resolution: real, paper: image size of logs that are imported, as for ingest (empty = as recorded; paper: as the table says). paper with a list of cities: WIDTHxHEIGHT (empty = 384x256).
         frames: real, paper: frames of logs that are imported, FIRST:END without END itself, as for ingest (empty = all; paper: as the table says). paper with a list of cities: 0:END (empty = 0:24).
-        pose_iterations: poses, edit: optimisation steps of every fit.
+        edit_iterations: edit: optimisation steps of every fit.
         device: Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N.
         fuse: shift, real, paper: how the clouds of every log are made.
         synthesize: shift, real, paper: how views are generated. Model, number format, seed and device are the benchmark's own flags; where views are generated is the benchmark's matter (real: `--synthesize.shifts-m` for the views that fits learn from).
@@ -287,7 +282,6 @@ def export(
     overwrite: bool = False,
     config: str | Path | None = None,
     time_s: float | None = None,
-    animated: bool = False,
     nodes: tuple[str, ...] = (),
     axes: Literal['viewer', 'world'] = 'viewer',
     sky: Literal['keep', 'none', 'sphere'] = 'keep',
@@ -304,7 +298,6 @@ def export(
         overwrite: Replace the output if it exists.
         config: YAML file of settings, read before those given here.
         time_s: Moment at which moving objects are taken, on the scene's clock (not given: formats with motion hold all of it, others the middle of the log).
-        animated: Require that the file holds the motion: a format that cannot is refused.
         nodes: Track ids of the objects to write, and background for what stands (not given: everything).
         axes: viewer: axes that programs expect of the format. world: x forward, y left, z up in every format.
         sky: keep: a panorama, in formats that hold one. none: no sky. sphere: 6000 flat Gaussians 300 m away, in every format.
@@ -554,7 +547,6 @@ def page(
     config: str | Path | None = None,
     method: str = '',
     budget: int = 3000000,
-    memory_mb: int = 0,
     images: int = 150,
 ) -> Any:
     """Write a fitted scene as one HTML page: fly through it, any layer, any time, without a network.
@@ -568,7 +560,6 @@ def page(
         config: YAML file of settings, read before those given here.
         method: Fit of a run to show (empty = the best one: mudg_s, else street_gaussians).
         budget: Most Gaussians on the page (0 = all). Where a fit has more, those that the recorded cameras would see smallest and faintest are left out.
-        memory_mb: Most graphics memory and memory for sorting that the page may take in a browser, together, in megabytes (0 = no limit). Gaussians are left out as for the budget.
         images: Most recorded images on the page, taken evenly.
     """
     ...
@@ -704,7 +695,6 @@ def score(
     fvd_resize: Literal['videogpt', 'google', 'stylegan-v'] = 'videogpt',
     dino_weights: str = '',
     clip_weights: str = '',
-    video_features: str = '',
     detections: str = '',
     lanes: str = '',
     as_published: bool = False,
@@ -732,7 +722,6 @@ def score(
         fvd_resize: How FVD's network gets its 224 x 224 pixels: shorter side and crop (videogpt), or squashed (google, stylegan-v).
         dino_weights: File with the weights of DINOv2, ViT-S/14 or ViT-L/14 (`dinov2_vits14_pretrain.pth`, `dinov2_vitl14_pretrain.pth`, or their tensors as safetensors). FD-DINOv2 and the consistency of a video are then computed (empty = not computed).
         clip_weights: File with the image tower of CLIP ViT-L/14 at 336 pixels (`model.safetensors` of openai/clip-vit-large-patch14-336, or OpenAI's names). CMMD, CLIP-F and CLIP-V are then computed (empty = not computed).
-        video_features: Folder with features of clips that an extractor of your own made: METHOD/TRAJECTORY.safetensors and recorded/CAMERA.safetensors, each with a tensor `features` of [clips, values]. Frechet and polynomial distances are then computed (empty = not computed).
         detections: File with boxes that a detector found in the views, as COCO results. NTA-IoU is then computed (empty = not computed).
         lanes: Folder with lane masks that a detector made of the views, METHOD/TRAJECTORY/000000.png. NTL-IoU is then computed (empty = not computed). Generated cities only: prepared logs have no lane lines.
         as_published: NTA-IoU: project true boxes as the published score does, corners behind the camera included, instead of cutting them at the near plane.

@@ -125,7 +125,7 @@ def _write_viewer(out: Path) -> Path:
     from mudg.viewer.report import VIEWER
     from mudg.viewer.settings import PageConfig
 
-    page = view.page_of(PageConfig(), view.find_shown(PageConfig(), out, None, None), report="report.html")
+    page = view.page_of(PageConfig(), view.find_sources(PageConfig(), out, None, None).read(), report="report.html")
     store.remove(description_path(out / VIEWER))
     return view.write_page(page, out / VIEWER, (out / VIEWER).with_name(f"{Path(VIEWER).stem}_page"))["page"]
 

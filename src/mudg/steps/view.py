@@ -93,7 +93,7 @@ class Report(Step):
 class Serve(Step):
     """Serve a fitted scene to driving simulators over gRPC, as a renderer of cameras and LiDAR."""
 
-    examples = ("mudg serve runs/kitti --port 50051", "mudg serve runs/kitti --edits cut_in.yaml --metrics-port 9100")
+    examples = ("mudg serve runs/kitti --port 50051", "mudg serve runs/kitti --edits cut_in.yaml")
     source: Annotated[Path, RUN]
     """Folder of a finished mudg run, or Gaussian scene written by fit."""
     scene: Annotated[Path | None, Flag("FOLDER", "", "scene")] = None

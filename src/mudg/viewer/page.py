@@ -4,7 +4,6 @@ server."""
 from __future__ import annotations
 
 import base64
-import bisect
 import gzip
 import hashlib
 import io
@@ -105,15 +104,11 @@ def lay_out(
         what, expected = "more Gaussians than a page can hold", f"at most {MOST_CHUNKS * size:,}"
         remedy = "set --budget to keep those that cover most"
         raise UsageError(what, where="--budget", got=f"{len(ranks):,}", expected=expected, remedy=remedy)
-    rows, size = rows[ranks], chunk_rows(len(ranks), size)
+    rows = rows[ranks]
+    size = max(1, size // 2) if len(rows) <= SMALL * size else size
     level = np.repeat([np.int8(level_of(k)) for k in range(-(-len(rows) // size))], size)[: len(rows)]
     order = np.lexsort((morton_codes(columns["means"], node, rows), node[rows], level))
     return Layout(rows[order], size, len(node), visible, lost)
-
-
-def chunk_rows(rows: int, size: int = CHUNK) -> int:
-    """Rows per chunk of a scene with so many: half of ``size`` in a small scene."""
-    return max(1, size // 2) if rows <= SMALL * size else size
 
 
 def opacity_of(logits: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -204,13 +199,10 @@ Sections = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True, slots=True)
 class Packed:
-    """A scene for the page; its chunks are made one at a time.
-
-    Args:
-        model: the scene, on the CPU. layout: which Gaussians of it are on the page.
-        sections: what belongs to all chunks, see the module's docstring. facts: JSON values that describe everything.
-        notes: sentences about what the page shows differently from the rasterizer.
-    """
+    """A scene for the page; its chunks are made one at a time. ``model``: the scene, on the CPU. ``layout``: which
+    Gaussians of it are on the page. ``sections``: what belongs to all chunks, see the module's docstring. ``facts``:
+    JSON values that describe everything. ``notes``: sentences about what the page shows differently from the
+    rasterizer."""
 
     model: SceneModel
     layout: Layout
@@ -249,16 +241,10 @@ class Packed:
 def pack_scene(
     model: SceneModel, begin_s: float, path: NDArray[np.floating] | None = None, most: int = 0, chunk_rows: int = CHUNK
 ) -> Packed:
-    """Prepare a fitted scene for the page.
-
-    Args:
-        model: on the CPU. begin_s: time that becomes 0 in all sections, seconds.
-        path: positions of the cameras f64[m, 3]; which Gaussians are worth keeping depends on how near they are.
-        most: number of Gaussians to keep (0 = all that can be drawn). chunk_rows: Gaussians per chunk.
-
-    Raises:
-        UsageError: more Gaussians than a page can hold.
-    """
+    """Prepare a fitted scene for the page. ``model``: on the CPU. ``begin_s``: time that becomes 0 in all sections,
+    seconds. ``path``: positions of the cameras f64[m, 3]; which Gaussians are worth keeping depends on how near they
+    are. ``most``: number of Gaussians to keep (0 = all that can be drawn). ``chunk_rows``: Gaussians per chunk.
+    UsageError: more Gaussians than a page can hold."""
     columns = _columns(model)
     layout = lay_out(columns, model.table.labels["node"].numpy(), path, most, chunk_rows)
     low, high = _color_range(columns["sh_dc"], layout, model.sh_degree)
@@ -628,11 +614,12 @@ class ViewerPage:
 
     def graphics_bytes(self) -> int:
         """What the scenes take on the graphics card: texels of 16 bytes, and the order, 4 bytes per Gaussian."""
-        return sum(scene_bytes(p.kept, p.layout.size, p.facts["degree"])[0] for _, p in self.scenes)
+        rows = lambda packed: len(packed.layout) * min(packed.layout.size, packed.kept)
+        return sum(16 * TEXELS[packed.facts["degree"]] * rows(packed) + 4 * packed.kept for _, packed in self.scenes)
 
     def heap_bytes(self) -> int:
         """What a browser keeps of the scenes to sort them: places, nodes, keys and rows twice, two orders."""
-        return sum(scene_bytes(p.kept, p.layout.size, p.facts["degree"])[1] for _, p in self.scenes)
+        return SORT_BYTES * sum(packed.kept for _, packed in self.scenes)
 
     def one_file(self, files: Iterable[PageFile], facts: Mapping[str, Any]) -> bytes:
         """The page with all data in it."""
@@ -663,19 +650,6 @@ class ViewerPage:
             entry=Markup(entry),  # noqa: S704
         )
         return text.encode()
-
-
-def scene_bytes(rows: int, size: int, degree: int) -> tuple[int, int]:
-    """What a scene of so many rows takes on the graphics card, and to be sorted; ``size``: rows per chunk."""
-    layers = -(-rows // size)
-    return 16 * TEXELS[degree] * layers * min(size, rows) + 4 * rows, SORT_BYTES * rows
-
-
-def most_within(limit_bytes: float, degree: int, size: int) -> int:
-    """The most rows whose graphics memory and memory for sorting are together within a limit."""
-    most = int(limit_bytes // (16 * TEXELS[degree] + 4 + SORT_BYTES))
-    needed = lambda rows: sum(scene_bytes(rows, chunk_rows(rows, size), degree))
-    return bisect.bisect_right(range(most + 1), limit_bytes, key=needed) - 1
 
 
 def asset(name: str) -> str:

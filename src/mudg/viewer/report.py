@@ -184,14 +184,10 @@ def page(
     out: Path = Path(),
     curves: Sequence[Mapping[str, Any]] = (),
 ) -> str:
-    """The text of the page.
-
-    Args:
-        scores: ``metrics.json``. ledger: ``run.json`` of the chain. settings: ``run.yaml``. videos: one per trajectory.
-        columns: panel columns in the order in which they stand in the videos.
-        viewer: relative address of the page that shows the fitted scene, or empty. out: folder of the run, for
-            commands. curves: as of ``fit_charts``.
-    """
+    """The text of the page. ``scores``: ``metrics.json``. ``ledger``: ``run.json`` of the chain. ``settings``:
+    ``run.yaml``. ``videos``: one per trajectory. ``columns``: panel columns in the order in which they stand in the
+    videos. ``viewer``: relative address of the page that shows the fitted scene, or empty. ``out``: folder of the run,
+    for commands. ``curves``: as of ``fit_charts``."""
     scene = scores["scene"]
     heading, lead = headline(scores)
     source = str(ledger.get("asked", {}).get("source", "LOG"))
@@ -616,11 +612,8 @@ def write_page(out: Path, videos: Sequence[TrajectoryVideo]) -> Path:
 
 def progress_page(out: Path, steps: Sequence[tuple[str, str, float]], state: str, standing: str) -> str:
     """The text of the page of a run that has not ended: its steps, and the pictures that they have left so far.
-
-    Args:
-        steps: name, state and seconds of each. state: of the run: ``running``, ``interrupted`` or ``failed``. standing:
-            which step runs, in words.
-    """
+    ``steps``: name, state and seconds of each. ``state``: of the run: ``running``, ``interrupted`` or ``failed``.
+    ``standing``: which step runs, in words."""
     leads = {
         "running": f"{standing}. This page renews itself.",
         "interrupted": "The run was stopped. Repeat the same command to go on.",

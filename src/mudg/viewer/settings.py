@@ -15,9 +15,6 @@ class PageConfig:
     budget: int = setting(default=3_000_000, ge=0)
     """Most Gaussians on the page (0 = all). Where a fit has more, those that the recorded cameras would see smallest
     and faintest are left out."""
-    memory_mb: int = setting(default=0, ge=0)
-    """Most graphics memory and memory for sorting that the page may take in a browser, together, in megabytes (0 = no
-    limit). Gaussians are left out as for the budget."""
     images: int = setting(default=150, ge=0)
     """Most recorded images on the page, taken evenly."""
 

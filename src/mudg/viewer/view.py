@@ -35,7 +35,6 @@ from mudg.viewer.page import CHUNK, ONE_FILE_BYTES, Packed, PageFile, ViewerPage
 from mudg.viewer.server import Answer, Site, SiteServer, Stream, open_server, show, token_for
 from mudg.viewer.settings import PageConfig, ViewConfig
 
-MEGABYTE: Final = 1e6
 PAGE_IMAGE_PX, LIVE_IMAGE_PX = 320, 640
 """Width of recorded images on a page of one file, and on one that a server shows."""
 NAMES: Final = {"mudg_s": "with diffusion", "street_gaussians": "without diffusion"}
@@ -202,22 +201,11 @@ def find_sources(config: PageConfig, run: Path, scene: Path | None, compare: Pat
     return ShownSources(place, tuple(fits), parts.fused)
 
 
-def find_shown(config: PageConfig, run: Path, scene: Path | None, compare: Path | None) -> Shown:
-    """``find_sources``, read."""
-    return find_sources(config, run, scene, compare).read()
-
-
 def page_of(config: PageConfig, shown: Shown, report: str = "", live: dict[str, Any] | None = None) -> ViewerPage:
     """The page of what is shown."""
     scene, begin = shown.scene, pages.begin_of(shown.scene)
     path = np.stack([frame.view.center_world for frame in scene.frames])
-    packed = []
-    for name, model in shown.fits:
-        most = config.budget  # 0 = all
-        if config.memory_mb:
-            within = pages.most_within(MEGABYTE * config.memory_mb / len(shown.fits), model.sh_degree, CHUNK)
-            most = min(most, within) if most else within
-        packed.append((name, pages.pack_scene(model, begin, path, most, CHUNK)))
+    packed = [(name, pages.pack_scene(model, begin, path, config.budget, CHUNK)) for name, model in shown.fits]
     width = PAGE_IMAGE_PX if live is None else LIVE_IMAGE_PX
     facts = pages.log_facts(scene, shown.fits[0][1].colors, width, config.images)
     facts = pages.with_particles(pages.with_ground(facts, shown.ground()), SEED)
