@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from mudg.base import seeds, store
 from mudg.base.errors import InputError, UsageError
 from mudg.benchmarks import run as bench
 from mudg.benchmarks import shift
-from mudg.benchmarks.chain import ExactViews
 from mudg.benchmarks.rows import LONGER, shift_rows
 from mudg.benchmarks.settings import BenchConfig
 from mudg.city import logs as city_logs
@@ -167,19 +165,6 @@ def made(tmp_path_factory):
     out = tmp_path_factory.mktemp("shift")
     config = BenchConfig(logs=1, iterations=30, processes=1, methods=("nearest_fill", "street_gaussians"))
     return shift.run(config, out, rules=TINY, distances_m=(3.0,)), config
-
-
-@pytest.mark.slow
-def test_exact_views_are_the_truth_beside_the_path_and_nothing_of_the_path(made, tmp_path):
-    truth = made[0] / str(city_logs.DEVELOPMENT[0]) / "truth"
-    names = sorted(path.name for path in truth.iterdir() if path.is_dir())
-    paths = [SimpleNamespace(name=name, origin="shifted" if "shift" in name else "recorded") for name in names]
-    out = ExactViews(truth=truth, paths=tuple(paths), out=tmp_path / "exact").run()
-    sets = list_observation_sets(out)
-    assert sorted(sets) == [name for name in names if "shift" in name] != names
-    seen, true = (read_observations(folder / "front_shift+3.0")[1] for folder in (out, truth))
-    assert seen.kind == "virtual"
-    assert torch.equal(seen.rgb, true.rgb) and torch.equal(seen.semantics, true.semantics)
 
 
 @pytest.mark.slow

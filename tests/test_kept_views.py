@@ -116,30 +116,6 @@ def test_every_combination_of_fields_and_number_types_comes_back_to_the_bit(tmp_
         assert_same(found, wanted)
 
 
-def test_a_file_of_views_reads_one_at_a_time_from_any_thread(tmp_path):
-    views = [a_view(seed) for seed in range(40)]
-    read = filed(tmp_path, views)
-    wrong: list[int] = []
-
-    def check(start: int) -> None:
-        for index in range(start, 40, 4):
-            try:
-                assert_same(read[index], views[index])
-            except AssertionError:
-                wrong.append(index)
-
-    threads = [threading.Thread(target=check, args=(start,)) for start in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert wrong == []
-    with pytest.raises(IndexError):
-        read[40]
-    with pytest.raises(TypeError):
-        read[3:5]
-
-
 @pytest.mark.parametrize("first", [1, 14])
 def test_views_prepared_ahead_are_those_of_their_steps(tmp_path, first):
     """From the beginning, and from the step at which a resumed fit goes on."""
@@ -229,15 +205,6 @@ def test_a_disk_that_fills_up_is_an_error_in_words(tmp_path, monkeypatch):
     monkeypatch.setattr(scratch.tempfile, "TemporaryFile", lambda **_: open("/dev/full", "wb", buffering=0))
     with pytest.raises(ResourceError, match=r"writing failed[\s\S]*No space left[\s\S]*free disk space"):
         scratch.ScratchFile(tmp_path).append(np.zeros(100, np.uint8))
-
-
-def test_a_mapped_array_keeps_its_values_and_has_no_name(tmp_path):
-    array = scratch.mapped_array(tmp_path, (3, 5000), np.float32)
-    assert not array.any()
-    array[:] = np.arange(15000).reshape(3, 5000)
-    scratch.rest_mapped()
-    assert np.array_equal(array, np.arange(15000).reshape(3, 5000))
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_mapped_array_that_the_disk_has_no_room_for_is_an_error_in_words(tmp_path, monkeypatch):
