@@ -347,33 +347,6 @@ def test_shards_have_drivers_of_their_own(tmp_path: Path) -> None:
         assert [one.host.split()[0] for one in folder.owners().values()] == [socket.gethostname()]
 
 
-def test_two_drivers_that_begin_at_the_same_moment(tmp_path: Path) -> None:
-    """Of eight processes at most one drives at a time."""
-    code = """
-import sys, time
-from pathlib import Path
-from mudg.base.errors import UsageError
-from mudg.base.location import Location
-from mudg.fleet.records import BatchFolder
-start, out = Path(sys.argv[1]), Path(sys.argv[2])
-(out.parent / ("ready" + sys.argv[3])).touch()
-while not start.exists():
-    time.sleep(0.001)
-try:
-    with BatchFolder(Location.of(out)).owned():
-        time.sleep(1.0)
-        print("mine")
-except UsageError as error:
-    print("refused", error.what)
-"""
-    words = [sys.executable, "-c", code, str(tmp_path / "start"), str(tmp_path / "out")]
-    racers = [subprocess.Popen([*words, str(number)], stdout=subprocess.PIPE, text=True) for number in range(4)]
-    wait_for(lambda: len(list(tmp_path.glob("ready*"))) == 4)
-    (tmp_path / "start").touch()
-    answers = [one.communicate()[0].split()[0] for one in racers]
-    assert answers.count("mine") <= 1 and set(answers) <= {"mine", "refused"}
-
-
 # ---- status --------------------------------------------------------------------------------------
 
 

@@ -459,19 +459,6 @@ def test_a_table_on_cities_end_to_end(filled):
 
 
 @pytest.mark.slow
-def test_further_paths_end_to_end(filled, tmp_path):
-    _, config = filled
-    changes = {"table": "drivedreamer4d", "logs": 1, "methods": ("mudg_r",)}
-    reset = {"iterations": BenchConfig().iterations, "fit": BenchConfig().fit}  # nothing is fitted
-    config = dataclasses.replace(config, **changes, **reset)
-    document = store.read_json(
-        bench.run("paper", config, tmp_path / "out", sources=("city:development",)) / "bench.json"
-    )
-    for place in TABLES["drivedreamer4d"].places:
-        assert "mean" in document["cells"]["mudg_r"][place.name]["psnr"], place.name
-
-
-@pytest.mark.slow
 def test_a_table_on_a_recorded_log(recorded, filled, tmp_path):
     _, config = filled
     config = dataclasses.replace(config, logs=8, resolution="", methods=("street_gaussians",), frames="")

@@ -456,19 +456,6 @@ def test_classes_of_points_are_scored_where_a_log_has_them_and_hidden_from_metho
         assert seen.sweeps and all(read_points(seen, sweep).classes is None for sweep in seen.sweeps)
 
 
-def test_classes_of_points_change_nothing_that_methods_make(scene, tmp_path):
-    found = []
-    for name, train_id in (("a", "road"), ("b", "sky")):
-        with_classes(scene, tmp_path / name, lambda count, i=ID[train_id]: np.full(count, i, np.uint8))
-        job = job_of(tmp_path / f"out_{name}", tmp_path / name, SPLITS["all"], BenchConfig())
-        job.write_seen(read_scene(tmp_path / name), places.HeldOut())
-        found.append((job.chain().fuse() / "static.safetensors").read_bytes())
-    assert found[0] == found[1]
-    # from the whole log the cloud takes them over
-    given = Fuse(scene=tmp_path / "a", out=tmp_path / "told", settings=FuseConfig()).run()
-    assert (given / "static.safetensors").read_bytes() != found[0]
-
-
 def test_a_dataset_log_is_imported_with_the_settings_of_the_command(city, tmp_path):
     log = write_custom.write_log(read_scene(city), tmp_path / "drive")
     config = BenchConfig(methods=("nearest_fill",), protocols=("gap-1",), frames="0:4", resolution="48", processes=1)

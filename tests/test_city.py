@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import subprocess
 import sys
@@ -149,28 +148,6 @@ def test_labels_come_from_the_pixel_centre_and_belong_together(world: CityWorld)
     assert np.isfinite(one.rgb).all()
 
 
-def test_supersampling_converges(world: CityWorld) -> None:
-    view = world.frame_views("front")[3]
-    reference = world.render(view, supersample=8).rgb
-    errors = [float(((world.render(view, supersample=n).rgb - reference) ** 2).mean()) for n in (1, 2, 4)]
-    assert errors[0] > 1.5 * errors[1] > 2 * errors[2]
-
-
-def test_instances_lie_in_their_boxes(world: CityWorld) -> None:
-    view = world.frame_views("front")[6]
-    truth = world.render(view, supersample=1)
-    points = view.center_world + pixel_rays(view) * np.where(truth.sky, 1, truth.depth)[..., None]
-    boxes = {world.instance_of(t.id): t for t in world.tracks()}
-    seen = [i for i in np.unique(truth.instance) if i > 0]
-    assert len(seen) >= 4
-    for instance in seen:
-        track = boxes[int(instance)]
-        pose = track.pose_at(view.time_s)
-        local = geometry.transform_points(geometry.invert(pose), points[truth.instance == instance])
-        # door mirrors stick out sideways, roof rails and lamps upwards
-        assert (np.abs(local) < track.size_m / 2 + [0.15, 0.3, 0.3]).all(), track.id
-
-
 # --- LiDAR ----------------------------------------------------------------------------------------
 
 
@@ -207,18 +184,6 @@ def scanner_mount(world: CityWorld) -> np.ndarray:
     sweep_pose = world.lidar_sweep(0).world_from_lidar
     ego = world.ego_path().pose_at(0.0)
     return geometry.invert(ego) @ sweep_pose
-
-
-def test_returns_project_onto_the_depth_image(world: CityWorld) -> None:
-    sweep, view = world.lidar_sweep(6), world.frame_views("front")[6].resized(480, 320)
-    truth = world.render(view, supersample=1)
-    uv, z = geometry.project(view, world_points(sweep))
-    inside = (z > 0.5) & (uv[:, 0] > 0) & (uv[:, 0] < 480) & (uv[:, 1] > 0) & (uv[:, 1] < 320)
-    col, row = uv[inside].astype(int).T
-    error = np.abs(z[inside] - truth.depth[row, col])
-    assert inside.sum() > 1000
-    assert np.median(error) < 0.05
-    assert (truth.semantics[row, col] == sweep.semantics[inside]).mean() > 0.9
 
 
 def test_range_noise_and_dropout_are_as_configured() -> None:
@@ -408,17 +373,6 @@ def test_same_result_with_any_number_of_threads(world: CityWorld) -> None:
         native.set_threads(before)
     assert_same_truth(one, two)
     np.testing.assert_array_equal(one_sweep.points.xyz, two_sweep.points.xyz)
-
-
-def test_same_result_in_another_process(world: CityWorld) -> None:
-    code = (
-        "import hashlib\nfrom mudg.city import CityConfig, CityWorld\n"
-        f"w = CityWorld(CityConfig(**{ {k: getattr(CONFIG, k) for k in CONFIG.__dataclass_fields__}!r}))\n"
-        "print(hashlib.sha256(w.render(w.frame_views('front')[1]).rgb.tobytes()).hexdigest())"
-    )
-    mine = hashlib.sha256(world.render(world.frame_views("front")[1]).rgb.tobytes()).hexdigest()
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert out.stdout.strip() == mine
 
 
 def test_noise_is_small_and_differs_between_frames(world: CityWorld) -> None:

@@ -374,19 +374,6 @@ def test_what_is_no_asset_is_refused(tmp_path: Path) -> None:
         assets.read_asset(file)
 
 
-def test_an_asset_takes_the_light_of_the_scene() -> None:
-    here, there = np.array([0.2, 0.1, 0.3]), np.array([0.1, 0.1, 0.6])
-    asset = edited.asset_of(toy(), "car-1", light_rgb=here)
-    lit, gain = edited.matched_light(asset, there)
-    assert gain == pytest.approx([2**-0.75, 1, 2**0.75])
-    colors = (0.5 + SH_C0 * one.columns["sh_dc"].double().numpy() for one in (asset, lit))
-    before, after = (edited.linear_of(rgb.clip(0)) for rgb in colors)
-    assert after == pytest.approx(before * gain, rel=1e-4, abs=1e-6)
-    assert edited.matched_light(asset, None)[1] == pytest.approx([1, 1, 1])
-    assert edited.matched_light(edited.asset_of(toy(), "car-1"), there)[1] == pytest.approx([1, 1, 1])
-    assert edited.light_gain(np.full(3, 0.01), np.full(3, 0.9)) == pytest.approx([4, 4, 4])
-
-
 def test_the_light_of_surfaces_is_that_of_the_pixels_that_show_them() -> None:
     """Ground of two greys under a white sky, which must not count."""
     model = toy()

@@ -13,8 +13,8 @@ from toy_clips import made_up_clip, with_patch
 
 from mudg.base.errors import UsageError
 from mudg.diffusion import model as mdm
-from mudg.diffusion import model_files, network, requests
-from mudg.diffusion.model import BatchPart, LossSettings, Stacked
+from mudg.diffusion import network, requests
+from mudg.diffusion.model import BatchPart, LossSettings
 from mudg.diffusion.models import draw_weights
 from mudg.diffusion.network import ConditionPixels, Finisher, Made, Refined, finish_in_tiles, with_detail
 from mudg.diffusion.requests import SampleRequest
@@ -272,28 +272,6 @@ def test_a_patch_is_finished_from_its_own_part_of_its_own_clip(monkeypatch, row,
         along = made.rgb[:, axis, :, 0] if axis == 0 else made.rgb[:, axis, 0]
         assert torch.allclose(along, expected.expand(frames, -1), atol=1e-3)
     assert bool((made.rgb[:, 2] == 1).all())
-
-
-@pytest.mark.parametrize(("row", "column", "side"), [PLACES[1], PLACES[6]])
-def test_refining_the_surroundings_of_a_patch_is_as_good_as_refining_its_image(row, column, side):
-    """With the shipped weights, and half of the condition noise: losses of the whole image, put together from what
-    `refine` and `enlarged` make of it. One cell beside the place, the colour's would be 0.04 to 0.12 of their value
-    apart."""
-    model, frames, generator = model_files.load("embedded"), 4, torch.Generator().manual_seed(row)
-    clip = with_patch(made_up_clip(3, 192, 128), row, column, side, scale=2)
-    clip = replace(clip, fine=replace(clip.fine, clip=replace(clip.fine.clip, rgb=clip.fine.clip.rgb * 0.9)))
-    encoded, truth = model.encode_condition([clip.condition]), model.encode_truth([clip])
-    stated = {m: z + 0.2 * torch.randn(z.shape, generator=generator) for m, z in truth.latents.items()}
-    with torch.no_grad():
-        terms = model._finisher_terms(stated, encoded, [clip])
-        whole = model._made(model.refine({m: z[0] for m, z in stated.items()}, encoded.pixels, frames))
-        made = whole.enlarged((256, 384), (2 * row, 2 * (row + side)), (2 * column, 2 * (column + side)))
-        given = model._pixels_of(Stacked.of([clip.fine.clip.condition]))
-        done = model.finisher(made, given, frames, torch.full((frames,), 2.0))
-        as_refined = Refined(done.rgb, done.depth_code, network.class_scores(done), done.log_error)
-        expected = model._pixel_terms(as_refined, model.pixel_truth([clip.fine.clip]), "fine")
-    for name, value in expected.items():
-        assert float(terms[name]) == pytest.approx(float(value), rel=1.5e-3, abs=1e-5), name
 
 
 def test_detail_comes_from_a_warped_image_that_agrees_and_from_nothing_else():

@@ -141,19 +141,6 @@ def test_results_depend_neither_on_threads_nor_on_what_is_remembered(world, tmp_
     assert fitted_bytes(first) == fitted_bytes(second)
 
 
-def test_the_kinds_of_densification_differ_and_none_keeps_the_rows(world, tmp_path):
-    configs = {
-        kind: settings(iterations=44, densify__max_gaussians=1600, densify__kind=kind) for kind in ("gradient", "none")
-    }
-    made = {kind: fit_to(world, tmp_path / kind, config).run() for kind, config in configs.items()}
-    rows = {kind: len(fit.load_model(folder).table) for kind, folder in made.items()}
-    start = len(fit.load_model(fit_to(world, tmp_path / "start", settings(iterations=1)).run()).table)
-    assert rows["none"] == start
-    assert start < rows["gradient"] <= 1600
-    logged = [json.loads(line).get("rows", 0) for line in (made["gradient"] / "log.jsonl").read_text().splitlines()]
-    assert 1500 < max(logged) <= 1600
-
-
 def test_the_opacity_weight_makes_gaussians_fainter_and_is_logged(world, tmp_path):
     means = {}
     for weight in (0.0, 0.5):
@@ -351,19 +338,6 @@ def test_fused_points_give_depth_beside_the_path(world):
     assert relative.median() < 0.03
     car = exact.semantics.reshape(-1)[lidar.pixel] == ID["car"]
     assert car.sum() > 5 and relative[car].median() < 0.05
-
-
-def test_options_of_virtual_views_change_the_fit_and_stay_finite(world, tmp_path):
-    usual = settings("mudg_s", iterations=30, densify__max_gaussians=2500, virtual__start=0.0, virtual__probability=0.6)
-    changes = ({}, {"lidar_weight": 0.0}, {"ssim_weight": 0.0})
-    configs = [replace(usual, virtual=replace(usual.virtual, **change)) for change in changes]
-    fits = [
-        fit_to(world, tmp_path / str(n), config, observations=(world["virtual"],)) for n, config in enumerate(configs)
-    ]
-    folders = [step.run() for step in fits]
-    assert len({fitted_bytes(folder)["gaussians.safetensors"] for folder in folders}) == len(folders)
-    for folder in folders:
-        assert all(torch.isfinite(value).all() for value in fit.load_model(folder).table.columns.values())
 
 
 def test_virtual_views_of_the_published_fit_have_the_published_terms_alone(world, tmp_path, monkeypatch):

@@ -245,19 +245,6 @@ def test_what_is_not_finite_is_found_in_one_look(world):
 # ---- parts ---------------------------------------------------------------------------------------
 
 
-def test_a_table_moves_with_moments_labels_and_nothing_else():
-    table = Table({"a": torch.arange(6.0).view(3, 2)}, {"node": torch.tensor([0, 1, 2])})
-    table.moment1["a"] += 1
-    assert table.to(CPU) is table
-    with pretend_device() as there:
-        moved = table.to(there)
-        assert moved.device == there
-        assert moved["a"].requires_grad
-        back = moved.to(CPU)
-    for name, value in table.state().items():
-        assert torch.equal(back.state()[name], value), name
-
-
 def test_a_fitted_scene_moves_and_renders_the_same(plain_fit):
     model = fit.load_model(plain_fit)
     assert model.to(CPU) is model

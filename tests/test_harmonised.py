@@ -22,7 +22,7 @@ from toy_world import write_scene
 from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
-from mudg.base.types import Condition, FusedCloud, Observation, Photo, PointCloud, RenderPlanes, View
+from mudg.base.types import FusedCloud, Observation, Photo, PointCloud, RenderPlanes, View
 from mudg.base.weather_settings import Conditions
 from mudg.core.edit import Motion
 from mudg.core.pictures import to_bytes
@@ -479,18 +479,6 @@ def published(tmp_path_factory) -> str:
     return str(write_tiny(tmp_path_factory.mktemp("published")))
 
 
-def watched(monkeypatch) -> list[Condition]:
-    """Fills with what the published-type model is given."""
-    given, sample = list[Condition](), PublishedMDM.sample
-
-    def noted(model, condition, request):
-        given.append(condition)
-        return sample(model, condition, request)
-
-    monkeypatch.setattr(PublishedMDM, "sample", noted)
-    return given
-
-
 def test_points_and_reference_of_the_published_condition_are_in_fog_at_their_own_distances() -> None:
     """Koschmieder's law: a black wall 12 m ahead has 1 - exp(-3 r / visibility) of the light of what is far away. So
     have its points, although their depth at the network's size is mixed with gaps, and its photograph, whose distance a
@@ -522,37 +510,6 @@ def test_points_and_reference_of_the_published_condition_are_in_fog_at_their_own
     small = torch.nn.functional.interpolate(expected[None], size=(8, 12), mode="bilinear")[0]
     assert torch.allclose(made.reference, small, atol=0.015)
     assert torch.allclose(made.color[0][:, colored], expected[:, ::4, ::4][:, colored], atol=0.015)
-
-
-@pytest.mark.slow
-def test_views_are_generated_in_weather_by_a_published_type_model(
-    run: Path, published: str, tmp_path: Path, monkeypatch
-) -> None:
-    edits, fitted = script(tmp_path, "- light: {time: night}"), run / FITTED
-    config = SynthesizeConfig(shifts_m=(1.0,), model=published, steps=1, precision="float32")
-    given = watched(monkeypatch)
-    synthesized(run, tmp_path / "day", config)
-    synthesized(run, tmp_path / "night", config, fitted=fitted, edits=edits)
-    day, night = given
-    assert float(night.reference.mean()) < 0.6 * float(day.reference.mean())
-    assert float(night.color.mean()) < 0.6 * float(day.color.mean())
-    assert torch.equal(day.depth, night.depth)
-    with pytest.raises(UsageError, match="for weather and light of --edits only"):
-        synthesized(run, tmp_path / "other", config, fitted=fitted)
-
-
-def test_a_removed_car_is_repaired_by_a_published_type_model(
-    run: Path, published: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, unguarded: None
-) -> None:
-    """Only what the edit touched changes."""
-    edits, given = script(tmp_path, CAR_GONE), watched(monkeypatch)
-    before = views_of(rendered(run, tmp_path / "plain", edits=edits))
-    parts = {"fused": run / "fuse", "harmonize": {"model": published, "steps": 1}}
-    made = views_of(rendered(run, tmp_path / "made", edits=edits, **parts))
-    assert len(given) == 1
-    changed = [(a.rgb != b.rgb).any(0) for a, b in zip(before, made, strict=True)]
-    assert any(bool(mask.any()) for mask in changed)
-    assert all(float(mask.float().mean()) < 0.5 for mask in changed)
 
 
 @pytest.mark.parametrize(

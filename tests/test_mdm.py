@@ -10,7 +10,6 @@ from refusals import refused
 
 from mudg.base.errors import IntegrityError, UsageError
 from mudg.base.types import Camera, Clip, Condition, View
-from mudg.diffusion import model as mdm
 from mudg.diffusion import model_files, network, requests
 from mudg.diffusion.model import MDM, BatchPart, LossSettings, MDMConfig
 from mudg.diffusion.network import ConditionPixels, Refiner
@@ -103,26 +102,6 @@ def test_given_classes_are_copied_where_they_are_known():
     assert float((sample.semantics == blocks[:, 0])[known].float().mean()) > 0.95
     without = model.sample(replace(condition, semantics=None, backdrop_semantics=None), SampleRequest(1))
     assert float((without.semantics == blocks[:, 0])[known].float().mean()) < 0.2
-
-
-def test_untrained_model_copies_the_condition_where_it_is_seen():
-    """At the start the x0 head gives sigmoid(4) of the condition's latent where everything was seen."""
-    model = MDM(TINY)
-    condition = replace(some_condition(), semantics=None)
-    everything = torch.ones_like(condition.valid)
-    condition = replace(condition, valid=everything, warped=everything)
-    encoded = model.encode_condition(condition)
-    stated, _ = model.predict(some_latents(model), encoded, torch.tensor([999]))
-    gate = torch.sigmoid(torch.tensor(mdm.COPY_BIAS))
-    assert torch.allclose(stated["depth"], gate * encoded.copy["depth"], atol=1e-5)
-    assert torch.allclose(stated["rgb"], gate * encoded.copy["rgb"] + (1 - gate) * encoded.backdrop, atol=1e-5)
-
-
-def test_class_scores_are_shares():
-    model = randomised(TINY)
-    encoded = model.encode_condition(some_condition())
-    _, log_shares = model.predict(some_latents(model), encoded, torch.tensor([500]))
-    assert torch.allclose(log_shares.exp().sum(2), torch.ones(1, 3, 8, 12), atol=1e-5)
 
 
 def test_known_frames_are_kept():
@@ -353,17 +332,6 @@ def test_shares_count_labelled_pixels_only():
     assert shares.shape == (19, 1, 2) and float(shares[0, 0, 0]) == pytest.approx(0.75)
     assert float(shares[13, 0, 0]) == pytest.approx(0.25) and float(shares[10, 0, 1]) == 1.0
     assert float(semantic_shares(torch.full((2, 2), 255)).sum()) == 0.0
-
-
-@pytest.mark.parametrize("axes", [(), (2, 3)])
-def test_leading_axes_are_kept(axes):
-    codec = PatchCodec(CodecConfig()).eval()
-    rgb, depth, ids = torch.rand(*axes, 3, 8, 8), torch.full((*axes, 1, 8, 8), 9.0), torch.zeros(*axes, 8, 8).long()
-    with torch.no_grad():
-        made = codec.decode(
-            {"rgb": codec.encode_rgb(rgb), "depth": codec.encode_depth(depth), "semantics": codec.encode_semantics(ids)}
-        )
-    assert made.rgb.shape == rgb.shape and made.depth.shape == depth.shape and made.semantics.shape == ids.shape
 
 
 # ---- the refiner: what is copied, shapes ---------------------------------------------------------

@@ -19,8 +19,7 @@ from mudg.base.types import Camera, Track, View
 from mudg.baselines.bezier import BezierNode
 from mudg.core import harmonics, native_ops
 from mudg.core.raster.rasterize import RasterConfig, rasterize
-from mudg.core.raster.request import harmonics as harmonics_of
-from mudg.core.table import Table, torch_adam_columns
+from mudg.core.table import Table
 from mudg.gaussians import model as scene_model
 from mudg.gaussians import nodes
 from mudg.gaussians import start as initial
@@ -76,16 +75,6 @@ def test_pose_agrees_with_the_track(time_s):
     assert np.abs(harmonics.rotation_matrix(quat).detach().numpy() - expected[:3, :3]).max() < 1e-5
     for outside in (-0.01, 2.01, 50.0):
         assert RigidNode.from_track(track()).pose_at(outside) is None
-
-
-def test_learnt_yaw_of_either_key_turns_the_pose_between_them():
-    flat = Track("flat", "car", [4, 2, 1.5], [0.0, 1.0], np.stack([pose(0, 0, 0, 0.0), pose(1, 0, 0, 0.0)]))
-    node = RigidNode.from_track(flat, learn_pose=True)
-    for key, yaw, expected in ((1, 0.4, 0.1), (0, 0.2, 0.25)):
-        with torch.no_grad():
-            node.offsets["yaw"][key] = yaw
-        rotation = harmonics.rotation_matrix(node.pose_at(0.25)[1]).detach().numpy()
-        assert math.atan2(rotation[1, 0], rotation[0, 0]) == pytest.approx(expected, abs=1e-6)
 
 
 def test_offsets_act_in_the_frame_of_the_box():
@@ -155,16 +144,6 @@ def test_compose_places_objects_and_hides_absent_ones():
     assert (compose(scene, 5.3).opacity[9:] > 0).all()
 
 
-def test_colour_bands():
-    scene = model(degree=2)
-    both = torch.cat([scene.table["sh_dc"], scene.table["sh_rest"]], 1)
-    assert torch.equal(harmonics_of(compose(scene, 0.3))[:5], both[:5])  # those of objects turn with them
-    lowest = compose(model(), 0.3)
-    assert lowest.sh.shape == (12, 1, 3)
-    assert lowest.sh_rest is None
-    assert compose(scene, 0.3, semantics=False).extra is None
-
-
 def test_gradients_reach_every_column_of_present_rows():
     scene = model(degree=1)
     g = compose(scene, 0.3)
@@ -217,15 +196,6 @@ def test_sky_shows_the_colour_of_the_direction(yaw):
     rays = np.stack([(u - 20) / 30, (v - 15) / 30, np.ones_like(u)], -1) @ view.world_from_cam[:3, :3].T
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     assert np.abs(shown.transpose(1, 2, 0) - rays).max() < 0.03
-
-
-def test_sky_does_not_depend_on_where_the_camera_stands():
-    sky = SkyNode.uniform(16)
-    with torch.no_grad():
-        sky.table["panorama"].copy_(torch.rand(1, 3, 16, 32, generator=torch.Generator().manual_seed(0)))
-    near = looking(0.4)
-    far = View(near.camera, geometry.from_rotation_translation(near.world_from_cam[:3, :3], [0.0, 0.0, 0.0]), 3.0)
-    assert torch.equal(sky_picture(sky, near), sky_picture(sky, far))
 
 
 def test_sky_filled_from_measured_colours():
@@ -332,19 +302,6 @@ def test_append_gives_zero_moments_and_wants_every_column():
     refused("fill every column", table.append, {"a": torch.tensor([7.0])}, {"node": torch.tensor([7])})
 
 
-def test_adam_kernel_equals_torch_optim():
-    g = torch.Generator().manual_seed(0)
-    start = torch.randn(20, 3, generator=g)
-    table, reference = Table({"x": start}), start.clone().requires_grad_()
-    optimiser = torch.optim.Adam([reference], lr=0.02, eps=1e-15)
-    for step in range(1, 6):
-        gradient = torch.randn(20, 3, generator=g)
-        table["x"].grad, reference.grad = gradient.clone(), gradient.clone()
-        table.adam_step(step, {"x": 0.02}, torch_adam_columns)
-        optimiser.step()
-    assert torch.allclose(table["x"], reference, atol=1e-6)
-
-
 # ---- starting values -----------------------------------------------------------------------------
 
 
@@ -421,32 +378,6 @@ def test_settling_removes_noise_and_leaves_a_clean_track_alone():
     clean = RigidNode.from_track(exact, learn_pose=True)
     clean.settle()
     assert key_error(clean, exact) < 0.002
-
-
-def test_settling_again_changes_nothing_and_short_tracks_stay():
-    _, noisy = wavy_track(0.1)
-    node = RigidNode.from_track(noisy, learn_pose=True)
-    node.settle()
-    once = node.offsets["shift"].detach().clone()
-    node.settle()
-    assert torch.allclose(node.offsets["shift"], once, atol=1e-6)
-    keys = np.stack([pose(0, 0, 0, 0), pose(1, 0.3, 0, 0.1)])
-    short = RigidNode("s", "car", (4, 2, 1.5), [0.0, 0.5], keys, learn_pose=True)
-    short.settle()
-    assert not short.offsets["shift"].any()
-
-
-def test_pose_matrix_is_the_learnt_pose():
-    node = RigidNode.from_track(track(), learn_pose=True)
-    with torch.no_grad():
-        node.offsets["shift"].copy_(0.2 * torch.randn(4, 3, generator=torch.Generator().manual_seed(0)))
-        node.offsets["yaw"].copy_(torch.tensor([0.1, -0.2, 0.05, 0.0]))
-    for time_s in (0.0, 0.3, 1.7):
-        position, quat = node.pose_at(time_s)
-        matrix = node.pose_matrix(time_s)
-        assert np.abs(matrix[:3, 3] - position.detach().numpy()).max() < 1e-5
-        assert np.abs(matrix[:3, :3] - harmonics.rotation_matrix(quat).detach().numpy()).max() < 1e-5
-    assert node.pose_matrix(2.5) is None
 
 
 # ---- deformable ----------------------------------------------------------------------------------

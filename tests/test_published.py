@@ -22,7 +22,6 @@ from mudg.base.types import Camera, Condition, View
 from mudg.core import noise
 from mudg.diffusion import memory_plan, published, views
 from mudg.diffusion.condition import ConditionRules, build_conditions
-from mudg.diffusion.parallel import recompute
 from mudg.diffusion.published import PublishedConfig, PublishedMDM, WorkSplit
 from mudg.diffusion.published_network import (
     LATENT_SCALE,
@@ -293,27 +292,6 @@ def test_guidance_is_that_of_the_schedule_module(model):
     assert not torch.allclose(with_context, without, atol=1e-3)
 
 
-def test_every_input_of_the_network_matters(model):
-    generator = torch.Generator().manual_seed(0)
-    given = {
-        "x": torch.randn(1, 4, 12, 8, 12, generator=generator),
-        "t": torch.tensor([300]),
-        "label": torch.tensor([0]),
-        "fps": torch.tensor([10]),
-        "text": torch.randn(1, 77, 16, generator=generator),
-        "image": torch.randn(1, 4, 2, 16, generator=generator),
-    }
-    with torch.no_grad():
-        before = model.net(**given)
-        for name, value in given.items():
-            changed = model.net(**{**given, name: value + 1})
-            assert error(changed, before) > 1e-4, name
-        later = given["image"].clone()
-        later[:, 3] += 1  # tokens belong to their frame: the change is greatest there
-        moved = (model.net(**{**given, "image": later}) - before).abs().mean((0, 2, 3, 4))
-    assert int(moved.argmax()) == 3
-
-
 def test_sequences_and_frames_go_through_in_parts(monkeypatch, model):
     q, k, v = torch.randn(3, 13, 5, 8, generator=torch.Generator().manual_seed(0)).unbind(0)
     whole = clip.attend(q, k, v, 2)
@@ -369,27 +347,6 @@ def test_a_training_step_moves_what_its_stage_says(stage, temporal):
         (2, "all"): of_transformers | of_other_temporal,
     }
     assert moved == {n for n in before if n.startswith(("net.", "image_tokens."))} - frozen[stage, temporal]
-
-
-@pytest.mark.slow
-def test_recomputing_gives_the_same_gradients():
-    """Also where dropout draws: the second computation of a stage draws what the first one drew."""
-    gradients = []
-    for again in (False, True):
-        model = tiny_model()
-        truth, encoded = batch_of(model, 2)
-        moving = choose_trainable(model, 1)
-        model.net.train()
-        if again:
-            recompute(model.net)
-        model.velocity_loss(truth, encoded, torch.Generator().manual_seed(4)).total.backward()
-        gradients.append(torch.cat([p.grad.flatten() for p in moving]))
-    assert error(gradients[1], gradients[0]) < 1e-5
-    other = tiny_model()
-    choose_trainable(other, 1)
-    other.velocity_loss(truth, encoded, torch.Generator().manual_seed(4)).total.backward()
-    undropped = torch.cat([p.grad.flatten() for p in other.parameters() if p.requires_grad])
-    assert error(undropped, gradients[0]) > 1e-2
 
 
 @contextmanager
@@ -549,8 +506,7 @@ def same(one, other):
     )
 
 
-@pytest.mark.parametrize("steps", [50, 20, 8])
-@pytest.mark.parametrize("guidance", [None, 1.0])
+@pytest.mark.parametrize(("steps", "guidance"), [(8, None), (8, 1.0), (20, None)])
 def test_passes_for_a_clip(model, monkeypatch, steps, guidance):
     """The numbers of docs/research/published.md: the denoiser once per step, the rest once per clip."""
     rows: dict[str, list[int]] = {}
@@ -578,8 +534,7 @@ def test_passes_for_a_clip(model, monkeypatch, steps, guidance):
     assert rows["Attention"] == [3 * halves] * layers
 
 
-@pytest.mark.parametrize("split", [WorkSplit(), WorkSplit(False, False, 1), WorkSplit(offload=True)])
-@pytest.mark.parametrize("bf16", [False, True])
+@pytest.mark.parametrize(("split", "bf16"), [(WorkSplit(False, False, 1), False), (WorkSplit(offload=True), True)])
 def test_keys_computed_once_change_nothing(model, monkeypatch, split, bf16):
     monkeypatch.setattr(model, "split", split)
     condition, request = some_condition(), SampleRequest(3, 7, bf16=bf16)
@@ -589,36 +544,10 @@ def test_keys_computed_once_change_nothing(model, monkeypatch, split, bf16):
     assert same(once, model.sample(condition, request))
 
 
-@torch.no_grad()
-def test_keys_belong_to_their_layers(model):
-    """Exactly the network's own; and keys of another context give another result."""
-    draw = torch.Generator().manual_seed(0)
-    x = torch.randn(2, 4, 12, 4, 6, generator=draw)
-    at, label, fps = (torch.tensor(pair) for pair in ([700, 3], [0, 500], [10, 10]))
-    text, image = torch.randn(2, 77, 16, generator=draw), torch.randn(2, 4, 2, 16, generator=draw)
-    plain = model.net(x, at, label, fps, text, image)
-    assert torch.equal(plain, model.net(x, at, label, fps, text, image, model.net.context_keys(text, image)))
-    assert not torch.equal(
-        plain, model.net(x, at, label, fps, text, image, model.net.context_keys(text.flip(0), image))
-    )
-
-
 @pytest.fixture(scope="module")
 def needs():
     """What the published network needs at 576x1024 in bfloat16."""
     return memory_plan.needs_of(PublishedConfig(), 2)
-
-
-@pytest.mark.parametrize(
-    ("card_gb", "together", "frames"),
-    [(16, (True, False), 8), (24, (True, True), 16), (40, (True, True), 16), (80, (True, True), 16)],
-)
-@pytest.mark.slow
-def test_what_fits_on_a_card(needs, card_gb, together, frames):
-    split, peak_bytes = memory_plan.choose(needs, card_gb * 10**9)
-    assert ((split.modalities_together, split.guidance_together), split.frames_at_once) == (together, frames)
-    assert not split.offload
-    assert peak_bytes <= card_gb * 10**9
 
 
 @pytest.mark.slow

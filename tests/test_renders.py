@@ -12,7 +12,6 @@ from toy_clips import made_up_clip, with_patch
 
 from mudg import native
 from mudg.base import palette
-from mudg.base.errors import InputError
 from mudg.base.types import Camera, FusedCloud, Photo, PointCloud, RenderPlanes, Track
 from mudg.diffusion import city_clips, clips
 from mudg.diffusion import condition as conditions
@@ -39,19 +38,6 @@ def with_renders(condition, seed=5):
     alpha = draw(1)
     planes = RenderPlanes(draw(3), 3 + 60 * draw(1), alpha, alpha * draw(1), some_ids(generator, t, h, w))
     return replace(condition, renders=planes)
-
-
-def test_planes_have_one_shape():
-    plane = torch.zeros(2, 1, 4, 6)
-    ids = plane.to(torch.uint8)
-    made = RenderPlanes(torch.zeros(2, 3, 4, 6), plane, plane, plane, ids)
-    assert made.map(lambda x: x[0]).color.shape == (3, 4, 6)
-    assert made.to(torch.device("cpu")).semantics.dtype == torch.uint8
-    with pytest.raises(InputError, match="depth"):
-        RenderPlanes(torch.zeros(2, 3, 4, 6), torch.zeros(2, 1, 4, 5), plane, plane, ids)
-    condition = some_condition()
-    with pytest.raises(InputError):
-        replace(condition, renders=made)
 
 
 # the condition ------------------------------------------------------------------------------------
@@ -95,25 +81,6 @@ def test_the_outline_of_a_measured_surface_is_that_of_the_render(alpha, depth):
     z = made.depth[0, 0].numpy()
     assert np.allclose(z[board], 12.0)
     assert np.allclose(z[beside], depth if alpha > RULES.sure_alpha and depth != 12.5 else 12.0)
-
-
-def test_ground_between_measured_rows_is_level():
-    """Rings of road points 1.6 m below the camera, half a metre apart: between them the depth is that of the plane."""
-    x, y = np.meshgrid(np.arange(3.0, 9.0, 0.5), np.arange(-10, 10, 0.02))
-    xyz = np.stack([x.ravel(), y.ravel(), np.full(x.size, -1.6)], 1).astype(np.float32)
-    cloud = PointCloud(
-        xyz, np.zeros((x.size, 3), np.uint8), "world", semantics=np.full(x.size, palette.ID["road"], np.uint8)
-    )
-    view = view_at()
-    falls = ((torch.arange(32) + 0.5 - 16) / 40)[:, None].expand(32, 48)
-    made = build_conditions(
-        FusedCloud(cloud, {}), [], [view], [], RULES, render_at=lambda view: flat_render(view, 1000.0, 0.0)
-    )[0]
-    between = ~made.valid[0, 0] & (falls > 1.6 / 6.0) & (falls < 1.6 / 4.4)
-    assert int(between.sum()) > 40
-    exact = 1.6 / falls[between]
-    level = (made.depth[0, 0][between] / exact - 1).abs()
-    assert float(level.max()) < 0.04  # of half a row: where in its pixel the measured point lies
 
 
 def test_what_a_render_shows_in_the_box_of_an_object_moves_with_it():
@@ -193,18 +160,6 @@ def test_ground_that_no_image_shows_is_level():
             assert float((depth * falls[hole] / 1.6 - 1).abs().max()) < 0.07  # half a row
         else:
             assert float(depth.min()) > 7.5
-
-
-def test_below_the_horizon_follows_the_camera():
-    level = conditions.below_horizon(view_at(), 0.1)
-    rows = (torch.arange(32) + 0.5 - 16) / 40
-    expected = rows[:, None] > 0.1 * torch.hypot(torch.tensor(1.0), (torch.arange(48) + 0.5 - 24)[None] / 40)
-    assert torch.equal(level, expected)
-    upside_down = view_at()
-    turned = upside_down.world_from_cam.copy()
-    turned[:3, :2] *= -1
-    upside_down = replace(upside_down, world_from_cam=turned)
-    assert torch.equal(conditions.below_horizon(upside_down, 0.1), expected.flip(0))
 
 
 def test_images_are_warped_by_rendered_depth():

@@ -275,42 +275,6 @@ def test_an_unscored_run_and_a_value_that_a_template_lacks_are_errors(tmp_path: 
     refused("title", report_html.render, "labels.html.j2", raises=UndefinedError)
 
 
-@pytest.mark.parametrize(
-    ("shifts_m", "left", "right"),
-    [((0.0, 2.0), "left", "m"), ((0.0, -2.0), "", "right, m"), ((-2.0, 2.0), "left", "right, m")],
-)
-def test_a_chart_names_the_sides_that_it_shows(shifts_m: tuple[float, ...], left: str, right: str) -> None:
-    scores = {
-        "methods": [{"name": "a"}],
-        "trajectories": [{"name": str(s), "shift_m": s} for s in shifts_m],
-        "results": [{"method": "a", "trajectory": str(s), "values": {"psnr": 20.0 + s}} for s in shifts_m],
-    }
-    figure = report._chart(scores, {"name": "psnr", "title": "PSNR", "unit": "dB", "better": "higher"})
-    template = report_html._environment().from_string('{% from "macros.html.j2" import chart %}{{ chart(figure) }}')
-    drawn = template.render(figure=figure)
-    words = re.findall(r"<text [^>]*>(left|right, m|m)</text>", drawn)
-    assert words == [word for word in (left, right) if word]
-
-
-def test_every_section_link_leads_to_a_section(page: str) -> None:
-    found = outline(page)
-    targets = {attributes.get("id") for _, attributes in found.tags}
-    links = [
-        attributes["href"]
-        for tag, attributes in found.tags
-        if tag == "a" and str(attributes.get("href")).startswith("#")
-    ]
-    assert len(links) >= 4
-    assert all(str(link)[1:] in targets for link in links)
-
-
-@pytest.mark.parametrize(("shifts_m", "first"), [((0.0, 4.0, 2.0, -2.0), 2.0), ((0.0, 3.0, 5.0), 3.0), ((0.0,), 0.0)])
-def test_the_page_begins_two_metres_to_the_left_or_near_there(shifts_m: tuple[float, ...], first: float) -> None:
-    videos = [report.TrajectoryVideo(f"front_{shift}", "front", shift, 1, 1, 1, {}, "", "") for shift in shifts_m]
-    chosen = [one for one in report._player_values({"truth": "exact"}, videos, [])["shift_choices"] if one["checked"]]
-    assert [one["name"] for one in chosen] == [f"front_{first}"]
-
-
 def test_curves_are_those_of_the_logs_of_both_fits(tmp_path: Path) -> None:
     assert report.fit_charts(tmp_path) == []
     logs = {"street_gaussians": [(10, 20.0), (20, 24.0)], "mudg_s": [(20, 25.0), (40, 30.0)]}

@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -246,14 +246,6 @@ def test_any_number_of_threads_writes_the_same_bytes(name: str, crowd: Path, tmp
 
 
 # ---- several at a time ---------------------------------------------------------------------------
-
-
-@pytest.fixture
-def children() -> Iterator[list[int]]:
-    started: list[int] = []
-    yield started
-    for child in started:
-        os.waitpid(child, 0)
 
 
 def forked(work: Callable[[], int], go: Path) -> int:

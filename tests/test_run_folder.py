@@ -171,17 +171,6 @@ def test_a_manifest_names_nothing_outside_its_folder(tmp_path: Path) -> None:
     assert (tmp_path / "precious").read_text() == "x"
 
 
-def test_an_older_unfinished_run_that_did_not_note_its_files_is_known_by_its_verb(tmp_path: Path) -> None:
-    folder = run(tmp_path / "r").path
-    store.write_text(folder / "rows" / "1.txt", "half")
-    store.write_text(folder / "mine.md", "mine")
-    state = store.read_json(folder / "run.json")
-    state.pop("files")
-    store.write_json(folder / "run.json", state)
-    finished(folder, 2, overwrite=True)
-    assert set(contents(folder)) == {"manifest.json", "mine.md", "out.txt", "rows/2.txt", "run.yaml"}
-
-
 def test_names_of_temporary_files(tmp_path: Path) -> None:
     with store.atomic_path(tmp_path / "picture.png") as path:
         assert is_temporary(path.name)
@@ -236,15 +225,6 @@ def test_a_link_to_a_folder_stays_a_link(tmp_path: Path) -> None:
     finished(tmp_path / "r", 2, overwrite=True)
     assert (tmp_path / "r").is_symlink() and (tmp_path / "real" / "out.txt").read_text() == "result 2"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["r", "real"]
-
-
-def test_seconds_of_an_interrupted_replacement_count(tmp_path: Path) -> None:
-    folder = finished(tmp_path / "r").path
-    new = run(folder, 2, overwrite=True)
-    new.pause()
-    state = store.read_json(new.path / "run.json")
-    store.write_json(new.path / "run.json", {**state, "seconds": 40.0})
-    assert run(folder, 2, overwrite=True).spent_before().seconds == 40.0
 
 
 def test_a_folder_that_cannot_be_renamed_is_refused_before_the_work(

@@ -22,7 +22,7 @@ from mudg.base import store
 from mudg.base.errors import InputError, IntegrityError
 from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, View
-from mudg.scene.check import Finding, check_scene, folded
+from mudg.scene.check import check_scene
 from mudg.scene.labels import read_label, read_trusted_classes
 from mudg.scene.read import open_files, read_image, read_points, read_scene
 from mudg.scene.schema import ref_problem
@@ -501,22 +501,3 @@ def test_check_names_what_is_odd(tmp_path: Path) -> None:
         "no frame is held out",
     ):
         assert any(words in f.message for f in findings), words
-
-
-def test_warnings_of_a_kind_are_one_line_with_three_examples() -> None:
-    many = [
-        Finding("warning", f"track {n} (car)", f"it moves sideways, {80 + n} degrees from its x axis")
-        for n in range(67)
-    ]
-    few = [("ego path", "the vehicle moves at 90 m/s"), ("track 3 (bus)", "its box measures 40 m")]
-    few = [Finding("warning", where, said) for where, said in few]
-    lines = folded([*many, *few], "mudg doctor scenes/a")
-    assert lines == [
-        (
-            "67 times: track 0 (car), track 1 (car), track 2 (car) and others: it moves sideways, 80 degrees from its x"
-            " axis (all of them: mudg doctor scenes/a)"
-        ),
-        "ego path: the vehicle moves at 90 m/s",
-        "track 3 (bus): its box measures 40 m",
-    ]
-    assert len(folded(many[:3], "")) == 3

@@ -368,19 +368,6 @@ def unreliable(address: str) -> Iterator[tuple[str, type[_Unreliable]]]:
             here.shutdown()
 
 
-def test_two_shards_and_a_store_that_fails_now_and_then(root: Location, server: str, tmp_path: Path) -> None:
-    made = BatchInAStore(root, tmp_path, 8)
-    with unreliable(SERVERS[server]) as (address, handler):
-        variables = {"AWS_ENDPOINT_URL": address, "STEP_S": "0.2"}
-        both = [
-            made.start(f"machine{i}", "--shard", "env/2", JOB_COMPLETION_INDEX=str(i), **variables) for i in range(2)
-        ]
-        assert [one.wait(300) for one in both] == [0, 0]
-        print(f"{server}: {handler.count} requests, {handler.count // 7} refused, {handler.count // 11} answers lost")
-        assert handler.count > 100
-    assert made.results() == {name: f"text of {name}\n" for name in made.names} and sum(made.runs().values()) == 8
-
-
 def test_of_six_drivers_one_works_on_a_batch(root: Location, server: str) -> None:
     ready, driving, most = threading.Barrier(6), [0], [0]
 
@@ -402,18 +389,3 @@ def test_of_six_drivers_one_works_on_a_batch(root: Location, server: str) -> Non
         answers = list(pool.map(race, range(6)))
     if CONDITIONAL[server]:
         assert answers.count("mine") <= 1 and most[0] <= 1
-
-
-def test_steps_of_a_batch_from_store_to_store(root: Location, tmp_path: Path) -> None:
-    """Real steps give the same bytes in a store and on this machine."""
-    digests = []
-    for place, machine in ((Location.of(tmp_path / "here"), "one"), (root, "two")):
-        scratch = ("--quiet", "--scratch", str(tmp_path / machine))
-        for seed in ("1", "2"):
-            words = ["ingest", "city", str(place / f"scenes/c{seed}"), *CITY, "--city.seed", seed, *scratch]
-            assert app.main(words) == 0
-        (place / "list.txt").save(b"scenes/c1\nscenes/c2\n")
-        words = f"batch run --list {place}/list.txt --out {place}/runs --stages fuse --jobs 1".split()
-        assert app.main([*words, *scratch]) == 0
-        digests.append({record.scene: record.digest for record in BatchFolder(place / "runs").records("done")})
-    assert digests[0] == digests[1] and len(digests[0]) == 2

@@ -113,21 +113,6 @@ def test_vibration_agrees_with_a_plain_loop_and_its_slopes_with_differences():
     assert torch.autograd.gradcheck(at, [value.clone().requires_grad_() for value in held])
 
 
-def test_children_lie_on_their_parents_path():
-    columns = {
-        "means": torch.zeros(2, 3),
-        "tau": torch.tensor([0.1, 0.1]),
-        "log_beta": torch.tensor([0.04, 0.005]).log(),
-        "velocity": torch.tensor([[3.0, 0, 0]] * 2),
-    }
-    node = VibrationNode.of_times([0.0, 0.1])
-    born = node.born_later(columns, torch.tensor([1.0, -2.0]), late=True)
-    assert born["tau"].tolist() == pytest.approx([0.14, 0.09])
-    assert born["means"][:, 0].tolist() == pytest.approx([3 * math.exp(-0.1) * 0.04, -3 * math.exp(-0.0125) * 0.01])
-    assert born["log_beta"].exp().tolist() == pytest.approx([0.04 / 1.6, 0.005])
-    assert node.born_later(columns, torch.zeros(2), late=False)["log_beta"].tolist() == columns["log_beta"].tolist()
-
-
 @pytest.mark.parametrize(("step", "late", "rows"), [(10, 20, 5), (20, 20, 6)])
 def test_what_changes_in_time_is_split_in_time(step, late, rows):
     """Of three Gaussians with small image gradients, one has a gradient of tau and a long life: it becomes two, late in

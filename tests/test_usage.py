@@ -1,7 +1,6 @@
 """What work takes: seconds, processor seconds, memory with child processes, bytes; over interrupted runs, too."""
 
 import gc
-import platform
 import subprocess
 import sys
 import threading
@@ -98,29 +97,6 @@ def test_what_child_processes_share_counts_once(tmp_path: Path) -> None:
             child.communicate()
     for found in (held, peak):
         assert alone + 0.9 * size < found < alone + 1.9 * size
-
-
-FREEING = """
-import numpy as np
-from mudg.base import memory
-from mudg.base import memory as usage
-blocks = [np.ones(12_000) for _ in range(1000)]  # 96 kB each: too small for a mapping of their own
-last = np.ones(12_000)
-full = usage.held_bytes()
-del blocks
-freed = usage.held_bytes()
-memory.give_back()
-print(full, freed, usage.held_bytes())
-"""
-
-
-@needs_proc
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="freed memory is kept, and can be given back, with glibc")
-def test_freed_memory_is_given_back() -> None:
-    said = subprocess.run([sys.executable, "-c", FREEING], check=True, capture_output=True, text=True).stdout
-    full, freed, left = map(int, said.split())
-    assert freed > full - (20 << 20), "the C library keeps what was freed"
-    assert left < full - (80 << 20)
 
 
 def watching() -> int:

@@ -148,22 +148,6 @@ def test_colours_and_displacements_are_kept_within_their_steps() -> None:
     assert np.abs(packed.facts["deform_step"] * packed.sections["deform"] - grid).max() <= 0.51e-4
 
 
-def test_a_chunk_says_where_it_is_and_what_it_holds() -> None:
-    model = toy_fitted(degree=3)
-    packed = pack_scene(model, 0.0, chunk_rows=128)
-    node, means = model.table.labels["node"].numpy(), columns_of(model)["means"]
-    for index in range(len(packed.layout)):
-        rows = packed.layout.chunk(index)
-        sections, record = packed.chunk(index)
-        still = means[rows[node[rows] == 0]]
-        assert record["rows"] == len(rows) == sections["block_of"][:, 1].sum() == sections["color"].shape[1]
-        assert (record["box"] is None) == (len(still) == 0)
-        if record["box"] is not None:
-            assert np.abs(np.array(record["box"]) - [still.min(0), still.max(0)]).max() < 1e-3
-        assert record["moves"] == bool((node[rows] != 0).any())
-        assert sections["harmonics"].shape == (45, len(rows))
-
-
 def test_more_than_a_page_holds_is_refused() -> None:
     refused("--budget", pack_scene, toy_fitted(degree=0), 0.0, chunk_rows=2, raises=UsageError)
 
@@ -221,20 +205,15 @@ def test_a_large_page_becomes_a_folder_whose_files_it_knows(
         assert base64.b64decode(record["sha256"]) == hashlib.sha256(content).digest()
     assert {path.name for path in folder.iterdir()} == {"index.html", *(record["url"] for record in records)}
     assert not (tmp_path / "page.html").exists()
+    contents = lambda: {path.name: path.read_bytes() for path in folder.iterdir()}
+    before = contents()
+    folder_page(toy, tmp_path, monkeypatch)
+    assert contents() == before
     (tmp_path / "again").mkdir()
     out = tmp_path / "again" / "page.html"
     view.run_page(PageConfig(images=0), toy[1], out, scene=toy[0] / "scene", report="report.html")
     index = (tmp_path / "again" / "page_page" / "index.html").read_text(encoding="utf-8")
     assert 'href="../report.html"' in index  # which lies beside the folder
-
-
-def test_a_folder_is_made_alike_twice(toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def content() -> dict[str, bytes]:
-        folder, _ = folder_page(toy, tmp_path, monkeypatch)
-        return {path.name: path.read_bytes() for path in folder.iterdir()}
-
-    first = content()
-    assert content() == first
 
 
 def test_a_folder_of_something_else_is_not_replaced(toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -440,20 +419,6 @@ def test_views_have_a_field_of_view_ground_and_a_vehicle(opened: Browser) -> Non
 
 
 @pytest.mark.slow
-def test_who_is_here_for_the_first_time_gets_a_hint(toy: Toy, tmp_path: Path) -> None:
-    note = "document.getElementById('note').textContent"
-    with Browser(tmp_path / "profile", size=(900, 500)) as one:
-        one.open(f"file://{toy[0] / 'page.html'}")
-        assert one.run(note).startswith("Drag to look around")
-        assert one.run("!document.getElementById('full').hidden")
-        one.run("dispatchEvent(new KeyboardEvent('keydown', {key: 'b', code: 'KeyB'})), 1")
-        assert one.run(note) == ""
-        one.open("about:blank", "true")
-        one.open(f"file://{toy[0] / 'page.html'}")
-        assert one.run(note) == ""
-
-
-@pytest.mark.slow
 def test_hidden_objects_are_gone_are_an_edit_script_and_nothing_is_loaded(
     opened: Browser, toy: Toy, tmp_path: Path
 ) -> None:
@@ -607,8 +572,12 @@ def test_the_server_answers_only_to_its_own_page(served: tuple[int, str]) -> Non
     for path in ("/../fit/model.json", "/%2e%2e/model.json", "//etc/passwd", "/model.json"):
         assert ask(port, "GET", path, Cookie=f"mudg_token={token}")[0] == 404
     own = f"http://127.0.0.1:{port}"
-    assert ask(port, "POST", "/frame", {}, X_Mudg_Token=token)[0] == 403
-    assert ask(port, "POST", "/frame", {}, X_Mudg_Token=token, Origin="https://evil.example")[0] == 403
+    for path in ("/frame", "/video"):
+        assert ask(port, "POST", path, {}, Origin=own)[0] == 403
+        assert ask(port, "POST", path, {}, X_Mudg_Token="wrong", Origin=own)[0] == 403
+        assert ask(port, "POST", path, {}, X_Mudg_Token=token)[0] == 403
+        assert ask(port, "POST", path, {}, X_Mudg_Token=token, Origin="https://evil.example")[0] == 403
+        assert ask(port, "GET", f"{path}?token={token}")[0] == 404
     status, text = ask(port, "POST", "/frame", {"layer": "color"}, X_Mudg_Token=token, Origin=own)
     assert status == 400 and b"request" in text
 
@@ -714,16 +683,6 @@ def test_a_video_follows_edits_and_what_is_hidden(served: tuple[int, str], toy: 
     assert np.abs(plain - moved).max() > 60
     assert np.abs(plain - hidden).max() > 60
     assert np.abs(hidden - moved).max() > 60
-
-
-def test_a_video_is_made_for_the_page_alone(served: tuple[int, str]) -> None:
-    port, token = served
-    own = f"http://127.0.0.1:{port}"
-    assert ask(port, "POST", "/video", question(), Origin=own)[0] == 403
-    assert ask(port, "POST", "/video", question(), X_Mudg_Token="wrong", Origin=own)[0] == 403
-    assert ask(port, "POST", "/video", question(), X_Mudg_Token=token)[0] == 403
-    assert ask(port, "POST", "/video", question(), X_Mudg_Token=token, Origin="https://evil.example")[0] == 403
-    assert ask(port, "GET", f"/video?token={token}")[0] == 404
 
 
 @pytest.mark.parametrize(

@@ -123,18 +123,6 @@ def test_near_kerbs_stay_steep_and_far_noise_of_the_ground_does_not() -> None:
     np.testing.assert_allclose(far[20, 30], [0, 0, 1], atol=1e-5)
 
 
-def test_noisy_depth_gives_steady_normals() -> None:
-    view = forward_view()
-    scene = street(view)
-    noise_share = 1 + 0.01 * np.random.default_rng(3).normal(size=scene.depth.shape).astype(np.float32)
-
-    def error_deg(smooth_px: int) -> float:
-        found = from_render(view, scene.color, scene.depth * noise_share, scene.classes, smooth_px=smooth_px)
-        return float(np.degrees(np.arccos(np.clip((found.normal * scene.normal).sum(-1)[~scene.sky], -1, 1))).mean())
-
-    assert error_deg(2) < 0.5 * error_deg(0)
-
-
 def test_guessed_light_does_not_exceed_what_a_camera_exposes_for() -> None:
     view = forward_view()
     scene = street(view)
@@ -182,20 +170,6 @@ def test_patches_cover_the_share_that_is_asked(share: float) -> None:
     x, y = np.random.default_rng(5).uniform(-400, 400, (2, 200_000))
     level = air.patch_threshold(share, 77)
     assert (air.patches(x, y, 1.0, 77) > level).mean() == pytest.approx(share, abs=0.02)
-
-
-def test_the_hash_is_that_of_the_generated_city() -> None:
-    """Values of hash_bits in native/city_math.h, worked out by hand in arbitrary precision."""
-
-    def mix(h: int) -> int:
-        for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
-            h = ((h ^ (h >> shift)) * factor) % 2**32
-        return h ^ (h >> 16)
-
-    for a, b, c in ((0, 0, 0), (1, 2, 3), (-5, 70000, 123456)):
-        text = (a * 0x9E3779B1) % 2**32 ^ ((b * 0x85EBCA77 + 0x165667B1) % 2**32) ^ ((c * 0xC2B2AE3D) % 2**32)
-        assert int(air.hash_bits(a, b, c)) == mix(text)
-        assert int(air.hash_bits(a, b, c, 9)) == mix((mix(text) + 9 * 0x27D4EB2F) % 2**32)
 
 
 # --- fog ------------------------------------------------------------------------------------------
@@ -433,13 +407,6 @@ def test_numbers_and_areas_of_drops_agree_with_integration(mm_h: float) -> None:
     sizes = air.rain_sizes(mm_h)
     assert area_per_m(sizes) == pytest.approx(np.trapezoid(n * math.pi / 4 * d**2, d) * 1e-6, rel=1e-6)
     assert sum(s.density for s in sizes) == pytest.approx(np.trapezoid(n, d), rel=1e-6)
-
-
-@pytest.mark.parametrize("mm_h", [5.0, 10.0, 50.0])
-def test_the_published_extinction_of_rain_is_twice_the_area_of_the_drops(mm_h: float) -> None:
-    slope = 4.1 * mm_h**-0.21
-    both = 2 * math.pi / 4 * 8000 * 2 / slope**3 * 1e-6
-    assert air.rain_extinction(mm_h) == pytest.approx(both, rel=0.2)
 
 
 SIZE = air.ParticleSize(60.0, 0.002, 5.0)

@@ -27,7 +27,6 @@ Matrix = NDArray[np.float64]
 EPOCH_US = 1_553_735_853_462_203
 GLOBAL_FROM_WORLD = yaw_matrix(0.7, (300.0, -200.0, 10.0))
 CAMERA_NUMBERS = {"front": 1, "front_left": 2, "front_right": 3, "side_left": 4, "side_right": 5}
-LASER_NUMBERS = {"top": 1, "front": 2, "side_left": 3, "side_right": 4, "rear": 5}
 TYPE_NUMBERS = {"car": 1, "truck": 1, "bus": 1, "pedestrian": 2, "cyclist": 4}
 LABELS = {"car": "vehicle", "truck": "vehicle", "bus": "vehicle", "pedestrian": "pedestrian", "cyclist": "cyclist"}
 SHUTTER_S, READOUT_S = 0.002, 0.04
