@@ -184,7 +184,7 @@ def main() -> int:
         print(f"{count} Gaussians")  # noqa: T201
         in_session(session)
     requests = [request_of(session, number, (960, 640)) for number in range(8)]
-    with serving(session, "bench", ServeConfig()) as address:
+    with serving(session, "bench", ServeConfig()) as (address, _):
         for clients in given.clients:
             taken, lost = load(address, requests, clients, given.seconds)
             p50, p95, p99 = np.quantile(taken, (0.5, 0.95, 0.99))
@@ -201,7 +201,7 @@ def soak(session: Session, minutes: float) -> int:
     own, first, total = psutil.Process(), 0, 0
     requests = [request_of(session, number, (480, 320)) for number in range(16)]
     threads = threading.active_count()
-    with serving(session, "bench", ServeConfig()) as address:
+    with serving(session, "bench", ServeConfig()) as (address, _):
         for minute in range(max(2, round(minutes))):
             taken, lost = load(address, requests, 4, 60.0)
             memory, total = own.memory_info().rss, total + len(taken)

@@ -6,7 +6,9 @@ from __future__ import annotations
 import io
 import json
 import struct
+import xml.etree.ElementTree as ET
 import zipfile
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,9 +24,11 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Source, View
 from mudg.core.edit import HeightMap
 from mudg.exporting.settings import ExportConfig
+from mudg.formats.exporters.opendrive import LANE_M, lanes_beside, opendrive
 from mudg.formats.splats import usd
 from mudg.formats.splats.cloud import SplatScene
 from mudg.gaussians.storage import save_model
+from mudg.scene.road import Road
 from mudg.steps.export import Export
 
 TIMES = np.array([0.0, 0.2, 0.4])
@@ -208,3 +212,64 @@ def test_the_command_needs_a_drive(tmp_path: Path) -> None:
 
 
 # -- the map ---------------------------------------------------------------------------------------
+
+
+def bend(slope: float = 0.03) -> Road:
+    """A path that turns left by 40 degrees and climbs."""
+    poses = []
+    for angle in np.linspace(0, 0.7, 90):
+        pose = geometry.yaw_matrix(angle, (60 * np.sin(angle), 60 * (1 - np.cos(angle)), slope * 60 * angle))
+        pitch = -np.arctan(slope)
+        pose[:3, :3] = pose[:3, :3] @ [[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]]
+        poses.append(pose)
+    return Road(np.stack(poses))
+
+
+def evaluated(xml: ET.Element) -> Iterator[tuple[float, float, float, float]]:
+    """Station, x, y and z along the reference line, as the standard says how to compute them."""
+    heights = [{k: float(v) for k, v in one.attrib.items()} for one in xml.iter("elevation")]
+    for piece, height in zip(xml.iter("geometry"), heights, strict=True):
+        at = {k: float(v) for k, v in piece.attrib.items()}
+        poly = {k: float(v) for k, v in piece[0].attrib.items() if k != "pRange"}
+        for p in np.linspace(0, 1, 9):
+            u, v = (sum(poly[f"{c}{axis}"] * p**n for n, c in enumerate("abcd")) for axis in "UV")
+            c, s, ds = np.cos(at["hdg"]), np.sin(at["hdg"]), p * at["length"]
+            z = sum(height[name] * ds**n for n, name in enumerate("abcd"))
+            yield at["s"] + ds, at["x"] + c * u - s * v, at["y"] + s * u + c * v, z
+
+
+def test_the_maps_line_is_the_path_driven() -> None:
+    road = bend()
+    xml = ET.fromstring(opendrive(road, np.zeros((0, 3)), "bend"))
+    points = np.array(list(evaluated(xml)))
+    assert np.abs(np.linalg.norm(points[:, 1:3] - [0, 60], axis=1) - 60).max() < 0.01
+    assert np.abs(points[:, 3] - 0.03 * points[:, 0]).max() < 0.02
+    assert (np.diff(points[:, 0]) > -1e-6).all()
+    assert points[-1, 0] == pytest.approx(float(xml.find("road").get("length")), abs=1e-6)
+    assert points[-1, 0] == pytest.approx(60 * 0.7, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    "left, right, lanes", [(1.8, 1.8, (0, 0)), (8.9, 1.9, (2, 0)), (5.3, 5.2, (1, 1)), (1.9, 8.7, (0, 2))]
+)
+def test_lanes_are_as_many_as_the_road_is_wide(left: float, right: float, lanes: tuple[int, int]) -> None:
+    road, rng = bend(0.0), np.random.default_rng(0)
+    stations, sides = rng.uniform(0, road.length_m, 4000), rng.uniform(-right, left, 4000)
+    surface = np.stack(
+        [geometry.transform_points(road.recorded(s), np.array([[0.0, d, 0.0]]))[0] for s, d in zip(stations, sides)]
+    )
+    assert lanes_beside(road, surface) == lanes
+    assert lanes_beside(road, surface[rng.permutation(len(surface))]) == lanes
+    xml = ET.fromstring(opendrive(road, surface, "x"))
+    ids = [int(lane.get("id")) for lane in xml.iter("lane")]
+    assert ids == sorted(ids, reverse=True) == list(range(lanes[0], -lanes[1] - 2, -1))
+    # the driven lane is centred on the path: it begins half a lane to the left of it
+    assert float(xml.find("road/lanes/laneOffset").get("a")) == LANE_M / 2
+
+
+def test_the_package_holds_the_map_of_a_drive(package: Package) -> None:
+    xml = ET.fromstring(package.archive.read("map.xodr"))
+    points = np.array(list(evaluated(xml)))
+    assert np.linalg.norm(points[-1, 1:3] - drive().ego.world_from_ego[-1, :2, 3]) < 0.01
+    standing = replace(drive(), ego=EgoPath(TIMES, np.stack([np.eye(4)] * 3)))
+    assert "map.xodr" not in Package(usd.to_alpasim(toy_splats.scene(1), standing, ground())).archive.namelist()

@@ -6,6 +6,7 @@ import io
 import math
 import threading
 import time
+import urllib.request
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -38,7 +39,7 @@ def session() -> Session:
 
 @pytest.fixture(scope="module")
 def address(session: Session) -> Iterator[str]:
-    with serving(session, NAME, ServeConfig()) as address:
+    with serving(session, NAME, ServeConfig()) as (address, _):
         yield address
 
 
@@ -146,7 +147,7 @@ def test_what_there_is_is_listed(address: str, tmp_path: Any) -> None:
 
 def test_cameras_stand_on_the_rig_where_the_log_has_them(toy_log: Scene, session: Session) -> None:
     types = wire.messages()
-    with serving(Session(session.model, scene=toy_log), NAME, ServeConfig()) as address:
+    with serving(Session(session.model, scene=toy_log), NAME, ServeConfig()) as (address, _):
         request = types.SceneRequest(scene_id=NAME)
         (camera,) = call(address, "get_available_cameras", request, types.AvailableCamerasReturn).available_cameras
         (path,) = call(
@@ -212,7 +213,7 @@ def test_poses_and_lenses_that_are_none_are_refused(address: str) -> None:
 
 def test_messages_larger_than_the_bound_are_refused(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mudg.sim.server.MESSAGE_MB", 1)
-    with serving(session, NAME, ServeConfig()) as address:
+    with serving(session, NAME, ServeConfig()) as (address, _):
         assert refusal(address, "render_rgb", b"x" * 2_000_000)[0] == "RESOURCE_EXHAUSTED"
 
 
@@ -228,7 +229,7 @@ def test_more_requests_than_may_wait_are_refused_at_once(session: Session, monke
     render = Session.render
     monkeypatch.setattr(Session, "render", lambda self, requests: (gate.wait(30), render(self, requests))[1])
     monkeypatch.setattr("mudg.sim.server.WAITING", 2)
-    with serving(session, NAME, ServeConfig()) as address, ThreadPoolExecutor(8) as pool:
+    with serving(session, NAME, ServeConfig()) as (address, _), ThreadPoolExecutor(8) as pool:
         jobs = [
             pool.submit(call, address, "render_rgb", picture_request(types), types.RGBRenderReturn) for _ in range(6)
         ]
@@ -244,12 +245,23 @@ def test_a_token_is_asked_for_and_needed_beyond_loopback(session: Session) -> No
     types, secret = wire.messages(), "a-secret-of-some-length"
     with pytest.raises(UsageError, match="--token"), serving(session, NAME, ServeConfig(host="0.0.0.0")):
         pass
-    with serving(session, NAME, ServeConfig(token=secret)) as address:
+    with serving(session, NAME, ServeConfig(token=secret)) as (address, _):
         assert refusal(address, "get_version", types.Empty())[0] == "UNAUTHENTICATED"
         wrong = [("authorization", "Bearer something-else-entirely")]
         assert refusal(address, "get_version", types.Empty(), metadata=wrong)[0] == "UNAUTHENTICATED"
         right = [("authorization", f"Bearer {secret}")]
         assert call(address, "get_version", types.Empty(), types.VersionId, metadata=right).version_id
+
+
+def test_metrics_count_what_was_asked(session: Session) -> None:
+    types = wire.messages()
+    with serving(session, NAME, ServeConfig(metrics_port=0)) as (address, pages):
+        call(address, "get_version", types.Empty(), types.VersionId)
+        refusal(address, "render_rgb", picture_request(types, scene_id="other"))
+        with urllib.request.urlopen(f"http://{pages}/metrics", timeout=10) as answer:
+            text = answer.read().decode()
+    assert 'mudg_requests_total{method="get_version",status="OK"} 1' in text
+    assert 'mudg_requests_total{method="render_rgb",status="NOT_FOUND"} 1' in text
 
 
 def test_a_port_that_is_taken_is_said(address: str, session: Session) -> None:

@@ -41,7 +41,7 @@ from mudg.scene.read import read_points, read_scene
 from mudg.steps.export import Export
 
 SINGLE = ("ply", "spz", "compressed-ply", "sog", "splat")
-FOREIGN = re.compile(r"'(metadata\.yaml|\w+\.json|mesh_ground\.ply)' in package .* unsupported extension")
+FOREIGN = re.compile(r"'(metadata\.yaml|\w+\.json|mesh_ground\.ply|map\.xodr)' in package .* unsupported extension")
 """What USD says of the files for AlpaSim in a package, which the standard does not allow there."""
 AHEAD = np.random.default_rng(0).uniform([-3, -2, 8], [3, 2, 40], (50, 3))
 """Points that every camera sees, in its axes, metres."""
@@ -63,7 +63,7 @@ def main() -> int:
     failures = 0
     files = written(given.run, given.out)
     tool = given.node_modules / ".bin" / "splat-transform"
-    for name in SINGLE:
+    for name in (*SINGLE, "spz 4"):
         there = tool.exists() and name in files
         failures += report(
             f"{name} read by splat-transform", against_splat_transform(tool, name, files[name]) if there else None
@@ -101,6 +101,9 @@ def written(run: Path, out: Path) -> dict[str, Path]:
             continue
         found[name] = out / f"{name}{suffix}"
         Export(format=name, source=run, out=found[name], overwrite=True, settings=ExportConfig()).run()
+    if installed("zstandard"):
+        found["spz 4"] = out / "version4.spz"
+        Export(format="spz", source=run, out=found["spz 4"], overwrite=True, settings=ExportConfig(spz_version=4)).run()
     return found
 
 

@@ -333,8 +333,14 @@ def requested(config: ExportConfig, name: str, exported: Exported) -> WriteReque
         scene = replace(scene, sky=None)
     facts = {**scene.facts, "generator": f"mudg {version()}"}
     scene = replace(scene, file_from_world=file_from_world(name, config.axes), facts=facts)
-    ground = _ground(exported) if name == "alpasim" else None
-    return WriteRequest(scene, None if whole else moment, exported.log, ground)
+    ground, road = (_ground(exported), _road(exported)) if name == "alpasim" else (None, None)
+    return WriteRequest(scene, None if whole else moment, exported.log, ground, road)
+
+
+def _road(exported: Exported) -> NDArray[np.floating] | None:
+    """Fused points of the road f[N, 3]; None where no point has a class."""
+    static = None if exported.parts.fused is None else read_fused(exported.parts.fused).static
+    return None if static is None or static.semantics is None else static.xyz[static.semantics == ID["road"]]
 
 
 def _ground(exported: Exported) -> HeightMap | None:

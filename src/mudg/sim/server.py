@@ -13,8 +13,10 @@ import io
 import math
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, Final
 
@@ -245,12 +247,37 @@ def encoded(rgb: NDArray[np.uint8], image_format: int, quality: float) -> bytes:
     return file.getvalue()
 
 
-def handlers(renderer: Renderer, token: str) -> list[Any]:
+class Metrics:
+    """Counts and times of requests, in Prometheus' text format."""
+
+    def __init__(self) -> None:
+        self._lock, self._counts, self._seconds = threading.Lock(), dict[tuple[str, str], int](), dict[str, float]()
+
+    def add(self, method: str, status: str, seconds: float) -> None:
+        """Count one request."""
+        with self._lock:
+            self._counts[method, status] = self._counts.get((method, status), 0) + 1
+            self._seconds[method] = self._seconds.get(method, 0.0) + seconds
+
+    def text(self) -> str:
+        """All of it."""
+        with self._lock:
+            rows = ["# TYPE mudg_requests_total counter"]
+            rows += [
+                f'mudg_requests_total{{method="{m}",status="{s}"}} {n}' for (m, s), n in sorted(self._counts.items())
+            ]
+            rows += ["# TYPE mudg_request_seconds_total counter"]
+            rows += [f'mudg_request_seconds_total{{method="{m}"}} {s:.6f}' for m, s in sorted(self._seconds.items())]
+        return "\n".join(rows) + "\n"
+
+
+def handlers(renderer: Renderer, metrics: Metrics, token: str) -> list[Any]:
     """Handlers of gRPC for all names of the service, and for health."""
     grpc, types = wire.package(), wire.messages()
 
-    def guarded(work: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
+    def guarded(name: str, work: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
         def answer(request: Any, context: Any) -> Any:
+            began, status = time.perf_counter(), "OK"
             try:
                 sent = dict(context.invocation_metadata()).get("authorization", "")
                 if token and not hmac.compare_digest(str(sent), f"Bearer {token}"):
@@ -264,32 +291,40 @@ def handlers(renderer: Renderer, token: str) -> list[Any]:
                 status, why = "RESOURCE_EXHAUSTED", " ".join(str(error).split())
             except MudgError as error:
                 status, why = "INVALID_ARGUMENT", " ".join(str(error).split())
+            finally:
+                metrics.add(name, status, time.perf_counter() - began)
             context.abort(grpc.StatusCode[status], why[:1000])
 
         return answer
 
-    def method(work: Callable[[Any], Any], asks: str, answers: str) -> Any:
+    def method(name: str, work: Callable[[Any], Any], asks: str, answers: str) -> Any:
         return grpc.unary_unary_rpc_method_handler(
-            guarded(work), getattr(types, asks).FromString, getattr(types, answers).SerializeToString
+            guarded(name, work), getattr(types, asks).FromString, getattr(types, answers).SerializeToString
         )
 
-    own = {name: method(getattr(renderer, name), *messages) for name, messages in wire.METHODS.items()}
-    health = {"Check": method(lambda _: types.HealthReply(status=1), "HealthRequest", "HealthReply")}
+    own = {n: method(n, getattr(renderer, n), asks, answers) for n, (asks, answers) in wire.METHODS.items()}
+    health = {"Check": method("Check", lambda _: types.HealthReply(status=1), "HealthRequest", "HealthReply")}
     services = {**dict.fromkeys(wire.SERVICES, own), wire.HEALTH: health}
     return [grpc.method_handlers_generic_handler(service, rows) for service, rows in services.items()]
 
 
 @contextlib.contextmanager
-def serving(session: Session, name: str, config: ServeConfig) -> Iterator[str]:
-    """A running server at ``host:port``, and its stop: what is being drawn is finished, for at most ``GRACE_S``.
-    UsageError: another address than loopback without a token. ResourceError: the address is taken, or grpcio is not
-    installed."""
-    grpc = wire.package()
+def serving(session: Session, name: str, config: ServeConfig) -> Iterator[tuple[str, str]]:
+    """A running server, and its stop: what is being drawn is finished, for at most ``GRACE_S``.
+
+    Yields:
+        Addresses ``host:port`` of the service and of its metrics (empty: none).
+
+    Raises:
+        UsageError: another address than loopback without a token. ResourceError: the address is taken, or grpcio is not
+            installed.
+    """
+    grpc, metrics = wire.package(), Metrics()
     token = token_for(config.host, config.token) if config.token or not is_loopback(config.host) else ""
     most = MESSAGE_MB * 2**20
     server = grpc.server(
         ThreadPoolExecutor(THREADS, "serve"),
-        handlers=handlers(Renderer(session, name), token),
+        handlers=handlers(Renderer(session, name), metrics, token),
         maximum_concurrent_rpcs=WAITING,
         options=[
             ("grpc.max_receive_message_length", most),
@@ -302,11 +337,41 @@ def serving(session: Session, name: str, config: ServeConfig) -> Iterator[str]:
     except RuntimeError as error:
         what = f"{config.host}:{config.port}"
         raise ResourceError("cannot listen on this address", where=what, remedy="choose another --port") from error
+    pages = _metrics_pages(metrics, config.metrics_port) if config.metrics_port >= 0 else None
     server.start()
     try:
-        yield f"{config.host}:{port}"
+        yield f"{config.host}:{port}", f"127.0.0.1:{pages.server_address[1]}" if pages else ""
     finally:
         server.stop(GRACE_S).wait()
+        if pages is not None:
+            pages.shutdown()
+            pages.server_close()
+
+
+def _metrics_pages(metrics: Metrics, port: int) -> ThreadingHTTPServer:
+    class Page(BaseHTTPRequestHandler):
+        timeout = 10.0
+
+        def do_GET(self) -> None:
+            body = metrics.text().encode()
+            self.send_response(200)
+            self.send_header("Content-Type", "text/plain; version=0.0.4")
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, format: str, *args: Any) -> None:
+            return
+
+    try:
+        pages = ThreadingHTTPServer(("127.0.0.1", port), Page)
+    except OSError as error:
+        where = f"127.0.0.1:{port}"
+        raise ResourceError(
+            "cannot listen on this address", where=where, remedy="choose another --metrics-port"
+        ) from error
+    threading.Thread(target=pages.serve_forever, name="metrics", daemon=True).start()
+    return pages
 
 
 def serve(config: ServeConfig, run: Path, edits: Path | None, scene: Path | None) -> dict[str, Any]:
@@ -316,8 +381,8 @@ def serve(config: ServeConfig, run: Path, edits: Path | None, scene: Path | None
     name = "" if session.scene is None else session.scene.id
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    with serving(session, name or run.name, config) as address:
-        log.info(f"serve: scene {name or run.name!r} at {address}")
+    with serving(session, name or run.name, config) as (address, pages):
+        log.info(f"serve: scene {name or run.name!r} at {address}" + (f", metrics at http://{pages}" if pages else ""))
         with contextlib.suppress(KeyboardInterrupt):
             stop.wait()
         log.info("serve: stopping")

@@ -16,5 +16,7 @@ class ServeConfig:
     """Port to listen on (0 = any free one)."""
     token: str = ""
     """Secret that clients send as `authorization: Bearer TOKEN` (empty: none, on the loopback address alone)."""
+    metrics_port: int = setting(default=-1, ge=-1, le=65535)
+    """Port on the loopback address for metrics in Prometheus' format (-1 = none, 0 = any free one)."""
     device: DeviceName = "auto"
     """Device: auto (CUDA if there is one), cpu, cuda, cuda:N."""

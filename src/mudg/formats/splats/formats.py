@@ -85,13 +85,15 @@ class WriteRequest:
 
     Args:
         scene: with the axes of the file. time_s: the moment, or None = all of the motion. log: whose cameras are
-            listed, where a format can. ground: where a format needs it.
+            listed, where a format can. ground: where a format needs it. road: points f[N, 3] of the road's surface,
+            where a format holds a map.
     """
 
     scene: SplatScene
     time_s: float | None
     log: Scene | None = None
     ground: HeightMap | None = None
+    road: NDArray[np.floating] | None = None
 
     @property
     def cloud(self) -> SplatCloud:
@@ -153,7 +155,9 @@ FORMATS: Final[Mapping[str, SplatFormat]] = {
     ),
     "usda": _format(".usda .usd", axes.WORLD, _MOVING, lambda r: usd.to_text(r.scene, r.time_s, log=r.log)),
     "usdz": _format(".usdz", axes.WORLD, f"{_MOVING} sky", lambda r: usd.to_package(r.scene, r.time_s, r.log)),
-    "alpasim": _format(".usdz", axes.WORLD, f"{_MOVING} sky", lambda r: usd.to_alpasim(r.scene, r.log, r.ground)),
+    "alpasim": _format(
+        ".usdz", axes.WORLD, f"{_MOVING} sky", lambda r: usd.to_alpasim(r.scene, r.log, r.ground, r.road)
+    ),
     "compressed-ply": _format(
         ".compressed.ply .ply",
         "RDF",

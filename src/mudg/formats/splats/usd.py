@@ -25,9 +25,11 @@ from mudg.base.errors import InputError
 from mudg.base.palette import CLASSES
 from mudg.base.types import Camera, Scene, View
 from mudg.core.edit import HeightMap
+from mudg.formats.exporters.opendrive import opendrive
 from mudg.formats.ncore import MICRO, PoseKeys, shutter_type
 from mudg.formats.splats import binary, ply
 from mudg.formats.splats.cloud import Floats, SplatCloud, SplatNode, SplatScene, each_once
+from mudg.scene.road import Road
 
 CODES_PER_S: Final = 1000
 FOCAL: Final = 24.0
@@ -227,7 +229,7 @@ def prim_names(names: Sequence[str]) -> list[str]:
 
 # alpasim -------------------------------------------------------------------------------------------
 #
-# A scene as NVIDIA's AlpaSim reads it: a USDZ package (see above) with four more files, found by their names.
+# A scene as NVIDIA's AlpaSim reads it: a USDZ package (see above) with five more files, found by their names.
 #
 #     metadata.yaml          names, sensors, first and last microsecond
 #     rig_trajectories.json  path of the vehicle, calibration of the cameras, begin and end of every image
@@ -259,11 +261,13 @@ _NO_DATE: Final = "1970-01-01"
 """The hour of writing is not noted: the same scene gives the same bytes."""
 
 
-def to_alpasim(scene: SplatScene, log: Scene | None, ground: HeightMap | None) -> bytes:
+def to_alpasim(
+    scene: SplatScene, log: Scene | None, ground: HeightMap | None, surface: NDArray[np.floating] | None = None
+) -> bytes:
     """A scene with its motion, the drive and the ground.
 
     Args:
-        log: the recorded drive. ground: its height, in our axes.
+        log: the recorded drive. ground, surface: its height, and points f[N, 3] of the road, in our axes.
 
     Raises:
         InputError: no drive or no ground is known, or a camera has no place on the vehicle.
@@ -282,7 +286,16 @@ def to_alpasim(scene: SplatScene, log: Scene | None, ground: HeightMap | None) -
         "sequence_tracks.json": store.json_text(_tracks(scene, clock)).encode(),
         "mesh_ground.ply": ground_mesh(ground, scene.file_from_world),
     }
+    if np.ptp(log.ego.world_from_ego[:, :2, 3], axis=0).max() > 2:  # a vehicle that stands tells no road
+        files["map.xodr"] = _map(log, scene, surface)
     return to_package(scene, None, log, files)
+
+
+def _map(log: Scene, scene: SplatScene, surface: NDArray[np.floating] | None) -> bytes:
+    """The driven corridor, in the axes of the file."""
+    road = Road(scene.file_from_world @ log.ego.world_from_ego)
+    points = np.zeros((0, 3)) if surface is None else geometry.transform_points(scene.file_from_world, surface)
+    return opendrive(road, points, log.id)
 
 
 class _PackageClock:
