@@ -40,7 +40,7 @@ from mudg.diffusion.settings import HarmonizeConfig, SynthesizeConfig
 from mudg.diffusion.synthesize import JobInputs, view_maker
 from mudg.diffusion.views import recorded_images
 from mudg.editing import harmonised
-from mudg.editing.harmonised import RenderMixer, Touched, guarded, pasted, soft_edge
+from mudg.editing.harmonised import RenderMixer, Touched, guarded, off_path_m, pasted, soft_edge
 from mudg.editing.plan import Actor, EditPlan, EditSources, EditWorld, plan_edits
 from mudg.editing.recorded import boxes_mask, cleared_cloud, ground_mask, photos_of_edited, vacated_at
 from mudg.editing.script import parse_edits
@@ -301,9 +301,9 @@ def test_a_sample_stays_at_its_start_where_it_is_not_free(run: Path) -> None:
 
 
 def test_a_repaired_view_is_the_mean_of_render_and_generated_view(run: Path, tmp_path: Path) -> None:
-    """Against what render writes and what the model makes of each view, mixed here in numpy; the same after an
-    interruption."""
-    shifts = {"shifts_m": (1.0,), "video": False, "device": "cpu"}
+    """Against what render writes and what the model makes of each view, mixed here in numpy: half the confidence on the
+    recorded path, 1.5 times at 1.5 m; the same after an interruption."""
+    shifts = {"shifts_m": (0.0, 1.5), "video": False, "device": "cpu"}
     how = HarmonizeConfig(model=str(run / "model"), steps=1, precision="float32")
     parts = {"scene": run / "scene", "model": run / FITTED}
     plain = RenderViews(**parts, out=tmp_path / "plain", settings=RenderConfig(**shifts)).run()
@@ -313,22 +313,22 @@ def test_a_repaired_view_is_the_mean_of_render_and_generated_view(run: Path, tmp
         out=tmp_path / "repaired",
         settings=RenderConfig(**shifts, repair=True, harmonize=how),
     )
-    again = SynthesizeConfig(model=how.model, shifts_m=(1.0,), steps=1, processes=1, precision="float32", device="cpu")
+    again = SynthesizeConfig(model=how.model, shifts_m=(1.5,), steps=1, processes=1, precision="float32", device="cpu")
     inputs, model = JobInputs(run / "scene", run / "fuse", run / FITTED), files.load(how.model)
-    name = "front_shift+1.0"
-    views = [seen.view for seen in views_of(plain, name)]
-    made = [view_maker(again, inputs, [view], model, None).make([view], 0, None)[2][0] for view in views]
-    repaired = views_of(step.run(), name)
-    for render, view, one in zip(views_of(plain, name), made, repaired, strict=True):
-        share = (view.confidence / (1 + view.confidence)).numpy()
-        wanted = (1 - share) * render.rgb.numpy() + share * view.rgb.numpy()
-        assert np.abs(one.rgb.numpy() - wanted).max() < 2 / 255  # each was rounded to 8 bits
-        assert np.abs(one.rgb.numpy() - render.rgb.numpy()).max() > 0.05
-        a, b, depth = (np.nan_to_num(seen.depth.numpy(), nan=-1.0) for seen in (render, view, one))
-        both = (a > 0) & (b > 0)
-        assert np.allclose(depth[both], ((1 - share) * a + share * b)[both], rtol=2e-3)
-        assert np.array_equal(depth[~both], np.where(a > 0, a, b)[~both])
-        assert torch.equal(one.semantics, render.semantics)
+    result = step.run()
+    for name, factor in (("front_recorded", 0.5), ("front_shift+1.5", 1.5)):
+        for render, one in zip(views_of(plain, name), views_of(result, name), strict=True):
+            view = view_maker(again, inputs, [render.view], model, None).make([render.view], 0, None)[2][0]
+            weight = factor * view.confidence
+            share = (weight / (1 + weight)).numpy()
+            wanted = (1 - share) * render.rgb.numpy() + share * view.rgb.numpy()
+            assert np.abs(one.rgb.numpy() - wanted).max() < 2 / 255  # each was rounded to 8 bits
+            assert np.abs(one.rgb.numpy() - render.rgb.numpy()).max() > 0.05
+            a, b, depth = (np.nan_to_num(seen.depth.numpy(), nan=-1.0) for seen in (render, view, one))
+            both = (a > 0) & (b > 0)
+            assert np.allclose(depth[both], ((1 - share) * a + share * b)[both], rtol=2e-3)
+            assert np.array_equal(depth[~both], np.where(a > 0, a, b)[~both])
+            assert torch.equal(one.semantics, render.semantics)
     folder = tmp_path / "repaired"
     whole = {path.name: path.read_bytes() for path in (folder / name / "rgb").iterdir()}
     for path in ("manifest.json", f"{name}/observations.json", f"{name}/data/000003.npz", f"{name}/rgb/000003.png"):
@@ -337,6 +337,16 @@ def test_a_repaired_view_is_the_mean_of_render_and_generated_view(run: Path, tmp
     store.write_json(folder / "run.json", state)
     step.run()
     assert {path.name: path.read_bytes() for path in (folder / name / "rgb").iterdir()} == whole
+
+
+def test_distances_from_a_path_are_those_of_its_densest_places() -> None:
+    rng = np.random.default_rng(0)
+    path = np.cumsum(rng.uniform(-1, 1, (6, 3)), axis=0)
+    dense = np.concatenate([np.linspace(a, b, 4001) for a, b in zip(path, path[1:], strict=False)])
+    for place in rng.uniform(-3, 3, (20, 3)):
+        assert off_path_m(place, path) == pytest.approx(np.linalg.norm(dense - place, axis=1).min(), abs=1e-4)
+    assert off_path_m(path[2] + 1e-9, path) < 1e-8
+    assert off_path_m(path[0] + [0, 3, 4], path[:1]) == pytest.approx(5)
 
 
 def test_sessions_and_exact_frames_are_repaired_like_renders(run: Path) -> None:

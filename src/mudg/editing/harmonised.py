@@ -45,6 +45,7 @@ from mudg.editing.plan import EditPlan
 from mudg.editing.recorded import EditedImages, boxes_mask, ground_mask, others, touched_boxes, vacated_at
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import FAR_M, raster_of, render_planes, render_view
+from mudg.scene.read import read_scene
 
 DYNAMIC: Final = torch.tensor(sorted(DYNAMIC_IDS), dtype=torch.uint8)
 FEATHER_PX: Final = 3
@@ -54,6 +55,10 @@ BRIGHTER: Final = 0.02
 CONTACT_REACH: Final = 0.2
 """The ground this far about a new place of an object, as a share of its height, is its contact shadow and no longer
 what was uncovered."""
+SHARE_PER_M: Final = 1.0
+SHARES: Final = 0.5, 2.0
+"""The last repair: a generated view counts as much as its confidence times its metres from the recorded path, with
+these bounds, beside 1 for the render."""
 OVERLAP: Final = 2
 """Frames that windows share."""
 PUBLISHED_OVERLAP: Final = 8
@@ -304,6 +309,8 @@ class RenderMixer:
 
     The model makes the view once more, from the fused points, the photographs and the render, and says how sure it is.
     What it makes of a view does not depend on other views: in windows of a path they come out the same to 58 dB.
+    Near the recorded path the render counts for more, since photographs of the same places made it; away from there
+    the generated view does (`SHARE_PER_M`).
 
     Args:
         inputs: folders of the scene, its clouds and the fit.
@@ -319,19 +326,33 @@ class RenderMixer:
         self._settings = loading.check_config(settings_of(config, device), fitted=True)
         self._inputs, self._model = inputs, loading.load_any(self._settings)
         self._maker: tuple[tuple[int, int], ViewMaker] | None = None
+        recorded = read_scene(inputs.scene)
+        self._paths = [
+            np.array([frame.view.world_from_cam[:3, 3] for frame in recorded.frames_of(name)])
+            for name in recorded.cameras
+        ]
 
     def __call__(self, view: View, render: Observation) -> Observation:
         """The view, from its render, which has its depth."""
         size = view.camera.width, view.camera.height
         if self._maker is None or self._maker[0] != size:
             self._maker = size, view_maker(self._settings, self._inputs, [view], self._model, None)
-        return mixed(render, self._maker[1].make([view], 0, None)[2][0])
+        off_m = min(off_path_m(view.world_from_cam[:3, 3], path) for path in self._paths)
+        share = min(max(SHARE_PER_M * off_m, SHARES[0]), SHARES[1])
+        return mixed(render, self._maker[1].make([view], 0, None)[2][0], share)
 
 
-def mixed(render: Observation, generated: Observation) -> Observation:
-    """The mean of a render and of the generated view with its confidence as weight, colour and depth; depth that only
-    one of them has is taken from it. Classes and confidence are the render's."""
-    weight = generated.confidence * generated.mask
+def off_path_m(place: NDArray[np.float64], path: NDArray[np.float64]) -> float:
+    """Metres from a place f64[3] to a path f64[N,3] of straight pieces."""
+    along = np.diff(path, axis=0, append=path[-1:])
+    at = ((place - path) * along).sum(1) / np.maximum((along**2).sum(1), 1e-12)
+    return float(np.linalg.norm(place - path - at.clip(0, 1)[:, None] * along, axis=1).min())
+
+
+def mixed(render: Observation, generated: Observation, share: float) -> Observation:
+    """The mean of a render and of the generated view with ``share`` times its confidence as weight, colour and depth;
+    depth that only one of them has is taken from it. Classes and confidence are the render's."""
+    weight = share * generated.confidence * generated.mask
     mean = lambda a, b: (a + weight * b) / (1 + weight)
     depth = render.depth
     if depth is not None and generated.depth is not None:
