@@ -47,9 +47,9 @@ class RenderConfig:
     video: bool = True
     """Also write one MP4 video per trajectory."""
     repair: bool = False
-    """Let the diffusion model make every view once more from its render, and mix both by its confidence and the distance
-    from the recorded path. Better off the path, slower: half a second a view. --harmonize.model names the model
-    (docs/edit/repair.md)."""
+    """Let the diffusion model make every view once more from its render, and mix both by its confidence and by the
+    distance from the recorded path. Better off the path, slower: half a second a view. --harmonize.model names the
+    model (docs/edit/repair.md)."""
     harmonize: HarmonizeConfig = setting(default_factory=HarmonizeConfig)
     """With an edit script: let the diffusion model repair what the edits touch."""
     raster: Literal["auto", "cpu", "torch", "gsplat"] = "auto"
