@@ -128,6 +128,6 @@ def test_empty_and_bad_input() -> None:
     assert not nothing.valid.any()
     behind = project_points(np.array([[-5, 0, 0]], np.float32), None, VIEW)
     assert not behind.valid.any()
-    refused(r"\[N, 3\]", project_points, np.zeros((3, 2), np.float32), None, VIEW)
+    refused(r"\(N, 3\)", project_points, np.zeros((3, 2), np.float32), None, VIEW)
     refused("near_m", ProjectConfig, near_m=5.0, far_m=1.0, raises=UsageError)
     refused("static_splat_px", ProjectConfig, static_splat_px=0.0, raises=UsageError)

@@ -242,28 +242,13 @@ UNUSED: frozenset[str] = frozenset(
 )
 """Published names that may be there and are not read: what follows from the schedule, unused parts of the towers."""
 
-_NUMBER = {"{i}": r"(?P<i>\d+)", "{j}": r"(?P<j>\d+)"}
-_Index = dict[tuple[str, int, str], list[tuple[re.Pattern[str], str]]]
+
+def _pattern(template: str) -> re.Pattern[str]:
+    """A name with ``{i}`` and ``{j}`` for numbers, as a pattern with groups of these names."""
+    return re.compile(re.sub(r"\\{([ij])\\}", r"(?P<\1>\\d+)", re.escape(template)))
 
 
-def _place(name: str) -> tuple[str, int, str]:
-    """What a name and its row share for certain: first and last component, and how many there are."""
-    parts = name.split(".")
-    return parts[0], len(parts), parts[-1]
-
-
-def _index(rows: Iterable[tuple[str, str]]) -> _Index:
-    """Rows (template, result) as patterns, found by `_place`; their order is kept."""
-    found: _Index = {}
-    for template, result in rows:
-        text = re.escape(template)
-        for mark, expression in _NUMBER.items():
-            text = text.replace(re.escape(mark), expression)
-        found.setdefault(_place(template), []).append((re.compile(text), result))
-    return found
-
-
-_TO_PUBLISHED = _index((clean, published) for published, clean in RULES)
+_TO_PUBLISHED = [(_pattern(clean), published) for published, clean in RULES]
 
 
 def published_names(clean: Iterable[str]) -> dict[str, str]:
@@ -273,7 +258,7 @@ def published_names(clean: Iterable[str]) -> dict[str, str]:
     known = set(names)
     result = {}
     for name in names:
-        for pattern, published in _TO_PUBLISHED.get(_place(name), ()):
+        for pattern, published in _TO_PUBLISHED:
             found = pattern.fullmatch(name)
             if found is None:
                 continue

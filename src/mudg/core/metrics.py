@@ -486,11 +486,11 @@ class ExactMotion:
             self._motion = self._found(before, pair)
         return self._motion
 
-    def true_change(self, before: Pair, pair: Pair) -> float:
-        """Summed absolute change of these surfaces in the truth; 0 where it is not known."""
+    def true_change(self, before: Pair, pair: Pair) -> float | None:
+        """Summed absolute change of these surfaces in the truth; None where it is not known."""
         motion = self.between(before, pair)
         if motion is None or before.truth_rgb is None or pair.truth_rgb is None:
-            return 0.0
+            return None
         if self._true_change is None:
             self._true_change = change(before.truth_rgb, pair.truth_rgb, motion)
         return self._true_change
@@ -516,15 +516,15 @@ def _true_frame(pair: Pair) -> TrueFrame | None:
     return TrueFrame.of(view, torch.where(torch.isfinite(depth) & (depth > 0), depth, 1000.0), ids)
 
 
-def change_of(motion: ExactMotion, per: Callable[[Pair, Pair, PixelMotion], float]) -> Neighbours:
+def change_of(motion: ExactMotion, per: Callable[[Pair, Pair, PixelMotion], float | None]) -> Neighbours:
     """Summed absolute change of surfaces from each view to the next, over ``per``, pooled over the trajectory."""
 
     def share(pairs: tuple[Pair, Pair]) -> tuple[float, float]:
         before, pair = pairs
         where = motion.between(before, pair)
-        if before.rgb is None or pair.rgb is None or where is None:
+        if before.rgb is None or pair.rgb is None or where is None or (count := per(before, pair, where)) is None:
             return 0.0, 0
-        return change(before.rgb.clamp(0, 1), pair.rgb.clamp(0, 1), where), per(before, pair, where)
+        return change(before.rgb.clamp(0, 1), pair.rgb.clamp(0, 1), where), count
 
     return Neighbours(neighbour_of, share)
 
