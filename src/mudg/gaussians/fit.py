@@ -251,7 +251,12 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
             state.appearance.adam_step(step - state.begun_at, rates, native_ops.adam_columns)
             if step % SHAPE_EVERY == 0:
                 shorten_needles(state.model.table, config.densify.longest_to_middle)
-                settle_nodes(state.model, config, step)
+                share = (
+                    learning_rates(step, config.iterations)["deform"] / learning_rates(1, config.iterations)["deform"]
+                )
+                for node in state.model.nodes:
+                    if isinstance(node, RigidNode):  # less and less, as the steps of the optimiser shrink
+                        node.after_step(share)
             if pose_round_due(config, step):
                 moved_m = refine_poses(state.model, state.views.recorded, raster, state.appearance)
                 folder.log(step=step, boxes_moved_m=round(moved_m, 5))
@@ -405,14 +410,6 @@ def correction_terms(
         inside = boxes_in_view(state.model, view.view).to(state.device, non_blocking=True)
         terms["objects"] = config.loss.object_weight * losses.object_map(alpha, inside).mean()
     return terms
-
-
-def settle_nodes(model: SceneModel, config: FitConfig, step: int) -> None:
-    """Regularise what nodes learn per key of their track, less and less as the steps of the optimiser shrink."""
-    share = learning_rates(step, config.iterations)["deform"] / learning_rates(1, config.iterations)["deform"]
-    for node in model.nodes:
-        if isinstance(node, RigidNode):
-            node.after_step(share)
 
 
 # ---- the optimiser -------------------------------------------------------------------------------
