@@ -251,12 +251,10 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
             state.appearance.adam_step(step - state.begun_at, rates, native_ops.adam_columns)
             if step % SHAPE_EVERY == 0:
                 shorten_needles(state.model.table, config.densify.longest_to_middle)
-                share = (
-                    learning_rates(step, config.iterations)["deform"] / learning_rates(1, config.iterations)["deform"]
-                )
+                now, first = (learning_rates(at, config.iterations)["deform"] for at in (step, 1))
                 for node in state.model.nodes:
                     if isinstance(node, RigidNode):  # less and less, as the steps of the optimiser shrink
-                        node.after_step(share)
+                        node.after_step(now / first)
             if pose_round_due(config, step):
                 moved_m = refine_poses(state.model, state.views.recorded, raster, state.appearance)
                 folder.log(step=step, boxes_moved_m=round(moved_m, 5))
