@@ -16,7 +16,6 @@ def annotate(
     depth_network: str = '',
     depth_steps: int = 0,
     device: str = 'auto',
-    precision: Literal['auto', 'float32', 'bfloat16'] = 'auto',
     sweeps: int = 6,
     dynamic: bool = True,
     ego: bool = False,
@@ -35,7 +34,6 @@ def annotate(
         depth_network: Take dense depth from a network and align it to LiDAR: folder, or name in the Hugging Face cache, of a PromptDepthAnything or Depth Anything model (transformers); or folder of a DepthLab written by mudg convert.
         depth_steps: DepthLab: denoising steps (0 = as in the model folder).
         device: Device of the networks of labeller and `depth_network`: auto (CUDA if there is one), cpu, cuda, cuda:N, mps.
-        precision: Number format of these networks. auto is float32; bfloat16 is faster on some devices and rounds depth to 0.4 percent.
         sweeps: Number of sweeps per LiDAR, nearest in time, whose points are merged for dense depth.
         dynamic: Write masks of dynamic objects, from the tracked boxes.
         ego: Write masks of the own vehicle: pixels at the bottom of the image that stay the same while it drives. Use it if the bonnet is visible.
@@ -55,7 +53,6 @@ def bench(
     cities: Literal['reported', 'development'] = 'reported',
     count: int = 6,
     steps: tuple[int, ...] = (1, 2, 8),
-    sampler: Literal['ddim', 'dpm_solver'] = 'ddim',
     eta: float | None = None,
     precision: Literal['auto', 'float32', 'bfloat16', 'float16'] = 'auto',
     harmonize: bool = False,
@@ -96,8 +93,7 @@ def bench(
         cities: mdm, poses, edit: list of cities. Choose settings on development; report results on reported, on which nothing was chosen.
         count: mdm, poses, edit: number of cities taken from the list, 1 to 6. mdm: each gives four clips: shifted by 2, 3 and 4 m, and on the recorded path.
         steps: mdm: numbers of denoising steps to compare; each is measured on its own.
-        sampler: mdm: sampler of the diffusion model. ddim: first order, with fresh noise between steps. dpm_solver: second order and deterministic, for many steps. Both cost one network pass per step. shift, real and paper have `--synthesize.sampler`, and likewise steps and eta.
-        eta: mdm: sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given: 1).
+        eta: mdm: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given: 1). shift, real and paper have `--synthesize.eta`, and likewise steps.
         precision: Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere. float16: published-type models on CUDA devices (shift, real, paper).
         harmonize: edit: add rows with the diffusion model: edited frames that it repaired, and fits that go on with them.
         threads: mdm, poses, edit: number of torch threads.
@@ -755,7 +751,6 @@ def synthesize(
     paths: tuple[str, ...] = (),
     model: str = 'embedded',
     steps: int = 2,
-    sampler: Literal['ddim', 'dpm_solver'] = 'ddim',
     eta: float | None = None,
     condition: Literal['full', 'reference', 'points', 'concat', 'repair'] = 'full',
     given_classes: bool = True,
@@ -786,8 +781,7 @@ def synthesize(
         paths: Further paths by name: up+1, lane+0.1, speed-0.1, ..., as for render.
         model: Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn or convert.
         steps: Denoising steps. More add texture and agree less with the truth pixel by pixel. Use 50 for published-type models.
-        sampler: Sampler of the diffusion model. ddim: first order, with fresh noise between steps. dpm_solver: second order and deterministic, for many steps. Both cost one network pass per step.
-        eta: Sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given: 1).
+        eta: Noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given: 1).
         condition: Which parts of the model's condition are given, to measure what each brings. reference: the nearest recorded image alone. points: LiDAR points alone. concat: both, without images warped by depth (published-type models: the image in frame 0, not in the image tokens). The shipped models were trained on whole conditions. repair: renders of `--fitted` and the nearest recorded image, without points; gives colour alone.
         given_classes: Use the classes of labelled points and recorded images in the model's condition, if the scene has labels.
         align_depth: Align generated depth to the LiDAR points in the same view (one scale and one shift per frame).
