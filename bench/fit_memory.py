@@ -128,14 +128,12 @@ def loaded(
         virtual=VirtualConfig(start=0.0, gaussians=options.unseen),
     )
     virtual = sum(map(len, sets.values()))
-    needed = kept.recorded_bytes(scene.frames, 0) + kept.virtual_bytes(sets)
     kept.IN_MEMORY_BYTES = 1 << 62 if options.in_memory else 0
-    scratch = kept.scratch_folder(options.views + virtual, needed, out)
     began = time.perf_counter(), time.process_time()
-    found, classes = fit.recorded_views(config, scene, sets, None, scratch)
+    found, classes = fit.recorded_views(config, scene, sets, None, out)
     cloud = read_fused(fused)
     measured = views.fused_lidar(cloud, scene.tracks)
-    found = replace(found, virtual=kept.keep(views.load_virtual(sets, classes, measured), virtual, scratch))
+    found = replace(found, virtual=kept.keep(views.load_virtual(sets, classes, measured), virtual, out))
     numbers = {
         "views": options.views,
         "virtual": virtual,
@@ -143,7 +141,6 @@ def loaded(
         "in_memory": options.in_memory,
         "loading_s": time.perf_counter() - began[0],
         "loading_cpu_s": time.process_time() - began[1],
-        "expected_gib": needed / GIB,
     }
     began = time.perf_counter(), time.process_time()
     state = fit.start_state(config, scene, cloud, found, classes)
@@ -205,7 +202,6 @@ def table(found: dict[str, Any]) -> str:
             [
                 (
                     f"{found['views']} recorded and {found['virtual']} virtual views of {found['size']},"
-                    f" {found['expected_gib']:.1f} GiB expected,"
                     f" {'in memory' if found['in_memory'] else 'in files'}"
                 ),
                 (

@@ -64,8 +64,9 @@ def test_a_measured_point_lies_in_the_pixel_that_shows_it(width: int) -> None:
 
 
 @pytest.mark.parametrize("keep", [True, False])
-def test_only_virtual_views_of_the_first_steps_are_halved(keep: bool) -> None:
-    sizes, virtual, recorded = HalvedViews(8, keep), stored(), stored(kind="recorded")
+def test_only_virtual_views_of_the_first_steps_are_halved(keep: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mudg.gaussians.views.IN_MEMORY_BYTES", (1 << 30) * keep)
+    sizes, virtual, recorded = HalvedViews(8), stored(), stored(kind="recorded")
     assert sizes.sized(virtual, 8).rgb.shape == (HEIGHT // 2, WIDTH // 2, 3)
     assert (sizes.sized(virtual, 8) is sizes.sized(virtual, 3)) == keep
     assert sizes.sized(virtual, 9) is virtual
@@ -76,8 +77,8 @@ def test_large_views_are_halved_at_every_step_and_tiny_ones_never(monkeypatch: p
     monkeypatch.setattr("mudg.gaussians.views.WHOLE_PIXELS", WIDTH * HEIGHT - 1)
     view = stored()
     for until, side in ((10.0, WIDTH // 2), (0.0, WIDTH)):
-        sizes = HalvedViews(until, keep=True)
+        sizes = HalvedViews(until)
         assert [sizes.sized(view, step).rgb.shape[1] for step in (1, 11)] == [side, side]
-    assert HalvedViews(10.0, keep=True).sized(stored(WIDTH - 1), 11).rgb.shape[1] == WIDTH - 1
+    assert HalvedViews(10.0).sized(stored(WIDTH - 1), 11).rgb.shape[1] == WIDTH - 1
     small = stored(300, 2 * LEAST_PX - 1)
     assert halved(small) is small

@@ -78,7 +78,9 @@ def filed(folder: Path, views: list[StoredView]) -> Sequence[StoredView]:
         for index in reversed(range(len(views))):  # any order
             yield index, views[index]
 
-    return kept.keep(loaded(), len(views), folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kept, "IN_MEMORY_BYTES", 0)
+        return kept.keep(loaded(), len(views), folder)
 
 
 def test_every_combination_of_fields_and_number_types_comes_back_to_the_bit(tmp_path, monkeypatch):
@@ -109,16 +111,6 @@ def test_views_grow_on_their_device(tmp_path):
         assert torch.equal(view.lidar.pixel.cpu(), wanted.lidar.pixel)
         for name in ("rgb", "mask", "channels"):
             assert torch.equal(getattr(view, name).cpu(), getattr(wanted, name))
-
-
-def test_a_full_disk_is_said_before_anything_is_read(tmp_path, monkeypatch):
-    room = shutil._ntuple_diskusage(100 << 30, 97 << 30, 3 << 30)
-    monkeypatch.setattr(kept.shutil, "disk_usage", lambda folder: room)
-    assert kept.scratch_folder(9, kept.IN_MEMORY_BYTES, tmp_path) is None
-    assert kept.scratch_folder(9, 2 << 30, tmp_path) == tmp_path
-    said = r"too little room[\s\S]*4.0 GiB free for 9 views[\s\S]*3.0 GiB[\s\S]*--width-px"
-    with pytest.raises(ResourceError, match=said):
-        kept.scratch_folder(9, 4 << 30, tmp_path)
 
 
 def test_a_mapped_array_keeps_its_values_and_has_no_name(tmp_path):
@@ -199,8 +191,9 @@ def test_ctrl_c_while_frames_are_read_ends_the_threads(world, tmp_path, monkeypa
 
     scene, before = read_scene(world["scene"]), threads_at_work()
     monkeypatch.setattr(kept, "mapped_array", ctrl_c)
+    monkeypatch.setattr(kept, "IN_MEMORY_BYTES", 0)
     with pytest.raises(KeyboardInterrupt):
-        fit.recorded_views(settings(), scene, scratch=tmp_path)
+        fit.recorded_views(settings(), scene, folder=tmp_path)
     assert threads_at_work() == before
 
 

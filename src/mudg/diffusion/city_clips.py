@@ -534,10 +534,8 @@ def cut_patch(full: Clip, scale: int, side_px: int, rng: np.random.Generator) ->
 
 def cropped(clip: Clip, rows: slice, columns: slice) -> Clip:
     """A rectangle of a clip and of its condition. Its cameras only say how large it is: they look straight ahead."""
-    cut = lambda x: x[..., rows, columns].contiguous()
-    own = {name: cut(getattr(clip, name)) for name in ("rgb", "depth", "depth_valid", "semantics")}
-    condition = clip.condition.cropped(rows, columns)
-    return replace(clip, condition=condition, **own, fine=None, point_color=None)
+    cut = replace(clip, fine=None, point_color=None).map(lambda x: x[..., rows, columns].contiguous())
+    return replace(cut, condition=clip.condition.cropped(rows, columns))
 
 
 def shifted_view(world: CityWorld, view: View, shift_m: float) -> View:

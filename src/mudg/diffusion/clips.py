@@ -336,8 +336,9 @@ def vary(clip: Clip, rng: np.random.Generator) -> Clip:
         if given.renders is not None and not without_renders:
             shown = given.renders
             renders = replace(shown, color=curve(shown.color, error), semantics=classes.on(shown.semantics))
-        made = replace(one, rgb=curve(one.rgb, 1.0), condition=replace(given, **colors, **ids, renders=renders))
-        return _mirrored(made) if mirrored else made
+        condition = replace(given, **colors, **ids, renders=renders)
+        made = replace(one, rgb=curve(one.rgb, 1.0), condition=condition, fine=None)
+        return replace(made.map(lambda x: x.flip(-1)), shift_m=-one.shift_m) if mirrored else made
 
     made = varied(clip)
     if clip.fine is None:
@@ -346,22 +347,6 @@ def vary(clip: Clip, rng: np.random.Generator) -> Clip:
     if mirrored:
         column = clip.rgb.shape[-1] - column - clip.fine.clip.rgb.shape[-1] // clip.fine.scale
     return replace(made, fine=replace(clip.fine, clip=varied(clip.fine.clip), column=column))
-
-
-def _mirrored(clip: Clip) -> Clip:
-    """The mirror image of a clip without its patch; the poses stay."""
-    flip = lambda x: x.flip(-1)
-    given = clip.condition
-    names = ("color", "depth", "valid", "reference", "warped", "backdrop", "semantics", "backdrop_semantics")
-    turned = {name: flip(getattr(given, name)) for name in names}
-    renders = None if given.renders is None else given.renders.map(flip)
-    measured = None if given.measured is None else given.measured.map(flip)
-    own = {name: flip(getattr(clip, name)) for name in ("rgb", "depth", "depth_valid", "semantics")}
-    if clip.depth_confidence is not None:
-        own["depth_confidence"] = flip(clip.depth_confidence)
-    return replace(
-        clip, condition=replace(given, **turned, renders=renders, measured=measured), **own, shift_m=-clip.shift_m
-    )
 
 
 NO_IDS, WORSE_IDS = 0.35, 0.25

@@ -150,7 +150,6 @@ def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: Pub
     found = weights.read_checkpoint(checkpoint)
     if config.towers:
         found = weights.with_towers(found, weights.read_checkpoint(Path(config.towers)))
-    refuse_relatives(found, checkpoint)
     found, adapted = widen(found)
     tensors = weights.match(found, wanted_shapes(network), str(checkpoint))
     _check_values(found, tensors, checkpoint)
@@ -171,23 +170,6 @@ def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: Pub
     }
     dtype = DTYPES[config.dtype]
     published.save(to, network, tensors, facts, _card(network, facts), dtype=dtype, shard_bytes=SHARD_BYTES)
-
-
-def refuse_relatives(state: Mapping[str, Tensor], where: Path) -> None:
-    """InputError for DynamiCrafter-256, which looks alike and is another model."""
-    marks = [name for name in state if ".framestride_embed." in name or name.endswith(".attn2.alpha")]
-    if marks:
-        raise InputError(
-            "this is the 256-pixel DynamiCrafter, which cannot be converted",
-            where=str(where),
-            got=", ".join(marks[:3]),
-            expected=(
-                "MuDG, or DynamiCrafter-512 or -1024: the small one predicts noise instead of velocity, has a schedule"
-                " that never reaches pure noise and no dynamic rescale, and weights its image attention with learned"
-                " factors"
-            ),
-            remedy="take the 512 or 1024 checkpoint",
-        )
 
 
 def widen(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:

@@ -141,14 +141,11 @@ def _prepare(config: FitConfig, inputs: FitInputs, out: Path) -> FitState:
     scene, fused, start = read_scene(inputs.scene), read_fused(inputs.fused), inputs.start
     if not METHODS[config.method].boxes:
         scene, fused = replace(scene, tracks=()), fused_without_boxes(scene, inputs.fused)
-    frames, invented = views.training_frames(scene, config.cameras), sum(map(len, inputs.virtual.values()))
-    needed = views.recorded_bytes(frames, config.width_px) + views.virtual_bytes(inputs.virtual)
-    scratch = views.scratch_folder(len(frames) + invented, needed, out)
-    shown, classes = recorded_views(config, scene, inputs.virtual, start, scratch)
+    shown, classes = recorded_views(config, scene, inputs.virtual, start, out)
     if inputs.virtual:
         measured = views.fused_lidar(fused, scene.tracks) if config.virtual.lidar_weight else None
         loaded = views.load_virtual(inputs.virtual, classes, measured)
-        shown = replace(shown, virtual=views.keep(loaded, invented, scratch))
+        shown = replace(shown, virtual=views.keep(loaded, sum(map(len, inputs.virtual.values())), out))
     found = checkpoint.latest(out / "steps")
     if found is None and start is None:
         return start_state(config, scene, fused, shown, classes)
@@ -168,17 +165,17 @@ def recorded_views(
     scene: Scene,
     virtual: Mapping[str, ObservationSet] | None = None,
     start: storage.StartFit | None = None,
-    scratch: Path | None = None,
+    folder: Path | None = None,
 ) -> tuple[ViewSet, tuple[int, ...]]:
     """The recorded views of a configuration, without virtual ones, and the train ids of the model's class channels
-    (those that ``virtual`` shows and ``start`` knows included). ``scratch``: keep them in files in this folder, not in
-    memory."""
+    (those that ``virtual`` shows and ``start`` knows included). ``folder``: for those that memory has no
+    room for."""
     frames = views.training_frames(scene, config.cameras)
     classes = views.classes_of(scene, frames, virtual or {}) if config.semantics else ()
     classes = classes if start is None else storage.all_classes(start, classes)
     with_lidar = "lidar" in METHODS[config.method].supervision and config.loss.lidar_weight > 0
     loaded = load_recorded(scene, frames, classes, config.width_px, with_lidar)
-    return ViewSet(views.keep(loaded, len(frames), scratch), filed=scratch is not None), classes
+    return ViewSet(views.keep(loaded, len(frames), folder)), classes
 
 
 def start_state(
@@ -230,7 +227,7 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
     raster, perception = raster_of(state.model, config.raster), perception_of(config.virtual, state.device)
     virtual_from, virtual_to = (share * config.iterations for share in (config.virtual.start, config.virtual.stop))
     virtual_from, pace = state.begun_at or virtual_from, checkpoint.Pace()
-    sizes = views.HalvedViews(config.virtual.half_size * config.iterations, keep=not state.views.filed)
+    sizes = views.HalvedViews(config.virtual.half_size * config.iterations)
 
     with log.task(f"fit {config.method}", config.iterations, state.step) as bar, Interruption() as interruption:
         while state.step < config.iterations:
@@ -251,7 +248,10 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
             state.appearance.adam_step(step - state.begun_at, rates, native_ops.adam_columns)
             if step % SHAPE_EVERY == 0:
                 shorten_needles(state.model.table, config.densify.longest_to_middle)
-                settle_nodes(state.model, config, step)
+                now, first = (learning_rates(at, config.iterations)["deform"] for at in (step, 1))
+                for node in state.model.nodes:
+                    if isinstance(node, RigidNode):  # less and less, as the steps of the optimiser shrink
+                        node.after_step(now / first)
             if pose_round_due(config, step):
                 moved_m = refine_poses(state.model, state.views.recorded, raster, state.appearance)
                 folder.log(step=step, boxes_moved_m=round(moved_m, 5))
@@ -405,14 +405,6 @@ def correction_terms(
         inside = boxes_in_view(state.model, view.view).to(state.device, non_blocking=True)
         terms["objects"] = config.loss.object_weight * losses.object_map(alpha, inside).mean()
     return terms
-
-
-def settle_nodes(model: SceneModel, config: FitConfig, step: int) -> None:
-    """Regularise what nodes learn per key of their track, less and less as the steps of the optimiser shrink."""
-    share = learning_rates(step, config.iterations)["deform"] / learning_rates(1, config.iterations)["deform"]
-    for node in model.nodes:
-        if isinstance(node, RigidNode):
-            node.after_step(share)
 
 
 # ---- the optimiser -------------------------------------------------------------------------------

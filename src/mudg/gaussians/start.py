@@ -149,7 +149,13 @@ def start_model(
         what, remedy = "the fused cloud has no static points", "check the LiDAR of the scene"
         raise InputError(what, where=scene.root, remedy=remedy)
     kinds = METHODS[config.method].nodes
-    blocks = [_static_columns(fused, views, classes, config)]
+    cloud = fused.static
+    centers = np.stack([stored.view.center_world for stored in views]).astype(np.float32)
+    rows = thinned(cloud.xyz, centers, config)
+    points = StartPoints(cloud.xyz[rows], cloud.rgb[rows], _labels(cloud)[rows], neighbour_scale(cloud.xyz[rows]))
+    filled = fill_unreached(views, points.xyz, classes, fused.colors)
+    points = points if filled is None else StartPoints.joined([points, filled])
+    blocks = [points.columns(classes, config.sh_degree)]
     nodes: list[StaticNode | RigidNode] = [StaticNode()]
     if "objects" in kinds:
         share = config.start.gaussians // max(1, len(fused.objects))
@@ -164,17 +170,6 @@ def start_model(
     log.info(f"start: {static} static Gaussians, {len(owner) - static} on {len(nodes) - 1} dynamic objects")
     table = Table(columns, {"node": owner})
     return SceneModel(table, tuple(nodes), sky, classes, config.sh_degree, colors=fused.colors)
-
-
-def _static_columns(
-    fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
-) -> Mapping[str, torch.Tensor]:
-    cloud = fused.static
-    centers = np.stack([stored.view.center_world for stored in views]).astype(np.float32)
-    rows = thinned(cloud.xyz, centers, config)
-    points = StartPoints(cloud.xyz[rows], cloud.rgb[rows], _labels(cloud)[rows], neighbour_scale(cloud.xyz[rows]))
-    filled = fill_unreached(views, points.xyz, classes, fused.colors)
-    return (points if filled is None else StartPoints.joined([points, filled])).columns(classes, config.sh_degree)
 
 
 def _labels(cloud: PointCloud) -> NDArray[np.uint8]:

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import math
-import shutil
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -23,7 +22,7 @@ from torch import Tensor
 
 from mudg import native
 from mudg.base import geometry, log, seeds
-from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID, UNLABELLED
 from mudg.base.processes import GIB, computed_ahead
 from mudg.base.scratch import mapped_array
@@ -129,11 +128,10 @@ class StoredView:
 
 @dataclass(frozen=True)
 class ViewSet:
-    """All views of a fit. ``virtual`` may be empty. ``filed``: they lie in files, not in memory."""
+    """All views of a fit. ``virtual`` may be empty."""
 
     recorded: Sequence[StoredView]
     virtual: Sequence[StoredView] = ()
-    filed: bool = False
 
     def choose(
         self, run_seed: int, step: int, virtual_probability: float, beside: bool = False
@@ -396,78 +394,40 @@ def lidar_pixels(view: View, xyz_world: NDArray[np.float32], gap_deg: float) -> 
 
 # ---- where views lie -----------------------------------------------------------------------------
 #
-# Small sets lie in memory. Decoded views of a long log at full size need more than the fit itself: 1,000 of 1600 x 1066
-# pixels 8 to 11 GiB, 1,000 virtual ones with dense depth 18. Above ``IN_MEMORY_BYTES`` their planes are mapped from
-# files without names in the folder of the fit: the system keeps as much of them in memory as it can spare.
+# Decoded views of a long log at full size need more memory than the fit itself: 1,000 of 1600 x 1066 pixels 8 to 11
+# GiB, 1,000 virtual ones with dense depth 18. Beyond ``IN_MEMORY_BYTES`` they are mapped from files without names in
+# the folder of the fit: the system keeps as much of them in memory as it can spare.
 
 IN_MEMORY_BYTES = GIB
-"""Decoded views of up to this size stay in memory."""
 FILE_BYTES = GIB // 4
-LIDAR_SHARE = 0.05
-"""Assumed share of pixels with LiDAR, for the size of views that are not read yet."""
-
-
-def recorded_bytes(frames: Sequence[Frame], width_px: int) -> int:
-    """Bytes that the frames need when they are decoded, about."""
-    total = 0.0
-    for frame in frames:
-        camera = resized_view(frame.view, width_px).camera
-        has = frame.labels
-        planes = 3 + sum(label in has for label in ("semantics", "ego", "semantics_confidence"))
-        planes += "sky" in has or "semantics" in has
-        total += camera.width * camera.height * (planes + 12 * LIDAR_SHARE)
-    return int(total)
-
-
-def virtual_bytes(sets: Mapping[str, ObservationSet]) -> int:
-    """Bytes that these observations need when they are decoded, about."""
-    total = 0.0
-    for found in sets.values():
-        for view, depth, semantics in zip(found.views, found.has_depth, found.has_semantics):
-            total += view.camera.width * view.camera.height * (5 + 4 * depth + 2 * semantics + 12 * LIDAR_SHARE)
-    return int(total)
-
-
-def scratch_folder(count: int, needed: int, folder: Path) -> Path | None:
-    """Where ``count`` views of ``needed`` bytes are to be kept: in files in this folder, or None: in memory. Says
-    which. ResourceError: the disk has less room than they need."""
-    if needed <= IN_MEMORY_BYTES:
-        return None
-    free = shutil.disk_usage(folder).free
-    if free < needed:
-        what = "the disk has too little room for the decoded views"
-        expected = f"{needed / GIB:.1f} GiB free for {count} views while the fit runs"
-        remedy = "free disk space, choose --out on another disk, or lower --width-px"
-        raise ResourceError(what, where=str(folder), expected=expected, got=f"{free / GIB:.1f} GiB", remedy=remedy)
-    place = f"kept in files without names in {folder}, gone when the fit ends"
-    log.info(f"views: {count}, {needed / GIB:.1f} GiB decoded: {place}")
-    return folder
 
 
 def keep(loaded: LoadedViews, count: int, folder: Path | None) -> Sequence[StoredView]:
-    """The views in their places: mapped from files in ``folder``, or in memory."""
+    """The views in their places: the first in memory, others mapped from files in ``folder`` (None: all in memory).
+    ResourceError: the disk has no room for them."""
+    places, total, left = dict[int, StoredView](), 0, np.zeros(0, np.uint8)
     with contextlib.closing(loaded) as pairs:
-        places = dict(pairs if folder is None else _mapped(pairs, folder))
+        for index, stored in pairs:
+            places[index] = stored
+            own = {name: plane for name, plane in vars(stored).items() if isinstance(plane, np.ndarray)}
+            if stored.lidar is not None:
+                own |= {name: values.numpy() for name, values in vars(stored.lidar).items()}
+            room = {name: -(-plane.nbytes // 8) * 8 for name, plane in own.items()}
+            size, before = sum(room.values()), total
+            total += size
+            if folder is None or total <= IN_MEMORY_BYTES:
+                continue
+            if before <= IN_MEMORY_BYTES:
+                log.info(f"views: more than fit into memory are kept in files without names in {folder}")
+            if size > len(left):
+                left = np.asarray(mapped_array(folder, (max(FILE_BYTES, size),), np.uint8))
+            for name, plane in own.items():
+                place, left = left[: plane.nbytes].view(plane.dtype).reshape(plane.shape), left[room[name] :]
+                place[...] = plane
+                own[name] = place
+            lidar = stored.lidar and LidarPixels(*(torch.from_numpy(own.pop(name)) for name in vars(stored.lidar)))
+            places[index] = replace(stored, lidar=lidar, **own)
     return tuple(places[index] for index in range(count))
-
-
-def _mapped(loaded: LoadedViews, folder: Path) -> Iterator[tuple[int, StoredView]]:
-    """The same views with all their numbers in files without names."""
-    left = np.zeros(0, np.uint8)
-    for index, stored in loaded:
-        own = {name: plane for name, plane in vars(stored).items() if isinstance(plane, np.ndarray)}
-        if stored.lidar is not None:
-            own |= {name: values.numpy() for name, values in vars(stored.lidar).items()}
-        room = {name: -(-plane.nbytes // 8) * 8 for name, plane in own.items()}
-        if sum(room.values()) > len(left):
-            left = np.asarray(mapped_array(folder, (max(FILE_BYTES, sum(room.values())),), np.uint8))
-        for name, plane in own.items():
-            place, left = left[: plane.nbytes], left[room[name] :]
-            place = place.view(plane.dtype).reshape(plane.shape)
-            place[...] = plane
-            own[name] = place
-        lidar = stored.lidar and LidarPixels(*(torch.from_numpy(own.pop(name)) for name in vars(stored.lidar)))
-        yield index, replace(stored, lidar=lidar, **own)
 
 
 # ---- halved --------------------------------------------------------------------------------------
@@ -482,12 +442,12 @@ LEAST_PX: Final = 96
 
 class HalvedViews:
     """Gives the steps up to ``until`` virtual views at half their size; of views above ``WHOLE_PIXELS`` all steps, for
-    want of memory. ``until``: 0 leaves every view as it is. ``keep``: halved views stay in memory, a quarter of what
-    the views themselves take."""
+    want of memory. ``until``: 0 leaves every view as it is. Halved views stay in memory, a quarter of what the views
+    themselves take, up to a quarter of ``IN_MEMORY_BYTES`` of colours."""
 
-    def __init__(self, until: float, keep: bool) -> None:
-        self._until = until
-        self._kept: dict[str, StoredView] | None = {} if keep else None
+    def __init__(self, until: float) -> None:
+        self._until, self._room = until, IN_MEMORY_BYTES // 4
+        self._kept: dict[str, StoredView] = {}
 
     def sized(self, view: StoredView, step: int) -> StoredView:
         """The view as a step is to see it."""
@@ -495,11 +455,10 @@ class HalvedViews:
         until = math.inf if self._until and height * width > WHOLE_PIXELS else self._until
         if view.kind == "recorded" or step > until:
             return view
-        if self._kept is None:
-            return halved(view)
-        if view.name not in self._kept:
-            self._kept[view.name] = halved(view)
-        return self._kept[view.name]
+        made = self._kept.get(view.name) or halved(view)
+        if view.name not in self._kept and made.rgb.nbytes <= self._room:
+            self._kept[view.name], self._room = made, self._room - made.rgb.nbytes
+        return made
 
 
 def halved(view: StoredView) -> StoredView:

@@ -241,15 +241,13 @@ class NearbyReturns:
         self._kept = {key: value for key, value in self._kept.items() if key in ids}
         parts, known = [np.zeros((0, 3), np.float32)], [self._separated(sweep) for sweep in chosen]
         for sweep in known:
-            parts += [sweep.static, *self._dynamic_points_at(time_s, sweep.owned)]
+            parts.append(sweep.static)
+            for index, xyz_object in sweep.owned.items():
+                pose = self._dynamic_tracks[index].pose_at(time_s)
+                if pose is not None:
+                    parts.append(geometry.transform_points(pose, xyz_object).astype(np.float32))
         gap = min((sweep.gap_deg for sweep in known), default=0.6)
         return np.concatenate(parts), gap, max((sweep.highest_rad for sweep in known), default=0.0)
-
-    def _dynamic_points_at(self, time_s: float, owned: dict[int, NDArray[np.float32]]) -> Iterator[NDArray[np.float32]]:
-        for index, xyz_object in owned.items():
-            pose = self._dynamic_tracks[index].pose_at(time_s)
-            if pose is not None:
-                yield geometry.transform_points(pose, xyz_object).astype(np.float32)
 
     def _separated(self, sweep: Sweep) -> _Separated:
         if sweep.id not in self._kept:

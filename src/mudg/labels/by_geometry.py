@@ -7,7 +7,6 @@ depth is filled from the returns (``core.complete``). The rules hold no paramete
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from mudg.base.palette import ID
-from mudg.core.depth import SKY_M, beyond_reach, complete_depth
+from mudg.core.depth import SKY_M, DenseDepth, beyond_reach, complete_depth
 from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import visible_depth
 from mudg.labels.inputs import LabelInput, Labels, far_to_near, surface_points
@@ -28,15 +27,6 @@ GROUND_M: Final = 0.2
 """Height above the ground plane up to which a pixel is ground (and a little more far away)."""
 GRASS: Final = 6.0
 """Ground greener than this (``greenness_of``) is terrain."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Surface:
-    """Dense depth: ``xyz_world`` f32[H, W, 3] (NaN = unknown), ``depth`` f32[H, W] metres, ``confidence`` f32[H, W]."""
-
-    xyz_world: Floats
-    depth: Floats
-    confidence: Floats
 
 
 def label_by_network(inputs: LabelInput, semantics: Bytes, confidence: Floats) -> Labels:
@@ -52,20 +42,19 @@ def label_by_network(inputs: LabelInput, semantics: Bytes, confidence: Floats) -
     return Labels(semantics, confidence, sky, find_dynamic(inputs, semantics, surface), depth, depth_confidence)
 
 
-def _complete(inputs: LabelInput, measured: Floats, sky: Mask) -> _Surface:
-    """Dense depth of what is not sky, and its points."""
+def _complete(inputs: LabelInput, measured: Floats, sky: Mask) -> DenseDepth:
+    """Dense depth of what is not sky."""
     beyond = beyond_reach(inputs.view, measured, inputs.highest_rad, gap_deg=inputs.beam_gap_deg)
     for box in far_to_near(inputs):  # the windows of vehicles return nothing, although they are near
         outline = box.outline(inputs.view, 0.0)
         if outline is not None:
             beyond &= ~outline
-    dense = complete_depth(inputs.rgb, measured, sky, beyond)
-    return _Surface(surface_points(inputs.view, dense.depth), dense.depth, dense.confidence)
+    return complete_depth(inputs.rgb, measured, sky, beyond)
 
 
-def find_dynamic(inputs: LabelInput, semantics: Bytes, surface: _Surface) -> Mask:
+def find_dynamic(inputs: LabelInput, semantics: Bytes, surface: DenseDepth) -> Mask:
     """Pixels of dynamic objects, bool[H, W]: the surface lies in their box, or is uncertain and has their class."""
-    dynamic = np.zeros(semantics.shape, bool)
+    dynamic, xyz_world = np.zeros(semantics.shape, bool), surface_points(inputs.view, surface.depth)
     for box in far_to_near(inputs):
         outline = box.outline(inputs.view) if box.number in inputs.moving else None
         if outline is None:
@@ -74,7 +63,7 @@ def find_dynamic(inputs: LabelInput, semantics: Bytes, surface: _Surface) -> Mas
         outline = outline[window]
         known = outline & np.isfinite(surface.depth[window])
         inside = np.zeros(outline.shape, bool)
-        inside[known] = box.contains(surface.xyz_world[window][known])
+        inside[known] = box.contains(xyz_world[window][known])
         uncertain = outline & ~(surface.confidence[window] > 0.3)
         dynamic[window] |= inside | (uncertain & (semantics[window] == box.train_id))
     return dynamic

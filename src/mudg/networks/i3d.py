@@ -121,15 +121,14 @@ class I3DFeatures(nn.Module):
     Args:
         state: the tensors of ``tensor_shapes``, in either layout; ``num_batches_tracked`` is left alone, anything else
             is refused.
-        where: file name for errors. epsilon: of the norms.
+        where: file name for errors.
 
     Raises:
         InputError: a tensor is missing, has another shape, holds impossible values, or is unknown.
     """
 
-    def __init__(self, state: Mapping[str, Tensor], where: str = "I3D weights", epsilon: float = NORM_EPSILON) -> None:
+    def __init__(self, state: Mapping[str, Tensor], where: str = "I3D weights") -> None:
         super().__init__()
-        self.epsilon = epsilon
         found, names = {_renamed(n): value for n, value in state.items()}, {_renamed(n): n for n in state}
         owner = "FVD's network"
         for name, value in checked_state(found, tensor_shapes(), where, "I3D", owner=owner, names=names).items():
@@ -169,7 +168,7 @@ class I3DFeatures(nn.Module):
         x = same_padded(x, (unit.size,) * 3, (unit.stride,) * 3)
         x = F.conv3d(x, self.get_buffer(f"{path}/conv3d/weight"), None, unit.stride)
         weight, bias, mean, variance = (self.get_buffer(f"{path}/bn/{leaf}") for leaf in _NORM)
-        return F.relu(F.batch_norm(x, mean, variance, weight, bias, training=False, eps=self.epsilon))
+        return F.relu(F.batch_norm(x, mean, variance, weight, bias, training=False, eps=NORM_EPSILON))
 
 
 def same_padded(x: Tensor, size: tuple[int, int, int], stride: tuple[int, int, int]) -> Tensor:
