@@ -55,7 +55,6 @@ from mudg.benchmarks.settings import BenchConfig
 from mudg.benchmarks.shift import standard_error, virtual_fits_of
 from mudg.core.metrics import METRICS
 from mudg.diffusion import model_files as mdm_files
-from mudg.editing.settings import ScoreConfig
 from mudg.gaussians.settings import METHODS
 from mudg.scoring.sets import FEATURES_FOLDER, FEWEST, distances, video_entry
 from mudg.scoring.tables import NO_TRUTH, NOT_COMPUTED, SET_METRICS
@@ -132,7 +131,8 @@ def run(
     rows = paper_rows(config, table, preset)
     logs = logs_of(config, sources, table)
     read = {f"log {log.name}": log.source for log in logs if not isinstance(log, ListedCity)}
-    weights = _weights_of(config.score)
+    files = {name: value for name, value in configuration.to_dict(config.score).items() if isinstance(value, str)}
+    weights = {name: at for name, at in files.items() if at and (name.endswith("weights") or Path(at).exists())}
     refuse_overlap(out, {"model": mdm_files.folder_of(config.model), **read, **weights})
     digests = {name: store.digest(Path(path)) for name, path in weights.items()}  # before any work: one may be missing
     refuse_foreign(out, PAGES, lambda doc: doc["bench"] == "paper" and doc["table"]["name"] == table.name)
@@ -155,12 +155,6 @@ def run(
     values = [{"name": r.name, "title": r.title, "method": r.method, "changes": dict(r.changes)} for r in rows]
     texts = {"bench.md": markdown, "bench.csv": as_csv, "page.html": page}
     return compare(out, jobs, config, lambda logs: document(table, logs, values, settings, pooled(logs, out)), texts)
-
-
-def _weights_of(config: ScoreConfig) -> dict[str, str]:
-    """Files and folders that a score reads: setting -> path."""
-    result = {name: value for name, value in configuration.to_dict(config).items() if isinstance(value, str) and value}
-    return {name: value for name, value in result.items() if name.endswith("weights") or Path(value).exists()}
 
 
 def further_columns(exact: bool) -> tuple[PaperColumn, ...]:

@@ -116,11 +116,15 @@ def run(
         **chain_settings(config, preset),
     }
 
+    changed = lambda row: configuration.result_settings(row.fit) if row.varied else None
+    fit_of = lambda row: "" if row.fit is None else row.method
+    methods = [{"name": r.name, "title": r.title, "fit": fit_of(r), "changes": changed(r)} for r in rows]
+
     def filled(measured: list[dict[str, Any]]) -> dict[str, Any]:
         pairs = list(zip(jobs, measured, strict=True))
         of = lambda name: [result for job, result in pairs if job.out.name == name]
         entries = [_entry(name, scenes[name], of(name)) for name in scenes]
-        return document(entries, list(map(_row_values, rows)), protocols, settings)
+        return document(entries, methods, protocols, settings)
 
     work = {f"{job.out.name} {job.split.name}": job.measure for job in jobs}
     return compare(out, work, config, filled, {"bench.md": markdown, "page.html": lambda doc: page_of(doc, out)})
@@ -227,12 +231,6 @@ class SplitJob:
 
 
 # ---- numbers ----
-
-
-def _row_values(row: Row) -> dict[str, Any]:
-    changes = configuration.result_settings(row.fit) if row.varied else None
-    fit = "" if row.fit is None else row.method
-    return {"name": row.name, "title": row.title, "fit": fit, "changes": changes}
 
 
 def _entry(name: str, scene: Path, splits: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -266,8 +266,10 @@ def check(config: ExportConfig, name: str, out: Path) -> None:
         raise UsageError(f"there is no export format {name!r}", expected=f"one of {known}", remedy="see docs/export.md")
     _refuse_settings(config, name)
     refuse_missing(name)
-    if name not in FOLDERS:
-        _refuse_name(out, name)
+    suffixes = (SUFFIXES[name],) if name in SUFFIXES else FORMATS[name].suffixes if name in FORMATS else ()
+    if name not in FOLDERS and not Path(out).name.lower().endswith(suffixes):
+        expected = f"a name that ends in {' or '.join(suffixes)}"
+        raise UsageError("the name of the file does not fit its format", where="--out", expected=expected, got=str(out))
 
 
 @one_torch_thread()
@@ -305,13 +307,6 @@ def _refuse_settings(config: ExportConfig, name: str) -> None:
         raise UsageError("the format does not have this setting", where=f"--{flag}", got=name, remedy="leave it out")
 
 
-def _refuse_name(out: Path, name: str) -> None:
-    suffixes = (SUFFIXES[name],) if name in SUFFIXES else FORMATS[name].suffixes
-    if not Path(out).name.lower().endswith(suffixes):
-        expected = f"a name that ends in {' or '.join(suffixes)}"
-        raise UsageError("the name of the file does not fit its format", where="--out", expected=expected, got=str(out))
-
-
 # -- Gaussians -------------------------------------------------------------------------------------
 
 
@@ -333,24 +328,15 @@ def requested(config: ExportConfig, name: str, exported: Exported) -> WriteReque
         scene = replace(scene, sky=None)
     facts = {**scene.facts, "generator": f"mudg {version()}"}
     scene = replace(scene, file_from_world=file_from_world(name, config.axes), facts=facts)
-    ground, road = (_ground(exported), _road(exported)) if name == "alpasim" else (None, None)
+    ground = road = None
+    if name == "alpasim":  # whose road and ground come from classes of points, the ground else from the Gaussians
+        cloud = None if exported.parts.fused is None else read_fused(exported.parts.fused)
+        if cloud is not None and cloud.static.semantics is not None:
+            road = cloud.static.xyz[cloud.static.semantics == ID["road"]]
+        ground = ground_of(cloud, exported.model)
+        if ground is None and len(lowest := lowest_points(exported.model)):
+            ground = HeightMap.from_points(np.asarray(lowest))
     return WriteRequest(scene, None if whole else moment, exported.log, ground, road)
-
-
-def _road(exported: Exported) -> NDArray[np.floating] | None:
-    """Fused points of the road f[N, 3]; None where no point has a class."""
-    static = None if exported.parts.fused is None else read_fused(exported.parts.fused).static
-    return None if static is None or static.semantics is None else static.xyz[static.semantics == ID["road"]]
-
-
-def _ground(exported: Exported) -> HeightMap | None:
-    """The height of the ground, by classes of points or Gaussians, else by the lowest Gaussians."""
-    if exported.model is None:
-        return None
-    cloud = None if exported.parts.fused is None else read_fused(exported.parts.fused)
-    found = ground_of(cloud, exported.model)
-    lowest = lowest_points(exported.model) if found is None else ()
-    return HeightMap.from_points(np.asarray(lowest)) if len(lowest) else found
 
 
 def middle_s(model: SceneModel, recorded: Scene | None) -> float:

@@ -45,7 +45,8 @@ class FactMaker:
 
     def of(self, view: View, truth: ViewTruth | None) -> ViewFacts:
         """What is known of a view; ``truth``: its exact or recorded truth, if there is one."""
-        frame = self._frame_at(view)
+        near = (f for f in self.frames_of(view.camera.name) if abs(f.view.time_s - view.time_s) <= SAME_TIME_S)
+        frame = next(near, None)  # what the view's camera recorded at its time
         points = self._points.truth_at(view, frame)
         if truth is not None and truth.instance is not None:
             agents, seen, lanes = visible_agents(view, self._vehicles, truth.instance), truth.seen, None
@@ -60,11 +61,6 @@ class FactMaker:
     def frames_of(self, camera: str) -> tuple[Frame, ...]:
         """The recorded frames of a camera; none if the scene lacks it."""
         return self._scene.frames_of(camera) if camera in self._scene.cameras else ()
-
-    def _frame_at(self, view: View) -> Frame | None:
-        """The image that the view's camera recorded at its time."""
-        near = (f for f in self.frames_of(view.camera.name) if abs(f.view.time_s - view.time_s) <= SAME_TIME_S)
-        return next(near, None)
 
     def _carried_lanes(self, view: View, frame: Frame) -> LaneFacts | None:
         """Markings of a recorded image where the ground shows them in another view. Without LiDAR there is no

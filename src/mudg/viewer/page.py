@@ -226,7 +226,10 @@ class Packed:
             blocks += [(int(one), own[start : start + BLOCK]) for start in range(0, len(own), BLOCK)]
         owners = np.array([(one, len(own)) for one, own in blocks], np.uint32)
         sections = _geometry(columns, rows, [own for _, own in blocks]) | {"block_of": owners}
-        sections["color"] = _colors(columns, rows, facts["color_low"], facts["color_high"])
+        shown = columns["sh_dc"][rows, 0] * SH_C0 + 0.5 - facts["color_low"]
+        red, green, blue = to_u8(shown / (facts["color_high"] - facts["color_low"])).T
+        opacity = to_u8(opacity_of(columns["logits"][rows]))
+        sections["color"] = np.stack([red - green, green, blue - green, opacity])
         sections["class"] = _classes(columns.get("semantics"), rows)
         if self.model.certainty is not None:
             sections["certainty"] = to_u8(self.model.certainty[torch.from_numpy(rows)].float().numpy())
@@ -327,11 +330,6 @@ def _color_range(bands: Any, layout: Layout, degree: int) -> tuple[float, float]
         rgb = bands[layout.chunk(index), 0] * SH_C0 + 0.5
         low, high = min(low, float(rgb.min())), max(high, float(rgb.max()))
     return max(low, COLOR_LIMITS[0]) if degree else 0.0, min(high, COLOR_LIMITS[1])
-
-
-def _colors(columns: Mapping[str, Any], rows: Any, low: float, high: float) -> NDArray[np.uint8]:
-    red, green, blue = to_u8((columns["sh_dc"][rows, 0] * SH_C0 + 0.5 - low) / (high - low)).T
-    return np.stack([red - green, green, blue - green, to_u8(opacity_of(columns["logits"][rows]))])
 
 
 def _classes(logits: Any, rows: Any) -> NDArray[np.uint8]:
