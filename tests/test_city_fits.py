@@ -10,7 +10,6 @@ import torch
 from toy_clips import tiny, with_settings
 
 from mudg import native
-from mudg.base.errors import UsageError
 from mudg.base.types import SweepPoints
 from mudg.core import metrics
 from mudg.diffusion import city_clips, clips, learn, model_files, models
@@ -75,17 +74,6 @@ def test_only_cities_with_renders_add_renders_and_a_finisher(tmp_path):
     assert kept.config == from_cities.config and not fresh
     grown, fresh = models.starting_model(tiny(tmp_path, start=str(tmp_path / "plain")))
     assert grown.config == from_cities.config and fresh == {"finisher"}
-
-
-def test_without_patches_a_finisher_keeps_its_weights(tmp_path):
-    model, fresh = models.starting_model(tiny(tmp_path))
-    models.hold_finisher(model, fresh, patches=True)
-    assert all(p.requires_grad for p in model.finisher.parameters())
-    with pytest.raises(UsageError, match="no patches"):
-        models.hold_finisher(model, fresh, patches=False)
-    models.hold_finisher(model, set(), patches=False)
-    assert not any(p.requires_grad for p in model.finisher.parameters())
-    assert all(p.requires_grad for p in model.net.parameters())
 
 
 def test_steps_of_fits_are_drawn_from_their_range(tmp_path):

@@ -44,25 +44,6 @@ def test_the_published_file_has_these_tensors() -> None:
     assert shapes["Mixed_7c.branch_pool.bn.running_var"] == (192,) and shapes["fc.weight"] == (1008, 2048)
 
 
-SIZES = {
-    "Mixed_5b": (192, 35, 256, 35),
-    "Mixed_5c": (256, 35, 288, 35),
-    "Mixed_5d": (288, 35, 288, 35),
-    "Mixed_6a": (288, 35, 768, 17),
-    "Mixed_6b": (768, 17, 768, 17),
-    "Mixed_6e": (768, 17, 768, 17),
-    "Mixed_7a": (768, 17, 1280, 8),
-    "Mixed_7b": (1280, 8, 2048, 8),
-    "Mixed_7c": (2048, 8, 2048, 8),
-}
-
-
-@pytest.mark.parametrize("name", SIZES)
-def test_sizes_of_blocks(network: inception.InceptionFeatures, name: str) -> None:
-    into, side, out, after = SIZES[name]
-    assert network.block(name, torch.zeros(1, into, side, side)).shape == (1, out, after, after)
-
-
 def test_taps_have_their_widths_and_do_not_depend_on_the_batch(network: inception.InceptionFeatures) -> None:
     images = torch.stack([inception.prepared(picture(seed=n), "tf1") for n in range(2)])
     taps = ("64", "192", "768", "2048", "logits_unbiased")

@@ -17,7 +17,6 @@ from mudg.base.errors import UsageError
 from mudg.base.geometry import invert
 from mudg.base.types import View
 from mudg.formats.importers import kitti_files as kitti_boxes
-from mudg.formats.importers.common import holdout_split, parse_frame_range
 from mudg.formats.importers.kitti_files import read_calibration_day, read_calibration_text, read_timestamps
 from mudg.scene.read import read_image, read_points
 
@@ -202,18 +201,6 @@ def test_track_with_a_gap_is_split_where_it_is_long(tmp_path: Path) -> None:
     short_gap = scene.track("7").pose_at(0.25)
     assert worst(short_gap, invert(made.world_from_velo(0)) @ made.world_from_car(0.25)) < 1e-6
     assert any("0.55 s and were split" in note for note in scene.source.notes)
-
-
-def test_frame_ranges_and_the_holdout_split() -> None:
-    assert parse_frame_range("") is None
-    assert parse_frame_range("10:26") == (10, 26)
-    for wrong in ("5", "7:7", "9:2", "a:b", "-1:4"):
-        refused("frame range", parse_frame_range, wrong, raises=UsageError)
-    moments = [[f"{camera}/{n:06d}" for camera in ("front", "left")] for n in range(10)]
-    split = holdout_split(moments, 4)
-    held_out = {frame_id for frame_id, part in split.items() if part == "test"}
-    assert held_out == {f"{camera}/{n:06d}" for camera in ("front", "left") for n in (4, 8)}
-    assert set(holdout_split(moments, 0).values()) == {"train"}
 
 
 # --- real pieces ----------------------------------------------------------------------------------

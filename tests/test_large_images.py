@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -65,20 +64,6 @@ def test_several_images_are_compared_with_features_of_the_truth_that_are_made_on
     monkeypatch.setattr(CodecFeatures, "forward", lambda self, rgb: made.append(rgb) or forward(self, rgb))
     assert distance.of_all(pairs, 1) == distance.of_all(pairs, 3) == alone
     assert len(made) == 2 * 6 * (len(pairs) + 1)  # six bands
-
-
-def test_bands_need_what_lies_around_them_and_nothing_has_no_distance(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The test above would notice a border that is too thin."""
-    pair, distance = pair_of(136, 40, masked=False), small_distance()
-    whole = distance(pair)
-    monkeypatch.setattr(featnets, "WHOLE_PIXELS", 0)
-    monkeypatch.setattr(featnets, "BAND_PIXELS", 24 * 40)
-    monkeypatch.setattr(CodecFeatures, "reach_rows", 16)
-    assert distance(pair) != pytest.approx(whole, rel=2e-6)
-    monkeypatch.setattr(featnets, "WHOLE_PIXELS", 0)
-    pair = pair_of(40, 24, masked=False)
-    empty = Pair(pair.rgb, None, None, pair.truth_rgb, None, None, None, mask=torch.zeros(1, 40, 24, dtype=torch.bool))
-    assert math.isnan(small_distance()(empty))
 
 
 def test_a_view_that_cannot_fit_is_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

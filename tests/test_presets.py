@@ -30,14 +30,6 @@ def words(*more: str) -> Any:
     return app.parse(["run", "city", "--out", "x", *more])[0].settings
 
 
-def test_presets_are_those_that_are_named() -> None:
-    assert set(PRESETS) == set(NAMES)
-    config = run_preset("paper")
-    plain, guided = pipeline.fits_of(config.fit, config.guided_share)
-    assert plain.iterations == guided.iterations == 30_000
-    assert pipeline.fits_of(config.fit, run_preset().guided_share)[1].iterations == 45_000
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_a_preset_is_its_row_over_the_defaults(name: PresetName) -> None:
     config = run_preset(name)

@@ -15,7 +15,6 @@ from refusals import refused
 from mudg import app
 from mudg.base import config as configuration
 from mudg.base import log, store
-from mudg.base import memory as usage
 from mudg.base.errors import IntegrityError, NumericsError, ResourceError, UsageError
 from mudg.scoring import score
 from mudg.steps import pipeline
@@ -182,19 +181,6 @@ def test_what_stopped_a_run_is_recorded_and_the_repeat_continues(
     assert "Repeat the same command" not in page.read_text()
 
 
-@pytest.mark.parametrize(
-    ("fit_s", "words"), [(None, ""), (78.0, ", about 6.5 min left"), (7800.0, ", about 9.6 h left"), (0.5, "")]
-)
-def test_a_run_says_how_long_the_rest_takes(tmp_path: Path, fit_s: float | None, words: str) -> None:
-    """From the first fit on, by what the steps took here; never of the few seconds of fusing."""
-    spent = {"ingest": 14.0, "fuse": 10.0} | ({} if fit_s is None else {"fit without diffusion": fit_s})
-    before = {"steps": {name: {"state": "complete", "seconds": seconds} for name, seconds in spent.items()}}
-    ledger = pipeline._Ledger(tmp_path, {}, before)
-    ledger.ahead = list(pipeline.DEMO_SECONDS)
-    assert ledger._standing("synthesize") == f"synthesize, step 3 of 9{words}"
-    assert ledger._standing("ingest") == "ingest"
-
-
 def test_the_shares_name_every_step_of_a_run(tmp_path: Path) -> None:
     steps = pipeline.steps_of(RunConfig(), tmp_path / "scene", tmp_path, overwrite=False)
     assert list(pipeline.DEMO_SECONDS) == [*steps, "viewer", "report"]
@@ -215,26 +201,6 @@ def test_the_page_of_a_run_shows_its_steps_while_it_goes_on(tmp_path: Path, verb
     chain(tmp_path)
     assert page.read_text() == report
     assert len(texts) == 1 or texts[1] == report
-
-
-def test_seconds_add_up_over_continuations_and_reuse_adds_none(
-    tmp_path: Path, verbs: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clock = {"now": 0.0}
-    costs = {"ingest": [10.0, 1.0, 1.0], "fuse": [2.0, 0.5], "synthesize": [30.0, 12.0, 0.25]}
-    monkeypatch.setattr(usage.time, "monotonic", lambda: clock["now"])
-    plain = Step.run
-
-    def costing(step: Step) -> Any:
-        clock["now"] += costs[step.verb()].pop(0) if step.verb() in costs else 0.0
-        return plain(step)
-
-    monkeypatch.setattr(Step, "run", costing)
-    verbs["trouble"]["synthesize"] = KeyboardInterrupt()
-    with pytest.raises(KeyboardInterrupt):
-        chain(tmp_path)
-    seconds = chain(tmp_path)["seconds"]
-    assert (seconds["ingest"], seconds["fuse"], seconds["synthesize"]) == (10.0, 2.0, 42.0)
 
 
 def test_other_settings_are_refused_at_once_and_named(tmp_path: Path, verbs: dict[str, Any]) -> None:

@@ -73,13 +73,6 @@ def test_only_held_out_frames_count_on_the_recorded_path(tmp_path: Path, scene: 
     assert value(document, "a", "front_recorded", "psnr") == 100.0  # equal pictures
 
 
-def test_without_held_out_frames_all_count_and_the_rules_say_so(tmp_path: Path) -> None:
-    scene = toy_views.write_scene(tmp_path / "scene", test_every=0)
-    document = of_one(scene, tmp_path)
-    assert document["results"][0]["views"] == 4
-    assert any("No frame was held out" in rule for rule in document["rules"])
-
-
 def test_a_recorded_log_has_no_truth_off_its_path(tmp_path: Path, scene: Path) -> None:
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0, 2.0))
     out = Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run()

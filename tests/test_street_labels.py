@@ -311,23 +311,3 @@ def test_training_that_was_stopped_ends_as_one_that_was_not(tmp_path: Path, monk
         a, b = one.tensors(group), two.tensors(group)
         assert all(torch.equal(a[name], b[name]) for name in a) and set(a) == set(b)
     assert not torch.equal(one.tensors("net")["head.bias"], one.tensors("average")["head.bias"])
-
-
-@pytest.mark.usefixtures("tools")
-def test_variations_are_drawn_anew_and_keep_classes_on_their_pixels() -> None:
-    import segmenter_vary
-    from segmenter_data import Sample
-
-    given, truth = given_at(STREET)
-    sample = Sample(given.rgb, gather(given), truth.astype(np.uint8))
-    rules = segmenter_vary.Rules(no_returns=0.0, no_ground=0.0, no_boxes=0.0)
-    for seed in range(4):
-        rgb, planes, classes = segmenter_vary.varied(sample, np.random.default_rng(seed), rules)
-        assert rgb.shape == (3, *segmenter_vary.CROP) and rgb.dtype == planes.dtype == np.float32
-        assert np.isfinite(rgb).all() and np.isfinite(planes).all()
-        elevation = planes[PLANES.index("elevation")]
-        assert (elevation[classes == ID["sky"]] > 0).all() and (elevation[classes == ID["road"]] < 0).all()
-        again = segmenter_vary.varied(sample, np.random.default_rng(seed), rules)
-        assert all((a == b).all() for a, b in zip((rgb, planes, classes), again, strict=True))
-    bare = segmenter_vary.disturbed(sample.evidence, np.random.default_rng(0), segmenter_vary.Rules(no_returns=1.0))
-    assert np.isnan(bare.depth_m).all() and not encode(bare)[PLANES.index("measured at all")].any()

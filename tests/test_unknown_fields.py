@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import bad_logs
-import kitti_folders
 import numpy as np
 import pytest
 import write_av2
@@ -218,22 +217,6 @@ def test_fields_that_a_custom_log_names_are_known_whatever_they_are_called(
     assert said(capsys) == ["passed over: 'foo' in *.npz, which this program does not know"]
 
 
-def test_tracklets_of_a_raw_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    drive = kitti_folders.write_raw_drive(tmp_path / "2011_09_26")
-    path = drive / "tracklet_labels.xml"
-    fields = (
-        "state occlusion occlusion_kf truncation amt_occlusion amt_occlusion_kf amt_border_l amt_border_r amt_border_kf"
-    )
-    official = path.read_text().replace("</rz>", "</rz>" + "".join(f"<{name}>0</{name}>" for name in fields.split()))
-    official = official.replace("</poses>", "<item_version>2</item_version></poses><finished>1</finished>")
-    path.write_text(official)
-    IMPORTERS["kitti"](drive, tmp_path / "official", ImportOptions())
-    assert said(capsys) == []
-    path.write_text(official.replace("<state>", "<foo>1</foo><state>").replace("<finished>", "<bar>1</bar><finished>"))
-    IMPORTERS["kitti"](drive, tmp_path / "unknown", ImportOptions())
-    assert said(capsys) == ["passed over: 'bar', 'foo' in tracklet_labels.xml, which this program does not know"]
-
-
 REAL = {
     "kitti": ("kitti_2011_09_26", {"frames": (0, 2)}),
     "pandaset": ("pandaset_002", {"frames": (33, 35), "cameras": ("front",)}),
@@ -246,26 +229,4 @@ def test_real_logs_hold_no_unknown_field(
 ) -> None:
     folder, options = REAL[name]
     IMPORTERS[name](shared_data(folder), tmp_path / "out", ImportOptions(resolution=160, **options))
-    assert said(capsys) == []
-
-
-def test_parts_of_real_logs_hold_no_unknown_field(
-    shared_data: Callable[[str], Path], capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Files of logs that lack what a scene needs."""
-    pytest.importorskip("pyarrow")
-    from mudg.formats.importers import argoverse2
-    from mudg.formats.importers.kitti_files import read_calibration_text, read_label_text
-    from mudg.formats.importers.waymo.logs import OFFICIAL, ParquetTable, TfrecordLog
-
-    av2, waymo, tracking = (shared_data(name) for name in ("av2_two_sweeps", "waymo_frame", "kitti_tracking_0001"))
-    with unknown_fields.named_once():
-        for path in sorted((av2 / "7fab2350").rglob("*.feather")):
-            if path.name != "flow_labels.feather":
-                argoverse2.read_feather(path, ())
-        for path in sorted(waymo.glob("*.tfrecord")):
-            TfrecordLog(path)
-        columns = ParquetTable(waymo / "v2_vehicle_pose.parquet").names
-        assert set(columns[2:]) == {f"[{OFFICIAL['vehicle_pose'][0]}].{name}" for name in OFFICIAL["vehicle_pose"][1]}
-        read_label_text(tracking / "label_02.txt", read_calibration_text(tracking / "calib.txt").rect0_from_velo)
     assert said(capsys) == []
