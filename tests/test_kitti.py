@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -241,38 +240,6 @@ def test_real_tracking_boxes_project_to_their_rectangles(shared_data: Callable[[
         differences.append(np.abs(np.r_[uv.min(0), uv.max(0)] - [left, top, right, bottom]).max())
     assert len(differences) >= 10
     assert np.median(differences) < 0.35
-
-
-def test_real_object_frame_points_and_box_counts(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
-    source, folder = shared_data("kitti_object_000008"), tmp_path / "training"
-    record = json.loads((source / "info.json").read_bytes())["data_list"][0]
-    camera, row = record["images"]["CAM2"], lambda values: " ".join(f"{value:.9g}" for value in np.ravel(values))
-    names = ("pedestrian", "cyclist", "car", "van", "truck", "person_sitting", "tram", "misc")
-    boxes = []
-    for item in record["instances"]:
-        if (label := item["bbox_label_3d"]) >= 0:
-            x, y, z, length, h, w, turn = item["bbox_3d"]
-            boxes.append(f"{names[label]} 0 0 0 {row(item['bbox'])} {h} {w} {length} {x} {y} {z} {turn}")
-    calibration = f"P2: {row(camera['cam2img'][:3])}\nR0_rect: {row(np.eye(3))}\n"
-    calibration += f"Tr_velo_to_cam: {row(camera['lidar2cam'][:3])}\n"
-    for name, suffix, content in (
-        ("image_2", "png", (source / "000008.png").read_bytes()),
-        ("velodyne", "bin", (source / "000008.bin").read_bytes()),
-        ("label_2", "txt", "\n".join(boxes).encode()),
-        ("calib", "txt", calibration.encode()),
-    ):
-        (folder / name).mkdir(parents=True)
-        (folder / name / f"000008.{suffix}").write_bytes(content)
-    scene = ingest(folder, tmp_path / "out")
-    points = read_points(scene, scene.sweeps[0]).xyz
-    assert len(points) == 17238
-    uv, z = geometry.project(scene.frames[0].view, points)
-    column, line = (uv - 0.5).T  # KITTI counts from the pixel's centre
-    assert int(((z > 0) & (column >= 0) & (line >= 0) & (column < 1241) & (line < 374)).sum()) == 17186
-    counts = [1325, 1900, 881, 659, 55, 162]
-    for track, expected in zip(scene.tracks, counts, strict=True):
-        local = geometry.transform_points(invert(track.world_from_object[0]), points)
-        assert (np.abs(local) <= track.size_m / 2).all(1).sum() == pytest.approx(expected, rel=0.08)
 
 
 # --- empty lines ----------------------------------------------------------------------------------

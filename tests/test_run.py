@@ -13,8 +13,7 @@ import pytest
 from refusals import refused
 
 from mudg import app
-from mudg.base import config as configuration
-from mudg.base import log, store
+from mudg.base import store
 from mudg.base.errors import IntegrityError, NumericsError, ResourceError, UsageError
 from mudg.scoring import score
 from mudg.steps import pipeline
@@ -101,22 +100,6 @@ def test_the_whole_chain_in_order(tmp_path: Path, verbs: dict[str, Any]) -> None
     sizes = {path: path.stat().st_size for path in (tmp_path / "out").rglob("*") if path.is_file()}
     steps = sum(size for path, size in sizes.items() if path.name not in ("run.json", "run.yaml"))
     assert sum(step["written_bytes"] for step in ledger["steps"].values()) == steps > 0
-
-
-def test_each_step_says_how_many_there_are(
-    tmp_path: Path, verbs: dict[str, Any], capsys: pytest.CaptureFixture[str]
-) -> None:
-    log.set_quiet(False)
-    config = with_seed(run_preset("fast"), 5)
-    chain(tmp_path, config)
-    said = capsys.readouterr().err
-    assert said.index("== ingest") < said.index("== fuse, step 1 of 9\n")
-    assert "== report, step 9 of 9" in said
-    assert verbs["ingest"].settings.resolution == "", "a city has a size of its own"
-    assert configuration.load(RunConfig, None, tmp_path / "out" / "run.yaml") == config  # it repeats the run
-    (tmp_path / "log").mkdir()
-    Run(source=tmp_path / "log", out=tmp_path / "other", settings=run_preset("fast")).run()
-    assert verbs["ingest"].settings.resolution == "480"
 
 
 def test_two_runs_in_one_folder_at_a_time(

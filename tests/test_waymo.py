@@ -28,7 +28,6 @@ from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.geometry import invert, transform_points, yaw_matrix
 from mudg.base.types import Scene, Track
 from mudg.city import sensors as rig
-from mudg.formats.importers import RECOGNISERS
 from mudg.formats.importers.waymo import importer as sensors
 from mudg.formats.importers.waymo import logs as tfrecord
 from mudg.formats.importers.waymo import records
@@ -485,17 +484,6 @@ def test_frames_out_of_order_are_refused_in_one_file_and_sorted_in_tables(bare: 
 
 
 @pytest.mark.parametrize("form", ["v1", "v2"])
-def test_incomplete_frames_are_left_out_when_asked(form: str, bare: made.Log, tmp_path: Path) -> None:
-    lacks_an_image(bare)
-    bare.frames[4]["lasers"] = []
-    scene = ingest(write(bare, form, tmp_path / "log"), tmp_path / "scene", skip_missing=True)
-    assert len(scene.sweeps) == 3
-    assert any("frames 2, 4 lack" in note for note in scene.source.notes)
-    only = ingest(write(bare, form, tmp_path / "log"), tmp_path / "other", cameras=("front",), frames=(0, 4))
-    assert len(only.frames) == 4  # the missing image is of a camera that was not asked for
-
-
-@pytest.mark.parametrize("form", ["v1", "v2"])
 def test_empty_scans_unknown_sensors_and_classes_are_taken_as_they_are(
     form: str, bare: made.Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -590,20 +578,3 @@ def test_tables_that_are_missing_or_damaged(bare: made.Log, tmp_path: Path, monk
     assert refused("empty value", ParquetTable(tmp_path / "holes.parquet").columns, ("a",)).where.endswith("row 1")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     assert "mudg[data]" in refused("pyarrow", ParquetTable, pose, raises=ResourceError).remedy
-
-
-def test_one_log_of_a_folder_is_chosen_by_name(bare: made.Log, tmp_path: Path) -> None:
-    folder = tmp_path / "logs"
-    names = [f"segment-{n}_with_camera_labels" for n in ("111_2", "222_3")]
-    for name in names:
-        made.write_tfrecord(bare, folder / f"{name}.tfrecord")
-    caught = refused("several logs", ingest, folder, tmp_path / "scene", raises=UsageError)
-    assert all(name in caught.expected for name in names)
-    refused("there is no such log", ingest, folder, tmp_path / "scene", sequence="333", raises=UsageError)
-    assert len(ingest(folder, tmp_path / "scene", sequence="222", frames=(0, 1)).frames) == 2
-    assert RECOGNISERS["waymo"](folder)
-    assert RECOGNISERS["waymo"](folder / f"{names[0]}.tfrecord")
-    assert not RECOGNISERS["waymo"](tmp_path)
-    for options in ({"poses": tmp_path}, {"boxes": tmp_path}, {"untwist": "no"}):
-        refused(".", ingest, folder, tmp_path / "other", raises=UsageError, **options)
-    refused("no Waymo log found", ingest, tmp_path / "scene", tmp_path / "other")
