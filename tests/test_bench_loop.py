@@ -111,6 +111,7 @@ def test_a_sweep_is_judged_by_what_the_city_returns_there(course: loop.Course) -
     assert worse["beams_f1"] == pytest.approx(0.8, abs=0.01)
 
 
+@pytest.mark.slow
 def test_the_benchmark_fits_drives_and_is_reused(tmp_path: Path) -> None:
     config = BenchConfig(logs=1, methods=("street_gaussians",), iterations=8, processes=1)
     out = loop.run(config, tmp_path / "loop", rules=RULES)

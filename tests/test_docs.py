@@ -57,8 +57,10 @@ FILE_ENDINGS = tuple(".py .json .jsonl .yaml .csv .txt .md .png .jpg .mp4 .html 
 FOREIGN_NAMES = (
     "PromptDepthAnything DepthLab DynamiCrafter DeepSpeed SegFormer MergedPointCloud RayCluster RayJob"
 ).split()
-SLOW = tuple(f"docs/{page}.md" for page in "bench_shift paper_tables results start/demo training".split())
-"""Pages whose examples take longer: a benchmark, the whole chain. So do those of formats, training and tutorials."""
+SLOW = tuple(
+    f"docs/{page}.md" for page in "bench_shift paper_tables results simulate/closed_loop start/demo training".split()
+)
+"""Pages whose examples take longer: a benchmark, the whole chain, driving. So do those of formats, training and tutorials."""
 
 
 class Block(NamedTuple):
