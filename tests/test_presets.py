@@ -67,15 +67,6 @@ def test_the_run_yaml_of_a_preset_gives_it_back_under_any_preset(name: PresetNam
     assert words("--config", str(file)) == words("--preset", "paper", "--config", str(file)) == before
 
 
-@pytest.mark.parametrize("verb", ["demo", "run"])
-def test_help_and_refusals_name_every_preset(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert app.main([verb, "--help"]) == 0
-    shown = capsys.readouterr().out
-    assert "--preset" in shown and all(name in shown for name in NAMES)
-    assert app.main(["demo", "--preset", "best"]) == 2
-    assert all(name in capsys.readouterr().err for name in ("quality",))
-
-
 def test_paper_needs_a_published_model_and_lpips_before_anything_is_written(tmp_path: Path) -> None:
     out, paper = tmp_path / "out", run_preset("paper")
     refused("published-type diffusion model", Run(source="city", out=out, settings=paper).run, raises=UsageError)
