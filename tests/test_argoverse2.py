@@ -222,38 +222,3 @@ def test_real_flow_follows_from_poses_and_boxes(shared_data: Callable[[str], Pat
     with_boxes = np.linalg.norm(moved - flow, axis=1)[dynamic]
     assert np.isfinite(with_boxes).all()  # every dynamic point lies in a box
     assert with_boxes.max() < 1e-4  # the flow labels were made of these boxes (and rounded to float32)
-
-
-def points_in_moving_boxes(scene: Scene) -> tuple[int, int]:
-    """Points that their own time brings into the boxes of fast objects, of those near them."""
-    inside = near = 0
-    for sweep in scene.sweeps:
-        points = read_points(scene, sweep)
-        world = transform_points(sweep.world_from_lidar, points.xyz.astype(np.float64))
-        for track in scene.tracks:
-            pose = track.pose_at(sweep.time_s)
-            span = track.times_s[-1] - track.times_s[0]
-            if pose is None or span == 0:
-                continue
-            velocity = (track.world_from_object[-1, :3, 3] - track.world_from_object[0, :3, 3]) / span
-            if np.linalg.norm(velocity) < 2:
-                continue
-            local = transform_points(invert(pose), world)
-            close = (np.abs(local) <= track.size_m / 2 + 1.5).all(1) & (local[:, 2] > 0.2 - track.size_m[2] / 2)
-            if close.sum() < 40:
-                continue
-            timed = world[close] - points.dt_s[close, None].astype(np.float64) * velocity
-            local = transform_points(invert(pose), timed)
-            inside += int((np.abs(local) <= track.size_m / 2 + 0.05).all(1).sum())
-            near += int(close.sum())
-    return inside, near
-
-
-def test_real_boxes_fit_their_points_at_the_sweeps_time(real: Path, tmp_path: Path) -> None:
-    """With each point brought to the stamp by its own time, boxes as drawn lose points, boxes brought there do not."""
-    scene = ingest(real, tmp_path / "out", cameras=("front",))
-    drawn = ingest(real, tmp_path / "drawn", cameras=("front",), untwist="no")
-    inside, near = points_in_moving_boxes(scene)
-    lost, _ = points_in_moving_boxes(replace(scene, tracks=drawn.tracks))
-    assert inside / near > 0.98
-    assert lost / near < 0.92

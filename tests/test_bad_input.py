@@ -19,7 +19,7 @@ from PIL import Image
 from toy_scene import ToyStreet
 
 from mudg.base import store
-from mudg.base.errors import InputError, MudgError, ResourceError, UsageError
+from mudg.base.errors import InputError, MudgError, UsageError
 from mudg.formats.settings import IngestConfig
 from mudg.labels.settings import AnnotateConfig
 from mudg.scene.check import check_scene
@@ -299,20 +299,6 @@ def test_broken_scene(case: str, verb: str, good_scene: Path, tmp_path: Path) ->
     for finished in ("fuse.json", "scene.json", "manifest.json"):
         assert not (tmp_path / "out" / finished).exists()
     assert [f for f in check_scene(root) if f.level == "error"]
-
-
-def test_output_that_cannot_be_written(tmp_path: Path) -> None:
-    ToyStreet(times=(0.0,)).write(tmp_path / "scene")
-    (tmp_path / "file").write_text("in the way")
-    source, out = tmp_path / "scene", tmp_path / "file" / "out"
-    for step in (
-        Fuse(scene=source, out=out, settings=FuseConfig()),
-        Ingest(log=source, out=out, settings=IngestConfig()),
-        Annotate(scene=source, out=out, settings=AnnotateConfig()),
-    ):
-        with pytest.raises((ResourceError, UsageError)):
-            step.run()
-    assert (tmp_path / "file").read_text() == "in the way"
 
 
 def test_images_with_colour_maps_and_grey_are_read_as_rgb(tmp_path: Path) -> None:

@@ -12,12 +12,11 @@ import pytest
 import torch
 from tiny_networks import small_mdm
 
-from mudg.base.errors import MudgError, UsageError
 from mudg.benchmarks import cities
 from mudg.benchmarks import run as bench
 from mudg.benchmarks.settings import BenchConfig
 from mudg.core import metrics
-from mudg.diffusion import city_clips, model_files
+from mudg.diffusion import model_files
 from mudg.diffusion.model import MDM
 from mudg.editing.model import display_of
 
@@ -47,29 +46,6 @@ def test_flicker_is_change_relative_to_the_truth_and_leaves_movers_and_the_camer
     cars = [replace(frame, ids=torch.full_like(frame.ids, 13)) for frame in frames]
     assert math.isnan(metrics.flicker(made, truth, cars))
     assert math.isnan(metrics.flicker(made[:1], truth[:1], frames[:1]))
-
-
-def test_reported_cities_are_neither_those_of_development_nor_of_training() -> None:
-    assert not set(city_clips.REPORTED) & set(city_clips.DEVELOPMENT)
-    assert min(city_clips.REPORTED + city_clips.DEVELOPMENT) >= city_clips.HELD_OUT
-    rules = city_clips.CityClipRules()
-    for number in (city_clips.REPORTED[0], city_clips.DEVELOPMENT[0]):
-        assert city_clips.city_config(rules, number) == city_clips.city_config(replace(rules, seed=7), number)
-    assert not set(cities.LISTS["development"]) & set(cities.LISTS["reported"])
-
-
-def test_what_reads_no_model_takes_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(bench.BENCHES, "edit", lambda config, out: ({"cities": []}, "nothing"))
-    out = bench.run("edit", BenchConfig(), tmp_path / "out")
-    assert json.loads((out / "run.json").read_text())["inputs"] == {}
-    absent = BenchConfig(model=str(tmp_path / "no model here"))
-    for name, error, said in (
-        ("edit", UsageError, "does not use this setting"),
-        ("mdm", MudgError, "no such file or folder"),
-        ("nothing", UsageError, "no such benchmark"),
-    ):
-        with pytest.raises(error, match=said):
-            bench.run(name, absent, tmp_path / "other")
 
 
 @pytest.mark.slow

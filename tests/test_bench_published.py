@@ -208,6 +208,7 @@ def test_table_3_runs_with_a_published_type_model_as_recorded(weights, tmp_path,
     assert (fused.box_growth_m, fused.occlusion_test) == (0.0, False)
 
 
+@pytest.mark.slow
 def test_real_runs_with_a_published_type_model_as_recorded(weights, scene, tmp_path, passes):
     flags = "--synthesize.shifts-m 2 --synthesize.guidance 1 --fit.virtual.perception filters"
     config = published_set_up(weights, flags)

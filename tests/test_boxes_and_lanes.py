@@ -183,13 +183,6 @@ def test_lines_beside_behind_and_far_away_are_left_out() -> None:
     assert not street_scores.lane_truth(ROAD_VIEW, [through])[:175].any()
 
 
-def test_masks_of_detectors_take_the_nearest_pixel() -> None:
-    small = np.zeros((2, 4), np.uint8)
-    small[1, 3] = 200
-    large = street_scores.at_lane_size(small)
-    assert large[180:, 480:].all() and large.sum() == 180 * 160
-
-
 def road_with_line(contrast: float = 0.3, column: int = 100, width: int = 4) -> tuple[np.ndarray, np.ndarray]:
     rgb = np.full((3, 60, 240), 0.3)
     rgb[:, :, column : column + width] += contrast

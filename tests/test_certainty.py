@@ -12,7 +12,6 @@ import torch
 from fit_settings import fit_config
 from toy_world import camera, fused_cloud, truth, view_at, write_scene
 
-from mudg.base import store
 from mudg.base.types import Gaussians, Track
 from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.core.table import Table
@@ -166,19 +165,3 @@ def test_a_fit_stores_it_and_a_render_shows_it(fitted):
     bare = render_condition(replace(model, classes=()), view, RASTER)
     torch.testing.assert_close(bare.certainty, seen.certainty)
     assert (bare.semantics == 255).all()
-
-
-def test_older_fits_have_none_and_removing_an_object_keeps_that_of_the_rest(fitted, tmp_path):
-    for name in ("model.json", "nodes.safetensors"):
-        (tmp_path / name).write_bytes((fitted / name).read_bytes())
-    tensors = store.read_tensors(fitted / "gaussians.safetensors")
-    assert tensors.pop("label.certainty") is not None
-    store.write_safetensors(tmp_path / "gaussians.safetensors", tensors)
-    model = fit.load_model(tmp_path)
-    assert model.certainty is None
-    assert render_condition(model, view_at(0.3, camera(width=60, height=40)), RASTER).certainty is None
-    model = fit.load_model(fitted)
-    model.table.labels["certainty"] = torch.arange(len(model.table)).half()
-    kept = model.without_nodes(model.node_names()[:1]) if model.node_names() else model
-    rows = (model.table.labels["node"] == 0).nonzero()[:, 0]
-    assert torch.equal(kept.certainty[: len(rows)], model.certainty[rows])

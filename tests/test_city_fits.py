@@ -10,7 +10,6 @@ import torch
 from toy_clips import tiny, with_settings
 
 from mudg import native
-from mudg.base.errors import UsageError
 from mudg.base.types import SweepPoints
 from mudg.core import metrics
 from mudg.diffusion import city_clips, clips, learn, model_files, models
@@ -73,17 +72,6 @@ def test_only_cities_with_renders_give_renders_and_a_finisher(tmp_path):
         for settings in (tiny(tmp_path), on_a_log):
             kept = models.starting_model(with_settings(settings, start=str(tmp_path / "start")))
             assert kept.config == made.config
-
-
-def test_without_patches_a_finisher_keeps_its_weights(tmp_path):
-    model = models.starting_model(tiny(tmp_path))
-    models.hold_finisher(model, True, patches=True)
-    assert all(p.requires_grad for p in model.finisher.parameters())
-    with pytest.raises(UsageError, match="no patches"):
-        models.hold_finisher(model, True, patches=False)
-    models.hold_finisher(model, False, patches=False)
-    assert not any(p.requires_grad for p in model.finisher.parameters())
-    assert all(p.requires_grad for p in model.net.parameters())
 
 
 def test_steps_of_fits_are_drawn_from_their_range(tmp_path):

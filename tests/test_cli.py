@@ -37,18 +37,6 @@ def call(monkeypatch: pytest.MonkeyPatch, outcome: object, *words: str) -> int:
 # ---- settings ----
 
 
-def test_flags_beat_the_file_and_the_file_beats_the_preset(tmp_path: Path) -> None:
-    file = tmp_path / "settings.yaml"
-    file.write_text("fit:\n  iterations: 77\n  start: {voxel_m: 0.3, gaussians: 90}\n")
-    args = parse("demo", "--fast", "--config", str(file), "--fit.start.voxel-m", "0.25")
-    assert args.settings.fit.iterations == 77
-    assert args.settings.fit.start.voxel_m == 0.25
-    assert args.settings.fit.start.gaussians == 90
-    fast, full = run_preset("fast"), run_preset()
-    assert args.settings.synthesize == fast.synthesize != full.synthesize
-    assert args.settings.ingest == fast.ingest
-
-
 def test_the_seed_goes_to_every_verb_that_draws_and_beats_the_file(tmp_path: Path) -> None:
     args = parse("demo", "--seed", "7")
     parts = [part for part in configuration.to_dict(args.settings).values() if isinstance(part, dict)]
@@ -72,13 +60,6 @@ def test_shifts_go_to_synthesize_and_render_together() -> None:
     assert set(default.render.shifts_m) == {0.0, *default.synthesize.shifts_m}
     side = parse("run", "log", "--out", "o", "--cameras", "front_left").settings
     assert side.synthesize.cameras == side.render.cameras == ("front_left",)
-
-
-def test_what_run_yaml_says_can_be_given_back(tmp_path: Path) -> None:
-    before = parse("run", "city", "--out", "x", "--fast", "--fit.iterations", "5").settings
-    file = tmp_path / "run.yaml"
-    file.write_text("verb: run\n" + configuration.dump_yaml(before))
-    assert parse("run", "city", "--out", "x", "--config", str(file)).settings == before
 
 
 @pytest.mark.parametrize(

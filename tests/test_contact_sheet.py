@@ -76,15 +76,3 @@ def test_scenes_that_lack_things_get_a_sheet_too(tmp_path: Path, lacking: str) -
     frames = tuple(replace(scene.frames[0], view=View(camera, pose, 0.0)) for camera in cameras.values())
     many = replace(scene, cameras=cameras, frames=frames, split={})
     assert sheets.contact_sheet(many).size == (sheets.WIDTH_PX, 2 * sheets.TILE_WIDTH_PX // 2 + sheets.TOP_HEIGHT_PX)
-
-
-def test_boxes_have_the_colour_of_their_class_also_where_there_are_no_points(tmp_path: Path) -> None:
-    scene = ToyStreet(car_start=(40, 0)).write(tmp_path / "scene", labels=False, width=60, height=30)
-    for label, color in (
-        ("bus", sheets.VEHICLE_COLOR),
-        ("cyclist", sheets.PEOPLE_COLOR),
-        ("barrier", sheets.OTHER_COLOR),
-    ):
-        tracks = tuple(replace(track, label=label) for track in scene.tracks)
-        top = np.array(sheets.top_view(replace(scene, tracks=tracks, sweeps=()), 400, 300))[20:250]
-        assert (top == color).all(2).sum() > 20, label

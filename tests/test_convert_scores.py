@@ -96,6 +96,7 @@ def test_other_networks_are_refused_and_nothing_is_written(tmp_path: Path) -> No
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_the_verb_converts_replaces_and_refuses_foreign_settings(tmp_path: Path) -> None:
     checkpoint = saved(tmp_path, "dinov2")
     to = tmp_path / "weights" / "dino"

@@ -12,15 +12,7 @@ from mudg.base import geometry
 from mudg.base.errors import UsageError
 from mudg.base.types import RasterTrace
 from mudg.core.table import Table
-from mudg.gaussians.densify import (
-    SPLIT_SHRINK,
-    DensifySettings,
-    DensifyStats,
-    densify,
-    reset_opacity,
-    rotate,
-    shorten_needles,
-)
+from mudg.gaussians.densify import SPLIT_SHRINK, DensifySettings, DensifyStats, densify, reset_opacity, shorten_needles
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import RigidNode, StaticNode
 from mudg.gaussians.settings import FitConfig
@@ -180,10 +172,3 @@ def test_when_it_is_due_and_a_wrong_kind_is_refused(tmp_path):
     (tmp_path / "fit.yaml").write_text("densify: {kind: mcm}\n")
     with pytest.raises(UsageError, match="'gradient' or 'none'"):
         configuration.load(FitConfig, None, tmp_path / "fit.yaml")
-
-
-def test_rotate_agrees_with_the_matrix():
-    quats = torch.tensor([[0.3, -0.5, 0.2, 0.9]])
-    vector = torch.tensor([[1.0, 2.0, -0.7]])
-    expected = geometry.matrix_from_quaternion(quats[0].numpy()) @ vector[0].numpy()
-    assert rotate(quats, vector)[0].tolist() == pytest.approx(expected.tolist(), abs=1e-6)

@@ -8,12 +8,12 @@ import math
 import numpy as np
 import pytest
 import torch
-from scipy import ndimage, sparse
+from scipy import ndimage
 
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, View
 from mudg.core import depth as depth_module
-from mudg.core.depth import align_depth, beyond_reach, complete_depth, conjugate_gradients, fit_depth, ray_elevation
+from mudg.core.depth import align_depth, beyond_reach, complete_depth, fit_depth, ray_elevation
 
 HEIGHT, WIDTH, FOCAL = 60, 90, 80.0
 CAMERA = Camera("c", WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
@@ -142,15 +142,6 @@ def test_what_does_not_answer_is_far() -> None:
     elevation = ray_elevation(View(CAMERA, LEVEL, 0.0))
     assert elevation[HEIGHT // 2 - 1, WIDTH // 2] == pytest.approx(0.5 / FOCAL, rel=1e-3)
     assert (np.diff(elevation, axis=0) < 0).all()
-
-
-def test_conjugate_gradients_solve_what_a_direct_solver_solves() -> None:
-    rng = np.random.default_rng(0)
-    factor = sparse.random(80, 80, 0.1, random_state=1, dtype=np.float32)
-    matrix = (factor @ factor.T + sparse.identity(80, dtype=np.float32)).tocsr()
-    goal = rng.normal(size=80).astype(np.float32)
-    found = conjugate_gradients(matrix, goal, np.zeros(80, np.float32), 1 / matrix.diagonal(), 400, 1e-7)
-    assert np.abs(found - np.linalg.solve(matrix.toarray().astype(np.float64), goal)).max() < 1e-4
 
 
 # -- alignment --------------------------------------------------------------------------------------

@@ -9,31 +9,28 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import tiny_networks
 import torch
 from pretend_device import copies, pretend_device
 from test_published import some_condition
 from toy_clips import HEIGHT, WIDTH, interrupted_at, losses_of, made_up_clip, tiny, with_settings, write_clips
-from toy_published import TINY, published_settings, tiny_checkpoint, tiny_model, write_tiny
+from toy_published import tiny_model, write_tiny
 from toy_scene import ToyStreet
 
 from mudg.base import log, store
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.types import Condition
 from mudg.core.depth import fit_depth
-from mudg.diffusion import convert, memory_plan, model_files, parallel, published
+from mudg.diffusion import memory_plan, model_files, parallel
 from mudg.diffusion.model import MDM
 from mudg.diffusion.models import model_config
 from mudg.diffusion.published import WorkSplit
 from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated
-from mudg.diffusion.settings import ConvertConfig, SynthesizeConfig
+from mudg.diffusion.settings import SynthesizeConfig
 from mudg.diffusion.views import check_config, load_any
-from mudg.labels import street_net
 from mudg.labels.depth_networks import Preparation, TransformersDepth
 from mudg.labels.inputs import DepthInput
 from mudg.labels.segmenters import Segmenter
 from mudg.labels.settings import AnnotateConfig
-from mudg.scene.labels import read_label
 from mudg.scene.observations import read_observations
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
@@ -110,18 +107,6 @@ def test_a_clip_of_the_small_model_is_the_same_on_a_device_and_crosses_once(smal
     assert sorted(crossed.to_host) == sorted(back + latents + fits)
 
 
-@pytest.mark.parametrize("changes", [{"steps": 4}, pytest.param({"align": False}, marks=pytest.mark.slow)])
-def test_other_requests_and_a_second_window_too(small, changes):
-    condition = made_up_clip(2).condition
-    first = generated(small, condition, SampleRequest(1, 5))
-    known = {m: z[-2:] for m, z in first.latents.items()}
-    request = replace(SampleRequest(2, 5, 1, known=known), **changes)
-    here = generated(small, condition, request)
-    with pretend_device() as there:
-        check_same_clip(here, generated(small.to(there), condition, request))
-    assert far_apart(known["rgb"], here.latents["rgb"][:2]) < NEAR
-
-
 @pytest.mark.parametrize("guidance", [pytest.param(1.0, marks=pytest.mark.slow), 7.5])
 def test_a_clip_of_the_published_kind_is_the_same_on_a_device_and_crosses_once(guidance):
     model, condition, request = tiny_model(), some_condition(), SampleRequest(3, 5, guidance=guidance)
@@ -181,21 +166,6 @@ def test_learn_on_a_device_is_learn_and_resumes(clips, tmp_path):
     assert max(far_apart(a[name], b[name]) for name in a if a[name].any()) < 2e-3  # kept in 16 bits
     psnr = [store.read_json(tmp_path / name / "metrics.json")["average"]["psnr"] for name in ("there", "here")]
     assert psnr[0] == pytest.approx(psnr[1], abs=0.02)
-
-
-@pytest.mark.slow
-def test_a_published_type_model_learns_on_a_device(tmp_path):
-    points = write_clips(tmp_path / "clips", 32, 32, points=True)
-    torch.save({"state_dict": tiny_checkpoint()}, tmp_path / "512.ckpt")
-    steady = replace(TINY, net=replace(TINY.net, dropout=0.0))  # dropout draws where it computes
-    convert.convert_file(ConvertConfig(), tmp_path / "512.ckpt", tmp_path / "model", steady)
-    config = published_settings(tmp_path / "model", points, steps=1, batch_frames=4, device="cpu", score_steps=1)
-    here = Learn(out=tmp_path / "here", settings=config).run()
-    with pretend_device():
-        there = Learn(out=tmp_path / "there", settings=with_settings(config, device="pretend")).run()
-    assert losses_of(tmp_path / "there") == pytest.approx(losses_of(tmp_path / "here"), rel=1e-5)
-    a, b = (published.load(folder).state_dict() for folder in (here, there))
-    assert max(far_apart(a[name], b[name]) for name in a if a[name].any()) < 1e-3
 
 
 # verbs --------------------------------------------------------------------------------------------
@@ -265,21 +235,6 @@ def test_weights_and_views_of_published_type_models_are_in_float16_on_cards(stre
     assert 0 < max(apart) < 0.02  # measured: see the message of a failure
 
 
-@pytest.mark.slow
-def test_the_shipped_labeller_on_a_device_writes_the_same_labels(street, tmp_path):
-    config = AnnotateConfig(device="cpu", processes=1, depth=False)
-    scenes = [labelled(street, tmp_path / "here", config)]
-    with pretend_device(), copies() as crossed:
-        scenes.append(labelled(street, tmp_path / "there", replace(config, device="pretend")))
-    for one, other in zip(*(scene.frames for scene in scenes), strict=True):
-        here, there = (read_label(scene, f, "semantics") for scene, f in zip(scenes, (one, other)))
-        assert np.mean(here != there) < 1e-2
-    frames = len(scenes[0].frames)
-    assert len(crossed.to_host) == frames  # probabilities alone
-    weights = sum(1 for _ in street_net.load(street_net.EMBEDDED).state_dict())
-    assert len(crossed.to_device) == weights + 2 * frames  # image and evidence
-
-
 class Plain(torch.nn.Module):
     """Answers as networks of transformers do, without the package."""
 
@@ -313,24 +268,6 @@ def test_pretrained_networks_compute_on_the_device_and_answer_on_the_cpu():
         assert isinstance(b, np.ndarray) and np.allclose(a, b, atol=1e-5)
     assert crossed.to_host == [3 * 600, 600]  # probabilities, depth
     assert sorted(crossed.to_device)[-2:] == [3 * 600, 3 * 600]  # two images
-
-
-@pytest.mark.slow
-def test_annotate_on_a_device_writes_the_same_labels(street, tmp_path):
-    tiny_networks.segformer(tmp_path / "net")
-    tiny_networks.depth_anything(tmp_path / "depth")
-    networks = {"weights": str(tmp_path / "net"), "depth_network": str(tmp_path / "depth")}
-    config = AnnotateConfig(labeller="network", **networks, device="cpu", processes=1)
-    scenes = [labelled(street, tmp_path / "here", config)]
-    with pretend_device():
-        scenes.append(labelled(street, tmp_path / "there", replace(config, device="pretend")))
-    for one, other in zip(*(scene.frames for scene in scenes), strict=True):
-        assert set(one.labels) == set(other.labels)
-        classes, depth = (
-            [read_label(scene, f, name) for scene, f in zip(scenes, (one, other))] for name in ("semantics", "depth")
-        )
-        assert np.mean(classes[0] != classes[1]) < 1e-2
-        assert np.allclose(*depth, rtol=1e-2, equal_nan=True)
 
 
 def test_what_a_device_does_not_do_is_said(street, small, tmp_path, monkeypatch):

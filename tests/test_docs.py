@@ -57,8 +57,9 @@ FILE_ENDINGS = tuple(".py .json .jsonl .yaml .csv .txt .md .png .jpg .mp4 .html 
 FOREIGN_NAMES = (
     "PromptDepthAnything DepthLab DynamiCrafter DeepSpeed SegFormer MergedPointCloud RayCluster RayJob"
 ).split()
-SLOW = tuple(f"docs/{page}.md" for page in "bench_shift paper_tables results start/demo training".split())
-"""Pages whose examples take longer: a benchmark, the whole chain. So do those of formats, training and tutorials."""
+LONG = "bench_shift paper_tables results simulate/closed_loop start/demo training"
+SLOW = tuple(f"docs/{page}.md" for page in LONG.split())
+"""Pages whose examples take longer: benchmarks, the whole chain, drives. So do formats, training and tutorials."""
 
 
 class Block(NamedTuple):

@@ -76,13 +76,6 @@ def test_brakes_stop_where_energy_says_and_never_reverse() -> None:
     assert motion.x_m == pytest.approx(way, abs=1e-9)
 
 
-def test_steering_stays_within_its_limit() -> None:
-    motion = BicycleState(0.0, 0.0, 0.0, 1.0)
-    for _ in range(100):
-        motion = motion.after(Controls(0.0, 0.8), 0.1, CAR)
-    assert motion.steer_rad == CAR.largest_steer_rad
-
-
 # -- roads -----------------------------------------------------------------------------------------
 
 
@@ -156,14 +149,6 @@ def test_solid_gaussians_stop_a_vehicle_and_those_of_the_road_do_not() -> None:
 # -- road users ------------------------------------------------------------------------------------
 
 
-def test_the_driver_model_rests_where_its_paper_says() -> None:
-    rule, speed = Following(15.0), 10.0
-    rest = (rule.gap_m + speed * rule.headway_s) / math.sqrt(1 - (speed / 15.0) ** 4)
-    assert rule.acceleration(speed, rest, 0.0) == pytest.approx(0.0, abs=1e-9)
-    assert rule.acceleration(15.0) == pytest.approx(0.0)
-    assert rule.acceleration(speed, rest / 2, 0.0) < 0 < rule.acceleration(speed, rest * 2, 0.0)
-
-
 def test_a_follower_stops_behind_a_vehicle_that_stops_where_a_recorded_one_drives_through_it() -> None:
     met = {}
     for traffic in ("log", "idm"):
@@ -174,13 +159,6 @@ def test_a_follower_stops_behind_a_vehicle_that_stops_where_a_recorded_one_drive
         rest = drive.boxes()["behind"].world_from_box[0, 3]
     assert met == {"log": "behind", "idm": ""}
     assert -8.0 < rest + 2.0 - (0.0 - CAR.overhang_m) < 0.0
-
-
-def test_an_even_follower_goes_where_it_went() -> None:
-    drive = Drive(straight(), {"ahead": driving(12.0, 6.0)}, BicycleState(0.0, 40.0, 0.0, 0.0), 0.0, "idm")
-    for _ in range(40):
-        drive.step(Controls(), 0.1)
-    assert drive.boxes()["ahead"].world_from_box[0, 3] == pytest.approx(12 + 6 * 4.0, abs=1.0)
 
 
 def test_controls_that_are_no_numbers_are_refused() -> None:

@@ -35,7 +35,6 @@ from mudg.steps.ingest import Fuse
 from mudg.steps.render import RenderViews
 
 FRAMES = 4
-LAST_S = 0.3 * (FRAMES - 1)
 
 
 @pytest.fixture
@@ -158,16 +157,6 @@ def test_sweeps_of_an_edited_run_are_in_fog_and_its_images_as_recorded(run: Path
         droplets += int((ranges[1] < ranges[0][beam] - 1e-3).sum())
         assert np.abs(kept - recorded[beam]).max() < 1e-4 and (ranges[1] < ranges[0][beam] + 1e-3).all()
     assert 0 < became["droplets"] == pytest.approx(droplets, abs=2)
-
-
-def test_the_vehicle_of_a_run_changes_lanes(run: Path, tmp_path: Path) -> None:
-    edits = script(tmp_path, "- lane_change: {id: ego, left_m: 0.5, start_s: 0, duration_s: 0.9}")
-    out = edited(run, edits, tmp_path / "edited")
-    new = read_scene(out / "scene")
-    assert (geometry.invert(ego_pose(LAST_S)) @ new.ego.pose_at(LAST_S))[1, 3] == pytest.approx(0.5, abs=0.02)
-    again = rendered(out / "scene", out / "fit" / "street_gaussians", tmp_path / "render")
-    for frame, image in zip(new.frames, again, strict=True):  # its images are the renders there
-        assert np.abs(read_image(new, frame) / 255 - image.permute(1, 2, 0).numpy()).max() <= 1 / 255
 
 
 def test_bad_scripts_leave_nothing(run: Path, tmp_path: Path) -> None:

@@ -17,16 +17,7 @@ from mudg.core.edit import Motion
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
 from mudg.editing.apply import complete_asset, hidden_by
-from mudg.editing.model import (
-    SHOWN,
-    Hidden,
-    continued,
-    noted,
-    shaded_cells,
-    shown_by,
-    with_closed_sides,
-    without_traces,
-)
+from mudg.editing.model import SHOWN, Hidden, continued, noted, shaded_cells, with_closed_sides, without_traces
 from mudg.editing.plan import Actor, EditSources, EditWorld, plan_edits, shown_anew
 from mudg.editing.script import parse_edits
 from mudg.gaussians.model import CERTAINTY, SceneModel
@@ -119,20 +110,6 @@ def same_places(found: np.ndarray, expected: np.ndarray) -> bool:
     return {tuple(np.round(m, 3)) for m in found} == {tuple(np.round(m, 3)) for m in expected.astype(np.float32)}
 
 
-def test_what_views_show_of_a_gaussian() -> None:
-    actor, views = lead()
-    model = street(actor, ROAD, np.full(len(ROAD), LIT), np.array([[14.0, 0, 0.7]]))
-    wall = len(ROAD)
-    with_car, without = (shown_by(model, views[0], RASTER, absent)[0] for absent in ((), ("car",)))
-    assert with_car[wall] < 0.01 < 1 < without[wall]
-    assert torch.equal(without[wall + 1 :], torch.zeros(len(model.table) - wall - 1))
-    first, last, both = (
-        noted(model, seen, RASTER).table.labels[SHOWN] for seen in (views[:1], views[-1:], [views[0], views[-1]])
-    )
-    assert torch.equal(first, with_car) and not torch.equal(first, last)
-    assert torch.equal(both, torch.maximum(first, last))
-
-
 def test_what_no_view_saw_goes_and_hidden_ground_is_closed() -> None:
     actor, views = lead()
     unseen = np.abs(ROAD[:, 1]) < 0.12 * ROAD[:, 0] - 0.3
@@ -175,13 +152,6 @@ def test_the_shadow_of_what_hardly_moves_becomes_as_bright_as_what_lies_around(s
     assert np.median(grey_of(made)[near]) == pytest.approx(LIT if gone else SHADED, abs=0.02)
     far = kept & (means[:, 1] > 4.3) & (means[:, 0] < 11)
     assert far.sum() > 10 and np.allclose(grey_of(made)[far], SHADED, atol=1e-5)
-
-
-def test_bright_ground_is_never_darkened() -> None:
-    actor, views = lead()
-    bright = np.where(np.abs(ROAD[:, 1]) < 1.5, 0.9, LIT)
-    made = cleared(street(actor, ROAD, bright, np.zeros((0, 3))), actor, views)
-    assert np.all(grey_of(made)[~made_up(made)] >= LIT - 1e-6)
 
 
 def test_a_shadow_may_reach_ground_that_no_view_shows() -> None:

@@ -89,17 +89,6 @@ def test_what_comes_back_renders_as_the_fit_does(name: str) -> None:
     assert db(turning(), baked(turning(), name)) >= LEAST_DB[name]
 
 
-@pytest.mark.parametrize("name", ["ply", "glb", "usda", "spz"])
-def test_harmonics_of_what_stands_come_back(name: str) -> None:
-    """Axes are turned there and back, harmonics with them."""
-    model = toy()
-    g, rows = torch.Generator().manual_seed(3), model.table.labels["node"] == 0
-    harmonics = torch.randn(len(model.table), 15, 3, generator=g) * 0.1 * rows[:, None, None]
-    bent = with_columns(model, 3, sh_rest=harmonics)
-    assert float(psnr(picture(bent), picture(model))) < 35  # they show
-    assert db(bent, baked(bent, name)) >= LEAST_DB[name]
-
-
 @pytest.mark.parametrize("kind", [RigidNode, DeformableNode, BezierNode])
 def test_nodes_of_every_kind_stand_where_the_model_puts_them(kind: type[RigidNode]) -> None:
     model = turning(kind)

@@ -141,18 +141,6 @@ def test_transforms_come_first_and_sensors_that_move_hang_on_the_map(tmp_path: P
     assert points.value().data.view("<u4")[3] == 0x010203
 
 
-def test_golden_bytes_of_a_transform(exported: tuple[Scene, Path]) -> None:
-    """Written by hand from OMG's rules."""
-    messages = ros2.Ros2Messages(log_of(exported[0]))
-    pose = geometry.from_rotation_translation(np.eye(3), [1.5, 0, 0])
-    golden = (
-        "00010000 01000000 01000000 00000000 04000000 6d617000 02000000 61000000 00000000"
-        "000000000000f83f 0000000000000000 0000000000000000"
-        "0000000000000000 0000000000000000 0000000000000000 000000000000f03f"
-    )
-    assert messages.content(messages._tf("/tf", 0.5, "map", {"a": pose})) == bytes.fromhex(golden)
-
-
 def test_names_are_those_that_ros_accepts(exported: tuple[Scene, Path]) -> None:
     names = ros2.ros_names(["front", "CAM__front-left", "cam front left", "02", "", "ä"])
     assert list(names.values()) == ["front", "CAM_front_left", "cam_front_left", "n02", "sensor", "sensor_2"]

@@ -3,7 +3,6 @@ for ever."""
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import os
 import signal
@@ -19,7 +18,7 @@ import torch
 from test_hostile_files import ends_within
 
 from mudg import app
-from mudg.base import failures, log, memory
+from mudg.base import failures, memory
 from mudg.base.errors import InputError, ResourceError
 from mudg.base.processes import run_in_processes
 from mudg.steps.synthesize import Learn
@@ -129,22 +128,6 @@ def test_streams_that_cannot_be_written_end_nothing_badly(redirections: str, wor
     done = run_mudg(redirections, *words)
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr and "Exception ignored" not in done.stderr
-
-
-@needs_full_device
-def test_messages_on_a_full_device_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    full = FULL.open("w", buffering=1)
-    for stream in (full, None):
-        monkeypatch.setattr(sys, "stderr", stream)
-        log.info("message")
-        log.warn("warning")
-        with log.task("work", 2) as bar:
-            bar.advance()
-            bar.advance()
-    with contextlib.suppress(OSError):
-        full.close()
-    monkeypatch.setattr(sys, "stderr", full)  # closed
-    log.warn("warning")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs ulimit -v")

@@ -1,7 +1,6 @@
 """The last stage of the small models: tiles, what it starts as, what it copies, what it learns from."""
 
 from dataclasses import fields, replace
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,7 +15,7 @@ from mudg.diffusion import model as mdm
 from mudg.diffusion import network, requests
 from mudg.diffusion.model import BatchPart, LossSettings
 from mudg.diffusion.models import draw_weights
-from mudg.diffusion.network import ConditionPixels, Finisher, Made, Refined, finish_in_tiles, with_detail
+from mudg.diffusion.network import ConditionPixels, Finisher, Made, Refined, finish_in_tiles
 from mudg.diffusion.requests import SampleRequest
 
 FINISHING = replace(TINY, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1))
@@ -272,19 +271,3 @@ def test_a_patch_is_finished_from_its_own_part_of_its_own_clip(monkeypatch, row,
         along = made.rgb[:, axis, :, 0] if axis == 0 else made.rgb[:, axis, 0]
         assert torch.allclose(along, expected.expand(frames, -1), atol=1e-3)
     assert bool((made.rgb[:, 2] == 1).all())
-
-
-def test_detail_comes_from_a_warped_image_that_agrees_and_from_nothing_else():
-    generator = torch.Generator().manual_seed(4)
-    sharp = torch.rand(1, 3, 12, 16, generator=generator) * 0.02
-    flat = torch.full_like(sharp, 0.01)
-    one = torch.ones(1, 1, 12, 16)
-
-    def given(color, seen):
-        return SimpleNamespace(color=color, valid=one, warped=seen)
-
-    taken = with_detail(flat, given(sharp, one))
-    assert (taken - taken.mean()).abs().mean() > 0.5 * (sharp - sharp.mean()).abs().mean()
-    assert torch.equal(with_detail(flat, given(sharp, torch.zeros_like(one))), flat)  # nothing was warped
-    assert torch.equal(with_detail(flat, given(sharp + 0.5, one)), flat)  # another surface
-    assert torch.allclose(with_detail(sharp, given(sharp, one)), sharp, atol=1e-6)

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mudg.base.geometry import yaw_matrix
-from mudg.labels.ground import CELL_M, above_plane, distance_to_path, driven_path, fit_ground, ground_near, map_ground
+from mudg.labels.ground import CELL_M, distance_to_path, driven_path, fit_ground, ground_near, map_ground
 
 KERB_AT_M = 4.0
 
@@ -105,11 +105,3 @@ def test_a_lowered_kerb_joins_a_sidewalk_but_not_directly() -> None:
     far, at_it, other_side, road = np.array([[-12, 6, 0.12], [10, 4.6, 0.04], [-12, -6, 0.12], [-12, 3, 0]], float)
     reachable, direct, _ = ground.under(np.stack([far, at_it, other_side, road]))
     assert reachable.tolist() == [True, True, False, True] and direct.tolist() == [False, True, False, True]
-
-
-def test_the_order_of_returns_changes_nothing() -> None:
-    xyz, path = street(np.random.default_rng(9))
-    shuffled = xyz[np.random.default_rng(1).permutation(len(xyz))]
-    one, other = (map_ground(points, path, path[0]) for points in (xyz, shuffled))
-    assert one is not None and other is not None and (one.reachable == other.reachable).mean() > 0.999
-    assert above_plane(one.plane, path) == pytest.approx(above_plane(other.plane, path), abs=1e-3)

@@ -125,19 +125,6 @@ def test_unknown_folders_and_missing_ones_are_named(tmp_path: Path) -> None:
         run(str(tmp_path / "photos"), tmp_path / "out", format="kitti")
 
 
-def test_finished_work_is_reused_and_other_settings_are_refused(tmp_path: Path) -> None:
-    drive = made.write_raw_drive(tmp_path / "day")
-    out = run(drive, tmp_path / "out")
-    made_ns = (out / "scene.json").stat().st_mtime_ns
-    assert run(drive, out, city=CityConfig(seed=5)) == out  # the city's settings do not matter here
-    assert (out / "scene.json").stat().st_mtime_ns == made_ns
-    with pytest.raises(UsageError, match="another configuration"):
-        run(drive, out, test_every=3)
-    (drive / "tracklet_labels.xml").unlink()  # the log changed
-    refused("another configuration", run, drive, out, raises=UsageError)
-    assert len(read_scene(run(drive, out, overwrite=True)).tracks) == 0
-
-
 def test_of_a_folder_with_many_logs_only_the_chosen_one_counts(tmp_path: Path) -> None:
     root = made.write_tracking(tmp_path / "training")
     for part in ("image_02", "velodyne"):

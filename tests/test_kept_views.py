@@ -17,7 +17,7 @@ import torch
 from fit_settings import fit_to, interrupted, small_fit, written_street
 from pretend_device import pretend_device
 from scipy.spatial import cKDTree
-from toy_world import camera, fused_cloud, view_at
+from toy_world import camera, view_at
 
 from mudg.base import scratch
 from mudg.base.errors import ResourceError
@@ -228,25 +228,6 @@ def test_a_sky_is_the_same_however_its_pixels_are_divided():
     assert torch.equal(whole.table["panorama"], parts.table["panorama"])
     none.fill([(directions[:0], colors[:0])])
     assert torch.equal(none.table["panorama"], SkyNode.uniform(8).table["panorama"])
-
-
-def test_points_of_unseen_surfaces_are_bounded(world, monkeypatch):
-    scene = read_scene(world["scene"])
-    state = fit.start_state(settings(), scene, fused_cloud(FRAMES), *fit.recorded_views(settings(), scene))
-    far = np.full(ODD[::-1], 20.0, np.float32)
-    views = [(a_view(n, ("depth",)), np.ones(ODD[::-1], bool)) for n in range(30)]
-    views = [(replace(view, depth=far), unseen) for view, unseen in views]
-    held: list[int] = []
-    joined = StartPoints.joined
-    monkeypatch.setattr(StartPoints, "joined", lambda parts: (held.append(sum(map(len, parts))), joined(parts))[1])
-    every, _, share = trust.unseen_rows(state.model, views, 10_000, 0)
-    whole = sum(held)
-    held.clear()
-    monkeypatch.setattr(trust, "MOST_SEEDS", whole // 3)
-    fewer, _, same_share = trust.unseen_rows(state.model, views, 10_000, 0)
-    assert share == same_share == 1.0
-    assert whole // 6 - 30 <= sum(held) <= whole // 3
-    assert 0 < len(fewer["means"]) <= len(every["means"])
 
 
 def test_few_points_of_unseen_surfaces_still_cover_them():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from mudg.base.errors import UsageError
 from mudg.base.geometry import invert
 from mudg.base.types import View
 from mudg.formats.importers import kitti_files as kitti_boxes
-from mudg.formats.importers.common import holdout_split, parse_frame_range
 from mudg.formats.importers.kitti_files import read_calibration_day, read_calibration_text, read_timestamps
 from mudg.scene.read import read_image, read_points
 
@@ -204,18 +202,6 @@ def test_track_with_a_gap_is_split_where_it_is_long(tmp_path: Path) -> None:
     assert any("0.55 s and were split" in note for note in scene.source.notes)
 
 
-def test_frame_ranges_and_the_holdout_split() -> None:
-    assert parse_frame_range("") is None
-    assert parse_frame_range("10:26") == (10, 26)
-    for wrong in ("5", "7:7", "9:2", "a:b", "-1:4"):
-        refused("frame range", parse_frame_range, wrong, raises=UsageError)
-    moments = [[f"{camera}/{n:06d}" for camera in ("front", "left")] for n in range(10)]
-    split = holdout_split(moments, 4)
-    held_out = {frame_id for frame_id, part in split.items() if part == "test"}
-    assert held_out == {f"{camera}/{n:06d}" for camera in ("front", "left") for n in (4, 8)}
-    assert set(holdout_split(moments, 0).values()) == {"train"}
-
-
 # --- real pieces ----------------------------------------------------------------------------------
 
 
@@ -254,38 +240,6 @@ def test_real_tracking_boxes_project_to_their_rectangles(shared_data: Callable[[
         differences.append(np.abs(np.r_[uv.min(0), uv.max(0)] - [left, top, right, bottom]).max())
     assert len(differences) >= 10
     assert np.median(differences) < 0.35
-
-
-def test_real_object_frame_points_and_box_counts(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
-    source, folder = shared_data("kitti_object_000008"), tmp_path / "training"
-    record = json.loads((source / "info.json").read_bytes())["data_list"][0]
-    camera, row = record["images"]["CAM2"], lambda values: " ".join(f"{value:.9g}" for value in np.ravel(values))
-    names = ("pedestrian", "cyclist", "car", "van", "truck", "person_sitting", "tram", "misc")
-    boxes = []
-    for item in record["instances"]:
-        if (label := item["bbox_label_3d"]) >= 0:
-            x, y, z, length, h, w, turn = item["bbox_3d"]
-            boxes.append(f"{names[label]} 0 0 0 {row(item['bbox'])} {h} {w} {length} {x} {y} {z} {turn}")
-    calibration = f"P2: {row(camera['cam2img'][:3])}\nR0_rect: {row(np.eye(3))}\n"
-    calibration += f"Tr_velo_to_cam: {row(camera['lidar2cam'][:3])}\n"
-    for name, suffix, content in (
-        ("image_2", "png", (source / "000008.png").read_bytes()),
-        ("velodyne", "bin", (source / "000008.bin").read_bytes()),
-        ("label_2", "txt", "\n".join(boxes).encode()),
-        ("calib", "txt", calibration.encode()),
-    ):
-        (folder / name).mkdir(parents=True)
-        (folder / name / f"000008.{suffix}").write_bytes(content)
-    scene = ingest(folder, tmp_path / "out")
-    points = read_points(scene, scene.sweeps[0]).xyz
-    assert len(points) == 17238
-    uv, z = geometry.project(scene.frames[0].view, points)
-    column, line = (uv - 0.5).T  # KITTI counts from the pixel's centre
-    assert int(((z > 0) & (column >= 0) & (line >= 0) & (column < 1241) & (line < 374)).sum()) == 17186
-    counts = [1325, 1900, 881, 659, 55, 162]
-    for track, expected in zip(scene.tracks, counts, strict=True):
-        local = geometry.transform_points(invert(track.world_from_object[0]), points)
-        assert (np.abs(local) <= track.size_m / 2).all(1).sum() == pytest.approx(expected, rel=0.08)
 
 
 # --- empty lines ----------------------------------------------------------------------------------

@@ -99,14 +99,6 @@ def torchrun(clips, out, **changes):
 
 
 @pytest.mark.slow
-def test_torchrun_trains(clips, tmp_path):
-    command = torchrun(clips, tmp_path / "out")
-    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=600)
-    assert done.returncode == 0, done.stderr
-    assert model_files.load(tmp_path / "out" / "model").config.widths == (16, 32)
-
-
-@pytest.mark.slow
 def test_ctrl_c_under_torchrun_saves_the_step(clips, tmp_path):
     """The terminal sends the signal to all processes, and the launcher sends it on once more."""
     out = tmp_path / "out"

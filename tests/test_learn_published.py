@@ -13,17 +13,16 @@ from toy_scene import ToyStreet
 
 from mudg.base import palette
 from mudg.base.errors import InputError, UsageError
-from mudg.base.types import Condition, SparseDepth
+from mudg.base.types import Condition
 from mudg.diffusion import city_clips, convert, learn, log_clips, models, published
 from mudg.diffusion import clips as clip_shards
-from mudg.diffusion.condition import ConditionRules, build_conditions, filled_depth
+from mudg.diffusion.condition import ConditionRules, build_conditions
 from mudg.diffusion.log_clips import LogClipRules, LogSource
 from mudg.diffusion.model import BatchPart, LossSettings
 from mudg.diffusion.published import PAPER_DROPOUT, ContextDropout, PublishedMDM
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.diffusion.views import recorded_images
 from mudg.scene.observations import read_observations
-from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.steps.ingest import Fuse
 from mudg.steps.synthesize import Learn, Synthesize
@@ -234,12 +233,6 @@ def test_clips_of_logs_show_points_alone(street, tmp_path):
     assert not torch.equal(thinner.condition.depth, clip.condition.depth)  # to train on: a share of the points
 
 
-def test_filling_takes_the_nearest_measured_depth():
-    depth = torch.zeros(2, 1, 1, 5)
-    depth[0, 0, 0, 1], depth[0, 0, 0, 4] = 7.0, 30.0
-    assert filled_depth(SparseDepth(depth, depth > 0))[:, 0, 0].tolist() == [[7.0, 7.0, 7.0, 30.0, 30.0], [100.0] * 5]
-
-
 def test_a_folder_of_clips_is_known_by_its_condition(street, tmp_path):
     sources = [LogSource(street / "scene", street / "fuse")]
     rules = LogClipRules(width=48, height=32, window=4)
@@ -266,17 +259,3 @@ def test_clips_of_cities_show_points_alone_and_are_as_long_as_asked():
         torch.from_numpy(found).permute(0, 3, 1, 2).float() / 255, size=(16, 24), mode="bilinear", align_corners=False
     )
     assert torch.allclose(condition.reference, small[0], atol=1e-6)
-
-
-@pytest.mark.slow
-def test_a_published_model_goes_on_learning_on_a_log(converted, street, tmp_path):
-    """Logs are cut into clips of the very size asked for, whatever the camera's aspect."""
-    source = f"{street / 'scene'}={street / 'fuse'}"
-    config = published_settings(
-        converted, "", scenes=(source,), stride=4, held_out_every=0, width=32, height=32, steps=1, batch_frames=4
-    )
-    made = Learn(out=tmp_path / "run", settings=config).run()
-    index = json.loads((tmp_path / "run" / "clips" / log_clips.INDEX).read_text())["rules"]
-    assert (index["width"], index["height"], index["published"]) == (32, 32, True)
-    assert "the first image as condition" in (made / "MODEL_CARD.md").read_text()
-    assert read_scene(street / "scene").cameras["front"].width == 72

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -236,22 +235,6 @@ def test_annotated_depth_is_learned_with_its_confidence(annotated, tmp_path, pub
     varied = (clips.vary(clip, np.random.default_rng(n)) for n in range(20))
     turned = next(one for one in varied if not torch.equal(one.depth, clip.depth))
     assert torch.equal(turned.depth_weight, clip.depth_weight.flip(-1))
-
-
-def test_the_weight_of_depth_scales_its_loss(annotated):
-    """Both kinds of model: the error at a pixel counts as much as its depth is to be believed."""
-    rules = LogClipRules(64, 32, window=3, held_out_every=0)
-    opened = log_clips.OpenLog(annotated[1], rules)
-    clip = log_clips.make_clip(opened, log_clips.log_windows(opened.scene, rules)[0], 0)
-    model = MDM(models.model_config(tiny(Path(), width=64, height=32, window=3)))
-
-    def term(confidence):
-        weighted = replace(clip, depth_confidence=torch.full_like(clip.depth, confidence))
-        return depth_term(model.pixel_truth([weighted]))
-
-    assert term(0.25) == pytest.approx(term(1.0) / 4, rel=1e-4) and term(1.0) > 0
-    cells = model.encode_truth([replace(clip, depth_confidence=torch.full_like(clip.depth, 0.5))]).depth_known
-    assert float(cells.max()) == pytest.approx(0.5)
 
 
 def test_points_are_left_out_but_of_published_type_clips():

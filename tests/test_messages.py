@@ -95,44 +95,6 @@ def test_messages_and_progress_cannot_be_forged(terminal: bool, monkeypatch: pyt
     assert "title" in said and "[red]c" in said and "\nsecond line\n" in said
 
 
-def test_bars_within_bars_and_messages_share_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The screen after every line: a terminal emulated as far as rich moves its cursor."""
-    written = io.StringIO()
-    made = []
-
-    def console() -> Console:
-        if log._bars:
-            return log._bars[0].console
-        made.append(Console(file=written, force_terminal=True, width=60, color_system=None, highlight=False))
-        return made[-1]
-
-    monkeypatch.setattr(log, "_console", console)
-    monkeypatch.setattr(log, "_quiet", False)
-    with log.task("outer", 2) as outer:
-        with log.task("inner", 3) as inner:
-            inner.advance()
-            log.info("a message")
-            assert len(log._bars) == 1 and {one.description for one in log._bars[0].tasks} == {"outer", "inner"}
-        outer.advance(2)
-        assert [one.description for one in log._bars[0].tasks] == ["outer"]
-    assert log._bars == []
-    rows, at = [""], 0
-    for piece in re.findall(r"\x1b\[[0-9;?]*[A-Za-z]|\r|\n|[^\x1b\r\n]+", written.getvalue()):
-        if piece == "\n":
-            at += 1
-            rows += [""] * (at + 1 - len(rows))
-        elif piece.endswith("A") and piece.startswith("\x1b"):
-            at -= int(piece[2:-1] or 1)
-        elif piece.endswith("K") and piece.startswith("\x1b"):
-            rows[at] = ""
-        elif piece == "\r":
-            continue
-        elif not piece.startswith("\x1b"):
-            rows[at] = piece if not rows[at] or piece.startswith(("outer", "inner")) else rows[at] + piece
-    assert "a message" in [row.strip() for row in rows]
-    assert sum(row.startswith("outer") for row in rows) == 1 and not any(row.startswith("inner") for row in rows)
-
-
 def test_no_verb_prints_what_a_track_is_called_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Ids of tracks may hold anything; the same id twice is an error that names it."""
     scene, street = tmp_path / "scene", ToyStreet(car_start=(12.0, 0.0), times=[0.0, 0.1])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sqlite3
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,14 +12,12 @@ import kitti_folders
 import numpy as np
 import pytest
 import roundtrip
-import write_av2
 import write_custom
-import write_nuplan
 from refusals import refused
 from toy_scene import ToyStreet
 
-from mudg.base.geometry import invert, yaw_matrix
-from mudg.base.types import EgoPath, Scene, Sweep, Track, View
+from mudg.base.geometry import yaw_matrix
+from mudg.base.types import EgoPath, Scene, Track
 from mudg.formats.importers import IMPORTERS, custom
 from mudg.formats.importers.common import ImportOptions
 from mudg.scene import motion
@@ -85,20 +82,6 @@ def test_frames_in_a_gap_of_a_curve_are_refused_left_out_or_bridged(truth: Scene
     assert any("bridged by curves" in note for note in bridged.source.notes)
 
 
-def test_the_estimate_of_a_gap_is_the_sagitta() -> None:
-    path = arc(0.0, 2.5, 0.05, LOST_S)
-    (gap,) = motion.gaps(path.times_s, path.world_from_ego)
-    chord = 2 * RADIUS_M * np.sin(SPEED_M_S * 1.3 / RADIUS_M / 2)
-    sagitta = RADIUS_M * (1 - np.cos(SPEED_M_S * 1.3 / RADIUS_M / 2))
-    assert gap.moved_m == pytest.approx(chord) and gap.off_m == pytest.approx(sagitta, rel=0.1)
-    assert motion.gap_at(path, 1.25) and not motion.gap_at(path, 0.60) and not motion.gap_at(path, 2.0)
-    straight = EgoPath(path.times_s, np.stack([yaw_matrix(0.0, (8 * t, 0, 0)) for t in path.times_s]))
-    assert not motion.gap_at(straight, 0.70)  # near a key
-    assert motion.gap_at(straight, 1.25)  # nobody knows: it is more than a second
-    still = EgoPath(path.times_s, np.tile(np.eye(4), (len(path.times_s), 1, 1)))
-    assert not motion.gap_at(still, 1.25)
-
-
 def test_lost_packets_of_kitti_leave_their_frames_out(tmp_path: Path) -> None:
     folder = kitti_folders.write_raw_drive(tmp_path / "day", kitti_folders.Drive(tuple(range(16))), twisted=False)
     for number in range(3, 14):
@@ -112,46 +95,6 @@ def test_lost_packets_of_kitti_leave_their_frames_out(tmp_path: Path) -> None:
     for sweep in left.sweeps:
         exact = first @ kitti_folders.world_from_velo(sweep.time_s)
         assert np.linalg.norm(sweep.world_from_lidar[:3, 3] - exact[:3, 3]) < motion.OFF_M
-
-
-@roundtrip.needs_native
-def test_lost_rows_of_argoverse2_and_nuplan(truth: Scene, tmp_path: Path) -> None:
-    """A scene that drives through the curve, without the poses of its middle."""
-    pytest.importorskip("pyarrow")
-
-    def moved(time_s: float) -> np.ndarray:
-        return on_arc(5 * time_s) @ invert(truth.ego.pose_at(time_s))
-
-    def later(view: View) -> View:
-        return replace(view, world_from_cam=moved(view.time_s) @ view.world_from_cam, time_s=5 * view.time_s)
-
-    def swept(one: Sweep) -> Sweep:
-        return replace(one, time_s=5 * one.time_s, world_from_lidar=moved(one.time_s) @ one.world_from_lidar)
-
-    frames, sweeps = tuple(replace(f, view=later(f.view)) for f in truth.frames), tuple(map(swept, truth.sweeps))
-    curve = replace(truth, frames=frames, sweeps=sweeps, tracks=(), ego=arc(-0.5, 2.5, 0.05))
-    log = write_av2.write_av2(curve, tmp_path / "av2")
-    (log / "annotations.feather").unlink()
-
-    def lose(columns: dict[str, Any]) -> None:
-        times = (columns["timestamp_ns"] - write_av2.nanos(0.0)) / 1e9
-        kept = (times < 0.6) | (times > 1.95)
-        for name in columns:
-            columns[name] = columns[name][kept]
-
-    write_av2.edit(log / "city_SE3_egovehicle.feather", lose)
-    database = write_nuplan.write_nuplan(curve, tmp_path / "nuplan")
-    with sqlite3.connect(database) as connection:
-        span = (write_nuplan.us(0.62), write_nuplan.us(1.88))
-        connection.execute("DELETE FROM ego_pose WHERE timestamp BETWEEN ? AND ?", span)
-    connection.close()
-    for kind, source, options, words in (
-        ("argoverse2", log, {"cameras": ("front", "front_left")}, "vehicle poses have a gap"),
-        ("nuplan", database, {}, "point cloud has no vehicle pose"),
-    ):
-        refused(words, IMPORTERS[kind], source, tmp_path / f"{kind} refused", ImportOptions(**options))
-        left = IMPORTERS[kind](source, tmp_path / f"{kind} left", ImportOptions(skip_missing=True, **options))
-        assert 0 < len(left.frames) < len(truth.frames)
 
 
 def poses_of(headings: list[float], step_m: float) -> np.ndarray:

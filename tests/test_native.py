@@ -292,20 +292,6 @@ def test_adam_equals_its_float64_twin(isa: str, shape: tuple[int, ...], sparse: 
         assert torch.equal(mine[0][~visible], parameter[~visible]) and mine[1][~visible].abs().sum() == 0
 
 
-@needs_native
-def test_adam_moves_every_element_alike_wherever_it_lies(pool: Any) -> None:
-    """Same history, same result: bit for bit, at any position, number of threads, dense or sparse."""
-    native.set_threads(3)
-    values = [torch.full((70_001,), x) for x in (0.3, 0.01, 0.02)]
-    adam(values[0], torch.full((70_001,), 0.7), values[1], values[2], 1e-3, 4)
-    assert all(len(torch.unique(value)) == 1 for value in values)
-    rows = [torch.full((701, 5), x) for x in (0.3, 0.01, 0.02)]
-    visible = torch.arange(701) % 3 != 0
-    adam(rows[0], torch.full((701, 5), 0.7), rows[1], rows[2], 1e-3, 4, visible)
-    for dense, sparse in zip(values, rows):
-        assert (sparse[visible] == dense[0]).all()
-
-
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.6, 1.0])
 def test_adam_on_all_columns_in_one_pass_is_adam_on_each(isa: str, share: float) -> None:
     """Bit for bit; narrow and wide columns; invisible rows are not looked at."""

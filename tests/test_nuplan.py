@@ -181,7 +181,6 @@ def cut(source: Path, size: int) -> None:
     ("spoil", "words"),
     [
         (lambda s: log(s).write_bytes(b"SQLite format 3\0" + b"x" * 5000), "not a readable SQLite|damaged"),
-        (lambda s: log(s).write_text("a text"), "not a readable SQLite|damaged"),
         (lambda s: cut(s, 6000), "damaged|not a readable|no table"),
         (sql("ALTER TABLE lidar_box RENAME TO boxes"), "no table 'lidar_box'"),
         (sql("ALTER TABLE ego_pose RENAME COLUMN qw TO w"), "table lacks columns"),
@@ -190,7 +189,6 @@ def cut(source: Path, size: int) -> None:
         (lambda s: blob("MergedPointCloud")(s).unlink(), "files that the log names are missing"),
         (sql("UPDATE ego_pose SET timestamp = timestamp / 1000"), "no vehicle poses at the time"),
         (sql("UPDATE lidar_pc SET timestamp = timestamp / 1000"), "another unit"),
-        (sql("UPDATE image SET timestamp = timestamp / 1000"), "a camera has no images"),
         (sql("UPDATE lidar_pc SET timestamp = 'soon' WHERE token = ?", made.token("cloud", 1)), "no whole number"),
         (sql("UPDATE ego_pose SET qw = qw * 1.5, qx = qx * 1.5, qy = qy * 1.5, qz = qz * 1.5"), "length 1"),
         (sql("UPDATE ego_pose SET x = NULL"), "not a finite number"),
@@ -199,13 +197,10 @@ def cut(source: Path, size: int) -> None:
         (sql("UPDATE lidar_box SET track_token = x'00' WHERE token = ?", CAR_BOX), "names a track"),
         (sql("DELETE FROM category"), "names a track or class that is not there"),
         (sql("UPDATE lidar_box SET length = 0"), "size makes no sense"),
-        (sql("UPDATE lidar_box SET yaw = 'north'"), "not a finite number"),
         (sql("UPDATE image SET filename_jpg = '../../../etc/passwd'"), "file name contains the component"),
         (sql("UPDATE lidar_pc SET filename = '/etc/passwd'"), "file name is absolute"),
         (sql("UPDATE camera SET rotation = ?", pickle.dumps([0.0, 0, 0, 0])), "length 1"),
-        (sql("UPDATE camera SET intrinsic = ?", pickle.dumps([[1.0, 2], [3, 4]])), "wrong number of values"),
         (sql("UPDATE camera SET intrinsic = ?", pickle.dumps([[0.0, 0, 0]] * 3)), "not of a pinhole camera"),
-        (sql("UPDATE camera SET intrinsic = ?", pickle.dumps([["a"] * 3] * 3)), "not a finite number"),
         (sql("UPDATE camera SET intrinsic = ?", b"\x80\x04\x8e\xff\xff\xff\xff\xff\xff\xff\x7f."), "malformed"),
         (sql("UPDATE camera SET intrinsic = 'text'"), "no pickled list"),
         (sql("UPDATE camera SET width = 40"), "size"),
@@ -229,14 +224,6 @@ def test_a_table_that_is_a_view_or_virtual_is_no_table(source: Path, tmp_path: P
     change(source, "ALTER TABLE category RENAME TO real_category")
     change(source, f"CREATE {instead}")
     refused("no table 'category'", ingest, source, tmp_path / "out")
-
-
-def test_missing_files_can_be_left_out(source: Path, tmp_path: Path) -> None:
-    blob("CAM_F0")(source).unlink()
-    blob("MergedPointCloud")(source).unlink()
-    change(source, "DELETE FROM image WHERE token = ?", made.token("image", "CAM_L0", 2))
-    scene = ingest(source, tmp_path / "out", skip_missing=True)
-    assert len(scene.sweeps) == len(scene.frames_of("front")) == len(scene.frames_of("front_left")) == 4
 
 
 def test_cameras_may_fire_one_after_another(source: Path, tmp_path: Path) -> None:

@@ -308,19 +308,3 @@ def test_real_boxes_hold_the_points_that_were_counted_in_them(shared_data: Calla
     off = sorted(abs(a - b) for a, b in zip(inside, declared, strict=True))
     assert len(boxes) == 68 and (inside[declared.index(495)], off[-1], off[-2]) == (479, 16, 5)
     assert np.percentile(off, 95) <= 2
-
-
-def test_real_camera_times_agree_with_the_turn(shared_data: Callable[[str], Path]) -> None:
-    """A camera is triggered when the beam passes it: point times there are its time before the stamp."""
-    source = shared_data("nuscenes_one_sample")
-    sample = json.loads((source / "info.json").read_bytes())["data_list"][0]
-    rows = np.fromfile(next(source.glob("*.pcd.bin")), "<f4").reshape(-1, 5)
-    dt_s = point_times(rows[:, :3], rows[:, 4])
-    far = np.linalg.norm(rows[:, :2], axis=1) > 3
-    for name, image in sample["images"].items():
-        if name == "CAM_BACK_LEFT":
-            continue  # at the seam
-        axis = invert(np.array(image["lidar2cam"]))[:3, 2]
-        off = np.angle(np.exp(1j * (np.arctan2(rows[:, 1], rows[:, 0]) - np.arctan2(axis[1], axis[0]))))
-        at = dt_s[far & (np.abs(off) < 0.02)].mean()
-        assert abs(at - (image["timestamp"] - sample["timestamp"])) < 0.004

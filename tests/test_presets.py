@@ -30,14 +30,6 @@ def words(*more: str) -> Any:
     return app.parse(["run", "city", "--out", "x", *more])[0].settings
 
 
-def test_presets_are_those_that_are_named() -> None:
-    assert set(PRESETS) == set(NAMES)
-    config = run_preset("paper")
-    plain, guided = pipeline.fits_of(config.fit, config.guided_share)
-    assert plain.iterations == guided.iterations == 30_000
-    assert pipeline.fits_of(config.fit, run_preset().guided_share)[1].iterations == 45_000
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_a_preset_is_its_row_over_the_defaults(name: PresetName) -> None:
     config = run_preset(name)
@@ -73,15 +65,6 @@ def test_the_run_yaml_of_a_preset_gives_it_back_under_any_preset(name: PresetNam
     file = tmp_path / "run.yaml"
     file.write_text(configuration.dump_yaml(before))
     assert words("--config", str(file)) == words("--preset", "paper", "--config", str(file)) == before
-
-
-@pytest.mark.parametrize("verb", ["demo", "run"])
-def test_help_and_refusals_name_every_preset(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert app.main([verb, "--help"]) == 0
-    shown = capsys.readouterr().out
-    assert "--preset" in shown and all(name in shown for name in NAMES)
-    assert app.main(["demo", "--preset", "best"]) == 2
-    assert all(name in capsys.readouterr().err for name in ("quality",))
 
 
 def test_paper_needs_a_published_model_and_lpips_before_anything_is_written(tmp_path: Path) -> None:

@@ -8,8 +8,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
+import test_mdm
 import torch
 from refusals import refused
 from toy_published import TINY, choose_trainable, fill, tiny_model, write_tiny
@@ -18,7 +18,7 @@ from toy_scene import ToyStreet
 from mudg.base import palette
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.store import read_safetensors
-from mudg.base.types import Camera, Condition, View
+from mudg.base.types import View
 from mudg.core import noise
 from mudg.diffusion import memory_plan, published, views
 from mudg.diffusion.condition import ConditionRules, build_conditions
@@ -61,17 +61,9 @@ def error(made, wanted):
 
 
 def some_condition(frames=4, height=8, width=12, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    camera = Camera("front", width, height, 20.0, 20.0, width / 2, height / 2)
-    views = tuple(View(camera, np.eye(4), 0.1 * t) for t in range(frames))
-    draw = lambda *shape: torch.rand(*shape, generator=generator)
-    return Condition(
-        views,
-        draw(frames, 3, height, width),
-        3 + 60 * draw(frames, 1, height, width),
-        draw(frames, 1, height, width) > 0.5,
-        draw(3, height, width),
-    )
+    """Points alone, as the published condition has them."""
+    absent = dict.fromkeys(("warped", "backdrop", "semantics", "backdrop_semantics"))
+    return replace(test_mdm.some_condition(frames, height, width, seed), **absent)
 
 
 @pytest.fixture(scope="module")
@@ -506,7 +498,8 @@ def same(one, other):
     )
 
 
-@pytest.mark.parametrize(("steps", "guidance"), [(8, None), (8, 1.0), (20, None)])
+@pytest.mark.parametrize("steps", [50, 20, 8])
+@pytest.mark.parametrize("guidance", [None, 1.0])
 def test_passes_for_a_clip(model, monkeypatch, steps, guidance):
     """The numbers of docs/research/published.md: the denoiser once per step, the rest once per clip."""
     rows: dict[str, list[int]] = {}

@@ -19,7 +19,7 @@ from mudg.base.errors import NumericsError, UsageError
 from mudg.baselines import emernerf as loop
 from mudg.baselines import emernerf_field as fields
 from mudg.baselines.emernerf import extent_of, lidar_rays, load_field, view_rays
-from mudg.baselines.emernerf_field import SIZES, Budget, Extent, RadianceField, RayDraws, Rays, aggregated
+from mudg.baselines.emernerf_field import SIZES, Budget, Extent, RadianceField, RayDraws, aggregated
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing.settings import RenderConfig
 from mudg.gaussians.settings import FitConfig
@@ -127,17 +127,6 @@ def test_flow_aggregation_equals_a_loop_and_moves_its_flow():
     assert (flow.grad.abs() > 0).all()
 
 
-def test_each_proposal_round_asks_its_own_network(monkeypatch):
-    field, asked = tiny_field(), []
-    real = field.proposed_density
-    monkeypatch.setattr(
-        field, "proposed_density", lambda level, xyz: (asked.append((level, len(xyz))), real(level, xyz))[1]
-    )
-    rays, _ = view_rays(view_at(0.0, camera("front", 4, 2)), field.extent, 0)
-    fields.march(field, rays, Budget((16, 12), 8, 0.1, 1000.0))
-    assert asked == [(0, 8 * 16), (1, 8 * 12)]
-
-
 def test_color_loss_reaches_every_field_and_proposals_learn_only_when_asked():
     field = tiny_field()
     rays, _ = view_rays(view_at(0.3, camera("front", 6, 4)), field.extent, 0)
@@ -206,11 +195,6 @@ def same(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
     return a.keys() == b.keys() and all(np.array_equal(a[name], b[name]) for name in a)
 
 
-def test_boxes_are_not_read(world, tmp_path):
-    Fit(scene=world / "bare", out=tmp_path / "bare", settings=fit_config(**TINY)).run()
-    assert same(parameters(world / "fit"), parameters(tmp_path / "bare"))
-
-
 def test_resumed_equals_uninterrupted(world, tmp_path, monkeypatch):
     real, calls = loop.take_step, []
 
@@ -237,17 +221,6 @@ def started(world: Path, device: torch.device | str = "cpu", **changes: object) 
 
     config = fit_config(**TINY | changes)
     return loop.prepare(config, read_scene(world / "scene"), Folder(), torch.device(device)), config
-
-
-def test_a_short_fit_lowers_its_losses(world, monkeypatch):
-    monkeypatch.setitem(loop.BATCHES, "tiny", (128, 128))
-    state, config = started(world, iterations=80)
-    lines = [
-        {name: float(value.detach()) for name, value in loop.take_step(state, config, step).items()}
-        for step in range(1, 81)
-    ]
-    for name in ("color", "lidar"):
-        assert sum(line[name] for line in lines[-10:]) < 0.8 * sum(line[name] for line in lines[:10]), name
 
 
 @pytest.mark.slow
@@ -343,15 +316,3 @@ def test_a_batch_of_pixels_shows_what_the_rays_meet(world):
     state.pixels.errors[3] = 1.0
     chosen = state.pixels.batch(40, 1.0, seeds.torch_generator(0, 2, "batch"))
     assert (chosen.cells == 3).all()
-
-
-def test_rays_move_to_a_device_and_back(world):
-    with pretend_device() as there:
-        field = tiny_field().to(there)
-        rays, _ = view_rays(view_at(0.0, camera("front", 3, 2)), field.extent, 0)
-        marched = fields.march(field, rays.to(there), Budget((8, 8), 4, 0.1, 1000.0))
-        rgb = fields.colors(field, rays.to(there), marched)[0].cpu()
-    field = tiny_field()
-    marched = fields.march(field, rays, Budget((8, 8), 4, 0.1, 1000.0))
-    assert torch.allclose(rgb, fields.colors(field, rays, marched)[0], atol=1e-5)
-    assert isinstance(rays.part(0, 2), Rays)

@@ -10,6 +10,7 @@ import io
 import json
 import re
 import shlex
+import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -64,8 +65,14 @@ def written(out: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> str:
-    out = finished_run(tmp_path_factory.mktemp("run"))
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run that tests only read, or copy."""
+    return finished_run(tmp_path_factory.mktemp("run") / "run")
+
+
+@pytest.fixture(scope="module")
+def page(run: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    out = shutil.copytree(run, tmp_path_factory.mktemp("page") / "run")
     return written(out).read_text(encoding="utf-8")
 
 
@@ -155,10 +162,9 @@ def test_every_control_has_a_label(page: str) -> None:
 EVIL = '"><script>alert(1)</script>'
 
 
-def test_names_from_a_scene_cannot_become_tags(tmp_path: Path) -> None:
+def test_names_from_a_scene_cannot_become_tags(run: Path) -> None:
     """Names of scenes, cameras, trajectories, methods, metrics and steps come from files of others."""
-    out = finished_run(tmp_path)
-    scores = store.read_json(out / "score" / "metrics.json")
+    scores = store.read_json(run / "score" / "metrics.json")
     method = scores["methods"][0]["name"]
 
     def renamed(value: Any) -> Any:
@@ -197,10 +203,9 @@ def test_videos_hold_all_panels_and_play(page: str) -> None:
         assert frames[0].shape == (4 * toy_views.HEIGHT, 4 * toy_views.WIDTH, 3)
 
 
-def test_panels_show_what_they_say(tmp_path: Path) -> None:
-    out = finished_run(tmp_path)
-    scores = store.read_json(out / "score" / "metrics.json")
-    folders = report._folders(out, scores)
+def test_panels_show_what_they_say(run: Path) -> None:
+    scores = store.read_json(run / "score" / "metrics.json")
+    folders = report._folders(run, scores)
     assert list(folders) == ["truth", "street_gaussians", "mudg_r", "mudg_s"]
     h, w = toy_views.HEIGHT, toy_views.WIDTH
     courses = {course["shift_m"]: report._columns(course, folders) for course in scores["trajectories"]}
@@ -258,9 +263,9 @@ def test_axis_ticks_enclose_the_values(low: float, high: float) -> None:
 
 
 def test_the_budget_makes_videos_smaller_and_without_an_encoder_pictures_stand_in(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out = finished_run(tmp_path)
+    out = shutil.copytree(run, tmp_path / "run")
     large = written(out).stat().st_size
     monkeypatch.setattr(report, "BUDGET_BYTES", 1000)
     assert written(out).stat().st_size < large

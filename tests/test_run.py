@@ -13,9 +13,7 @@ import pytest
 from refusals import refused
 
 from mudg import app
-from mudg.base import config as configuration
-from mudg.base import log, store
-from mudg.base import memory as usage
+from mudg.base import store
 from mudg.base.errors import IntegrityError, NumericsError, ResourceError, UsageError
 from mudg.scoring import score
 from mudg.steps import pipeline
@@ -104,22 +102,6 @@ def test_the_whole_chain_in_order(tmp_path: Path, verbs: dict[str, Any]) -> None
     assert sum(step["written_bytes"] for step in ledger["steps"].values()) == steps > 0
 
 
-def test_each_step_says_how_many_there_are(
-    tmp_path: Path, verbs: dict[str, Any], capsys: pytest.CaptureFixture[str]
-) -> None:
-    log.set_quiet(False)
-    config = with_seed(run_preset("fast"), 5)
-    chain(tmp_path, config)
-    said = capsys.readouterr().err
-    assert said.index("== ingest") < said.index("== fuse, step 1 of 9\n")
-    assert "== report, step 9 of 9" in said
-    assert verbs["ingest"].settings.resolution == "", "a city has a size of its own"
-    assert configuration.load(RunConfig, None, tmp_path / "out" / "run.yaml") == config  # it repeats the run
-    (tmp_path / "log").mkdir()
-    Run(source=tmp_path / "log", out=tmp_path / "other", settings=run_preset("fast")).run()
-    assert verbs["ingest"].settings.resolution == "480"
-
-
 def test_two_runs_in_one_folder_at_a_time(
     tmp_path: Path, verbs: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -182,19 +164,6 @@ def test_what_stopped_a_run_is_recorded_and_the_repeat_continues(
     assert "Repeat the same command" not in page.read_text()
 
 
-@pytest.mark.parametrize(
-    ("fit_s", "words"), [(None, ""), (78.0, ", about 6.3 min left"), (7800.0, ", about 9.2 h left"), (0.5, "")]
-)
-def test_a_run_says_how_long_the_rest_takes(tmp_path: Path, fit_s: float | None, words: str) -> None:
-    """From the first fit on, by what the steps took here; never of the few seconds of fusing."""
-    spent = {"ingest": 14.0, "fuse": 10.0} | ({} if fit_s is None else {"fit without diffusion": fit_s})
-    before = {"steps": {name: {"state": "complete", "seconds": seconds} for name, seconds in spent.items()}}
-    ledger = pipeline._Ledger(tmp_path, {}, before)
-    ledger.ahead = list(pipeline.PERCENT_OF_A_RUN)
-    assert ledger._standing("synthesize") == f"synthesize, step 3 of 9{words}"
-    assert ledger._standing("ingest") == "ingest"
-
-
 def test_the_shares_name_every_step_of_a_run(tmp_path: Path) -> None:
     steps = pipeline.steps_of(RunConfig(), tmp_path / "scene", tmp_path, overwrite=False)
     assert list(pipeline.PERCENT_OF_A_RUN) == [*steps, "viewer", "report"]
@@ -215,26 +184,6 @@ def test_the_page_of_a_run_shows_its_steps_while_it_goes_on(tmp_path: Path, verb
     chain(tmp_path)
     assert page.read_text() == report
     assert len(texts) == 1 or texts[1] == report
-
-
-def test_seconds_add_up_over_continuations_and_reuse_adds_none(
-    tmp_path: Path, verbs: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clock = {"now": 0.0}
-    costs = {"ingest": [10.0, 1.0, 1.0], "fuse": [2.0, 0.5], "synthesize": [30.0, 12.0, 0.25]}
-    monkeypatch.setattr(usage.time, "monotonic", lambda: clock["now"])
-    plain = Step.run
-
-    def costing(step: Step) -> Any:
-        clock["now"] += costs[step.verb()].pop(0) if step.verb() in costs else 0.0
-        return plain(step)
-
-    monkeypatch.setattr(Step, "run", costing)
-    verbs["trouble"]["synthesize"] = KeyboardInterrupt()
-    with pytest.raises(KeyboardInterrupt):
-        chain(tmp_path)
-    seconds = chain(tmp_path)["seconds"]
-    assert (seconds["ingest"], seconds["fuse"], seconds["synthesize"]) == (10.0, 2.0, 42.0)
 
 
 def test_other_settings_are_refused_at_once_and_named(tmp_path: Path, verbs: dict[str, Any]) -> None:

@@ -124,28 +124,3 @@ def test_short_help_is_help_and_every_part_of_a_verb_has_a_page() -> None:
 def test_help_all_works_for_every_verb(verb: str) -> None:
     said = help_of(verb, "--help-all")
     assert f"usage: mudg {verb}" in said and "--quiet" in said
-
-
-@pytest.mark.parametrize(
-    ("page", "shown", "others"),
-    [
-        ("batch status", (), ("--stages", "--preset", "--reason", "--shard")),
-        ("batch retry", ("--reason",), ("--stages", "--shard")),
-        ("batch run", ("--list", "--stages", "--engine", "--set"), ("--reason",)),
-        ("bench paper", ("--table", "--iterations"), ("--protocols", "--sampler", "--variant")),
-        ("bench mdm", ("--steps", "--cities"), ("--table", "--protocols", "--score.width-px")),
-        ("bench real", ("--protocols", "--variant"), ("--table", "--videos", "--sampler")),
-        ("ingest kitti", ("--frames", "--resolution", "--boxes"), ("--city.width", "--format")),
-        ("ingest city", ("--city.width", "--test-every"), ("--frames", "--boxes", "--format")),
-        ("asset export", ("--scene", "--out"), ("--label", "--kind", "--axes")),
-        ("asset import", ("--label", "--kind"), ("--scene",)),
-    ],
-)
-@pytest.mark.parametrize("asked", ["--help", "--help-all"])
-def test_parts_of_verbs_have_pages_of_their_own(
-    page: str, shown: tuple[str, ...], others: tuple[str, ...], asked: str
-) -> None:
-    said = help_of(page, asked)
-    assert f"usage: mudg {page}" in said and "--quiet" in said
-    listed = {line.split()[0].replace("[no-]", "") for line in said.splitlines() if line.startswith("  --")}
-    assert set(shown) <= listed and not set(others) & listed

@@ -63,14 +63,6 @@ def test_scenes_are_drawn_by_the_weights_of_their_data_sets():
     assert [listed.draw(rng(7)) for _ in range(3)] == [listed.draw(rng(7))] * 3
 
 
-def test_without_weights_every_scene_counts_the_same():
-    scenes = [ListedScene(path=str(n), data_set="ab"[n > 2]) for n in range(12)]
-    listed = SceneList(scenes, {}, 0, "list")
-    assert listed.shares == {"a": 0.25, "b": 0.75} and listed.scored == []
-    assert SceneList(scenes, {}, 2, "x").scored == SceneList([*scenes, scenes[0]], {}, 2, "x").scored  # by path alone
-    assert "12 scenes" in listed.summary() and "75 % of the clips" in listed.summary()
-
-
 def test_lists_are_read_in_two_formats(tmp_path):
     (tmp_path / "l.yaml").write_text(
         "data_sets: {k: 2.0}\nscenes:\n- a\n- {path: b, data_set: k, weight: 2, held_out: true}\n- {path: c, data_set:"

@@ -72,13 +72,6 @@ def test_only_held_out_frames_count_on_the_recorded_path(tmp_path: Path, scene: 
     assert value(document, "a", "front_recorded", "psnr") == 100.0  # equal pictures
 
 
-def test_without_held_out_frames_all_count_and_the_rules_say_so(tmp_path: Path) -> None:
-    scene = toy_views.write_scene(tmp_path / "scene", test_every=0)
-    document = of_one(scene, tmp_path)
-    assert document["results"][0]["views"] == 4
-    assert any("No frame was held out" in rule for rule in document["rules"])
-
-
 def test_a_recorded_log_has_no_truth_off_its_path(tmp_path: Path, scene: Path) -> None:
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0, 2.0))
     out = Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run()
@@ -229,19 +222,3 @@ def test_lidar_is_the_depth_truth_of_a_log_without_depth_labels(tmp_path: Path) 
     at_12_m = lambda _, seen: dataclasses.replace(seen, depth=torch.full_like(seen.depth, 12.0))
     document = of_one(scene, tmp_path, at_12_m)
     assert value(document, "a", "front_recorded", "rmse_m") == pytest.approx(2.0, abs=1e-4)  # the wall stands at 10 m
-
-
-def test_metrics_without_truth_are_one_line_and_no_columns() -> None:
-    names = ("psnr", "ssim", "lidar_rmse_m")
-
-    def text_of(*values: object) -> str:
-        results = [{"method": m, "trajectory": "t", "views": 3, "values": dict(zip(names, values))} for m in "ab"]
-        metrics = [{"name": name, "title": name} for name in names]
-        document = {"scene": {"id": "drive"}, "rules": [], "metrics": metrics, "results": results}
-        return score_tables.markdown({**document, "trajectories": [{"name": "t"}]})
-
-    text = text_of("no truth", "no truth", 1.5)
-    assert "No truth here for psnr, ssim." in text and "| method | views | lidar_rmse_m |" in text
-    assert "| no truth" not in text
-    text = text_of("no truth", "no truth", "no truth")
-    assert "Nothing to score against: there is no truth here." in text and "|" not in text

@@ -18,7 +18,6 @@ from mudg.core import feature_distances
 from mudg.editing.settings import ScoreConfig
 from mudg.networks import inception
 from mudg.scene.read import read_scene
-from mudg.scoring import score
 from mudg.scoring import sets as distributions
 from mudg.scoring import tables as score_tables
 from mudg.scoring.sets import FeatureFiles, ImageSet, TrajectorySets
@@ -166,16 +165,6 @@ def test_without_weights_one_line_names_the_flags(tmp_path: Path) -> None:
     shown = page._score_values(document)
     assert "FID (Inception weights: mudg score --fid-weights FILE)" in shown["not_computed"]
     assert "Perceptual" not in [group["title"] for group in shown["score_groups"]]  # no table without a number
-
-
-def test_the_page_and_the_terminal_show_the_floor_below_the_methods(tmp_path: Path, quick: Path) -> None:
-    out, document = scored(tmp_path, quick)
-    group = next(g for g in page._score_values(document)["score_groups"] if g["title"] == "Distribution")
-    assert [row["title"] for row in group["rows"]] == ["a", "b", score_tables.FLOOR]
-    assert all(len(row["cells"]) == 4 for row in group["rows"])  # two distances, FID and KID
-    text = score.summary_table(out)
-    assert "FID" in text
-    assert score_tables.FLOOR in text
 
 
 def test_weights_are_checked_before_the_work(tmp_path: Path) -> None:

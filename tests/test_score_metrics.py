@@ -82,15 +82,6 @@ def test_equal_pictures_are_0_apart_only_masked_in_pixels_count_and_odd_sizes_wo
     assert distance(spoilt, truth, mask) < 1e-6 < distance(spoilt, truth)
 
 
-@pytest.mark.parametrize(
-    ("change", "strengths"), [(blurred, (0.5, 1.0, 2.0, 4.0)), (noisy, (0.01, 0.03, 0.1)), (jpeg, (90, 50, 20, 5))]
-)
-def test_stronger_degradation_is_farther(pictures, distance, change, strengths):
-    apart = [distance(change(pictures[0], s), pictures[0]) for s in strengths]
-    assert apart == sorted(apart)
-    assert apart[-1] > 4 * apart[0] > 0
-
-
 def test_degradations_are_ordered_as_people_see_them_where_psnr_is_not(pictures, distance):
     truth = pictures[0]
     darker, moved = truth * 0.9, torch.roll(truth, 1, 2)
@@ -121,19 +112,6 @@ def test_lpips_distance_by_hand():
     assert lpips([a], [b], weight=second) == pytest.approx(1.0, abs=1e-6)  # of two places
     assert np.isnan(lpips([a], [b], weight=second & ~second, over_weight=True))
     refused("shape", lpips, [a], [b[..., :1]])
-
-
-@pytest.mark.parametrize("size", [1.0, 1e-3, 1e-9, 1e-12])
-def test_features_are_normalised_as_published(size):
-    """The published formula in float64, also where 1e-10 is not small beside the features."""
-    x, y = (
-        size * torch.randn(5, 3, 4, generator=torch.Generator().manual_seed(n), dtype=torch.float64) for n in (0, 1)
-    )
-    x[:, 1, 1] = 0
-    units = [v / ((v**2).sum(0, keepdim=True).sqrt() + 1e-10) for v in (x, y)]
-    expected = float(((units[0] - units[1]) ** 2).sum(0).mean())
-    assert lpips([x], [y]) == pytest.approx(expected, rel=1e-12)
-    assert lpips([x.float()], [y.float()]) == pytest.approx(expected, rel=1e-5)
 
 
 def test_places_without_features_pass_a_finite_gradient():

@@ -23,7 +23,7 @@ from tiny_networks import mask2former, segformer
 from mudg.base.errors import ResourceError
 from mudg.base.palette import CLASSES, ID, UNLABELLED
 from mudg.labels import segmenters
-from mudg.labels.segmenters import KINDS, Segmenter, match_classes, tile_starts
+from mudg.labels.segmenters import KINDS, Segmenter, match_classes
 from mudg.networks import folders
 
 NAMES = {"0": "Road", "1": "traffic light", "2": "sky", "3": "unicorn"}
@@ -151,16 +151,6 @@ def test_a_network_without_its_head_is_refused(tmp_path: Path) -> None:
     settings = json.loads((tmp_path / "config.json").read_text())
     (tmp_path / "config.json").write_text(json.dumps({**settings, "id2label": NAMES}))
     refused("decode_head", Segmenter.load, tmp_path)
-
-
-def test_tiles_cover_everything_and_overlap() -> None:
-    for length, tile in ((50, 64), (64, 64), (65, 64), (300, 64), (1920, 1024)):
-        starts = tile_starts(length, tile)
-        covered = np.zeros(length, bool)
-        for start in starts:
-            covered[start : start + tile] = True
-        assert covered.all() and starts[-1] == max(0, length - tile)
-        assert all(b - a <= 0.75 * tile + 1 for a, b in zip(starts[:-1], starts[1:]))
 
 
 def test_what_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,6 @@ from mudg.base import geometry
 from mudg.base.errors import InputError, MudgError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, View
-from mudg.base.weather_settings import FogSettings, WeatherSettings
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
 from mudg.gaussians.model import CERTAINTY, SceneModel
@@ -302,18 +301,6 @@ def test_beams_measure_the_wall_while_the_vehicle_drives() -> None:
     assert not behind[reply.beam].any() and (reply.classes[central] == ID["car"]).mean() > 0.99
     straight = np.abs(away[:, 0]) > 0.98
     assert reply.intensity[straight].mean() == pytest.approx(0.49, abs=0.02)  # squarely met
-
-
-def test_fog_takes_far_returns_and_adds_near_ones() -> None:
-    beams = BeamTable.spinning(np.linspace(-20, 20, 16), 1.0, (0.5, 30.0))
-    at = Instant(0.0, geometry.yaw_matrix(0.0, (0.0, 0.0, 0.0)))
-    weather = WeatherSettings(fog=FogSettings(visibility_m=15))
-    request = LidarRequest(beams=beams, start=at, weather=weather, seed=4)
-    session = Session(wall())
-    clear, foggy = sweep(session, replace(request, weather=None)), sweep(session, request)
-    assert np.median(foggy.range_m) < np.median(clear.range_m)
-    again = sweep(session, request)
-    assert foggy.xyz.tobytes() == again.xyz.tobytes() and foggy.beam.tobytes() == again.beam.tobytes()
 
 
 def test_a_car_that_the_caller_places_is_met_by_beams() -> None:

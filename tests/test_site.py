@@ -60,6 +60,7 @@ FOLDER = TESTS.parent / "docs" / "notebooks"
 SMALL = {"FRAMES": 4, "WIDTH": 96, "HEIGHT": 64, "STEPS": 20, "LESSONS": 2}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [path.name for path in sorted(FOLDER.iterdir())])
 def test_a_notebook_runs(name: str, tmp_path: Path) -> None:
     """As one program in an empty folder. Its links lead to pages, and no output is stored in it."""

@@ -294,19 +294,3 @@ def test_rotated_harmonics_look_from_rotated_directions_as_the_old_ones_did(degr
     made = harmonics.rotated(sh.astype(np.float32), rotation)
     seen = np.einsum("dk,nkc->dnc", harmonics.basis(d @ rotation.T, degree), made)
     assert np.abs(seen - np.einsum("dk,nkc->dnc", harmonics.basis(d, degree), sh)).max() < 1e-5
-
-
-@pytest.mark.parametrize("band", [1, 2, 3])
-def test_rotations_of_a_band_are_orthogonal_and_compose(band: int) -> None:
-    first, second = turn(7), turn(8)
-    one, two, both = (harmonics.band_rotation(r, band) for r in (first, second, second @ first))
-    assert np.abs(one @ one.T - np.eye(2 * band + 1)).max() < 1e-12
-    assert np.abs(two @ one - both).max() < 1e-12
-
-
-@pytest.mark.parametrize("band", [1, 2, 3])
-def test_a_turn_about_z_mixes_opposite_orders_by_its_multiples(band: int) -> None:
-    turn_z = matrix_from_quaternion([np.cos(0.35), 0, 0, np.sin(0.35)])
-    order = np.arange(-band, band + 1)
-    wanted = np.diag(np.cos(order * 0.7)) + np.fliplr(np.diag(-np.sin(order * 0.7)))
-    assert np.abs(harmonics.band_rotation(turn_z, band) - wanted).max() < 1e-12

@@ -260,10 +260,8 @@ HIDDEN = {"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": False}}}
     ("name", "content", "said"),
     [
         ("a.ply", ply(rows(opacity=[0.9, 0.2, 0.7])), "logits are due"),
-        ("a.ply", ply(rows(opacity=1.0)), "logits are due"),
         ("a.ply", ply(rows(**{name: value for name, value in LINEAR.items() if name != "opacity"})), "logarithms are"),
         ("a.ply", ply(rows(opacity=[255.0, 40.0, 128.0])), "from 0 to 255"),
-        ("a.ply", ply(rows(f_dc_0=200.0, f_dc_1=120.0, f_dc_2=90.0)), "from 0 to 255"),
         ("a.ply", ply(rows(trbf_center=0.5, motion_0=0.1)), "motion over time are not read: 'trbf_center', 'motion_0'"),
         ("a.ply", ply(after=("element color_space 1\nproperty uchar color_space", b"\1")), "'color_space' is not read"),
         ("a.ply", ply(FOURTH), "beyond degree 3"),
@@ -281,7 +279,6 @@ HIDDEN = {"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": False}}}
         ("far.glb", glb(rows(x=300_000.0)), "steps of 31.2 mm"),
         ("a.glb", glb(kind={"colorSpace": None}), "names no colorSpace"),
         ("a.glb", glb(kind={"sortingMethod": "zDepth"}), "zDepth"),
-        ("a.glb", glb(kind={"projection": "orthographic"}), "orthographic"),
         ("a.glb", glb(document={"animations": [{"channels": [], "samplers": []}]}), "animations"),
         ("a.glb", glb(node={"extensions": {"EXT_mesh_gpu_instancing": {}}}), "instances"),
         ("a.glb", glb(turn_length=3.0), "length 1"),
@@ -302,9 +299,7 @@ def test_what_a_file_means_besides_is_said(
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        *(("a.ply", ply(rows(filter_3D=[0.1, value, 0.1])), "filter_3D") for value in (math.nan, math.inf)),
         ("a.ply", ply(rows(**LINEAR)), r"plain values[\s\S]*log\(scale\)"),
-        ("a.ply", ply(rows(**LINEAR | {"scale_2": None})), "plain values"),
         *(
             ("a.ply", ply(rows(**{column: 1}), kinds={column: "uchar"}), rf"whole numbers[\s\S]*{column}")
             for column in ("opacity", "scale_1", "f_dc_0", "rot_2")
@@ -316,7 +311,6 @@ def test_what_a_file_means_besides_is_said(
             ply(rows(**{f"rot_{n}": [1.0 - n, 0.0, 1.0] for n in range(4)})),
             r"no quaternion[\s\S]*Gaussian 1[\s\S]*1 of 3[\s\S]*take them out",
         ),
-        ("a.ply", ply(rows(scale_1=[0.0, 0.0, math.nan])), r"Gaussian 2[\s\S]*1 of 3[\s\S]*take them out"),
         ("a.ply", ply(rows(x=[math.inf, 0.0, 0.0])), r"Gaussian 0[\s\S]*take them out"),
         # lists
         ("a.ply", ply(before=("element face 9\nproperty list uchar int vertex_indices", b"\xff" * 3)), "lists last"),
@@ -341,7 +335,6 @@ def test_what_a_file_means_besides_is_said(
         ("a.glb", glb(rows(opacity=-9.0), plain=False, document=by("splat-transform 3.7.0")), "logits"),
         ("a.glb", glb(rows(opacity=0.5), plain=False), r"size[\s\S]*negative[\s\S]*exp\(scale\)"),
         ("a.glb", glb(kind={"colorSpace": "ACEScg"}), r"colour space[\s\S]*srgb_rec709_display[\s\S]*ACEScg"),
-        ("a.glb", glb(kind={"colorSpace": 3}), "colour space"),
         ("a.glb", glb(kind={"kernel": "gabor"}), "ellipsoids"),
         (
             "a.glb",
@@ -353,15 +346,12 @@ def test_what_a_file_means_besides_is_said(
             glb(document={"extensionsRequired": ["KHR_gaussian_splatting", "KHR_draco_mesh_compression"]}),
             "KHR_draco",
         ),
-        ("a.glb", glb(document={"extensionsRequired": "all"}), "no list"),
         ("a.glb", glb(view={"extensions": {"EXT_meshopt_compression": {}}}), "EXT_meshopt_compression"),
         ("a.glb", glb(view={"buffer": 1}), "outside the file"),
         ("a.glb", glb(document={"buffers": [{"byteLength": 9, "uri": "a.bin"}]}), "outside the file"),
         # other files
         ("a.ksplat", b"\0\1" * 99, r"what to do: [\s\S]*splat-transform"),
         ("a.gltf", b'{"asset": {}}', r"what to do: [\s\S]*glb"),
-        ("meta.json", b'{"version": 2}', r"what to do: [\s\S]*\.sog"),
-        ("a.usdz", b"PK\3\4" + bytes(99), r"what to do: [\s\S]*ply, spz or glb"),
         ("a.usda", b"#usda 1.0", r"what to do: [\s\S]*ply, spz or glb"),
         ("a.ckpt", b"\x80\2" * 9, r"what to do: [\s\S]*PLY"),
         ("a.obj", b"hello", r"\.glb, \.ply, \.sog, \.splat, \.spz"),

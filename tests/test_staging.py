@@ -70,18 +70,6 @@ def test_two_steps_from_store_to_store(command: Callable[..., Any], scratch: Pat
     assert json.loads(record)["key"] == json.loads((tmp_path / "here/run.json").read_text())["key"]
 
 
-def test_a_finished_result_is_reused_and_another_refused(command: Callable[..., Any], scene: Path) -> None:
-    at("memory://bucket/city").push(scene)
-    words = ("fuse", "memory://bucket/city", "--out", "memory://bucket/fused")
-    assert command(*words)[0] == 0
-    before = at("memory://bucket/fused/run.json").load()
-    assert command(*words)[0] == 0 and at("memory://bucket/fused/run.json").load() == before
-    code, _, said = command(*words, "--voxel-m", "0.3")
-    assert code == 2 and "another configuration" in said and at("memory://bucket/fused/run.json").load() == before
-    code, _, said = command(*words, "--voxel-m", "0.3", "--overwrite")
-    assert code == 0 and at("memory://bucket/fused/run.json").load() != before
-
-
 @pytest.mark.parametrize("fails", ["put_file", "pipe_file", "get_file"])
 def test_stopped_in_a_transfer_the_same_command_goes_on(
     fails: str, command: Callable[..., Any], scratch: Path, scene: Path, monkeypatch: pytest.MonkeyPatch

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,9 +12,8 @@ import pytest
 import torch
 from refusals import refused
 from test_annotate import STREET, given_at, overlap
-from toy_scene import ToyStreet
 
-from mudg.base import checkpoint, geometry
+from mudg.base import geometry
 from mudg.base.errors import IntegrityError, ResourceError
 from mudg.base.palette import CLASSES, ID
 from mudg.core.depth import ray_elevation
@@ -25,10 +23,9 @@ from mudg.labels import street_net
 from mudg.labels.annotate import LABELLERS
 from mudg.labels.evidence import BOX_GROUPS, PLANE_COUNT, PLANES, Evidence, encode, gather
 from mudg.labels.inputs import TRAIN_ID_OF
-from mudg.labels.street_net import StreetNet, StreetNetConfig, at_size, reduced, settled, settled_by_color
+from mudg.labels.street_net import StreetNet, StreetNetConfig, at_size, reduced, settled
 from mudg.networks.folders import CPU
 
-TOOLS = Path(__file__).resolve().parent.parent / "tools"
 TINY = StreetNetConfig(widths=(8, 8, 8, 8, 8), blocks=(1, 1, 1, 1, 1))
 
 
@@ -155,14 +152,6 @@ def test_no_people_beside_or_behind_what_fills_their_box() -> None:
     assert (far[ID["person"]] > 0.04).all()
 
 
-def test_joined_ground_is_hardly_sidewalk() -> None:
-    beside = np.full((4, 6), 8, np.float32)
-    joined = np.zeros((4, 6), bool)
-    joined[:, 3:] = True
-    found = settled(even(), made_up(beside_m=beside, direct=joined))[ID["sidewalk"]]
-    assert (found[:, 3:] < 0.002).all() and (found[:, :3] > 0.05).all()
-
-
 def test_outside_boxes_there_is_hardly_anything_that_boxes_are_drawn_around() -> None:
     box = np.zeros((4, 6), np.uint8)
     box[:, :2] = 1
@@ -172,19 +161,6 @@ def test_outside_boxes_there_is_hardly_anything_that_boxes_are_drawn_around() ->
     for name in ("car", "person", "bus"):
         assert (found[ID[name], :, 2:] < 0.2 * free[ID[name], :, 2:]).all()
     assert (found[ID["pole"], :, 2:] > free[ID["pole"], :, 2:]).all()
-
-
-def test_a_dark_place_is_hardly_sky_unless_all_is_dark() -> None:
-    given, truth = given_at(STREET)
-    evidence = gather(given)
-    evenly = np.full((len(CLASSES), *truth.shape), 1 / len(CLASSES), np.float32)
-    found = settled_by_color(evenly, given.rgb, evidence)[ID["sky"]]
-    assert (found[truth == ID["building"]] < 0.01).mean() > 0.9 and (found[truth == ID["sky"]] > 0.05).mean() > 0.9
-    road = (truth == ID["road"]) & evidence.direct
-    grey = settled_by_color(evenly, given.rgb, evidence)
-    assert (grey[ID["terrain"], road] < 0.2 * grey[ID["road"], road]).mean() > 0.9
-    night = settled_by_color(evenly, given.rgb // 16, evidence)
-    assert night[ID["sky"]] == pytest.approx(1 / len(CLASSES))
 
 
 def test_a_picture_is_looked_at_with_the_focal_length_of_training() -> None:
@@ -269,65 +245,3 @@ def test_damaged_folders_end_in_words(tmp_path: Path) -> None:
 
 
 # --- training -------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def tools(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(TOOLS))
-
-
-def options_of(work: Path, run: str, **given: object) -> Namespace:
-    plain = {"seed": 3, "cities": 1, "first_cities": 1, "all_cities_at": 1, "run": run, "start": "", "steps": 2}
-    plain |= {"batch": 1, "lr": 1e-3, "balance": 0.25, "checkpoint_every": 1, "workers": 0}
-    return Namespace(work=work, **plain | given)
-
-
-@pytest.mark.usefixtures("tools")
-def test_training_that_was_stopped_ends_as_one_that_was_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import segmenter_data
-    import train_segmenter
-
-    monkeypatch.setattr(train_segmenter, "StreetNetConfig", lambda: TINY)
-    for number in range(segmenter_data.VIEWS):
-        given, truth = given_at(ToyStreet(car_start=(11.0 + number, 1.0)))
-        made = segmenter_data.Sample(given.rgb, gather(given), truth.astype(np.uint8))
-        segmenter_data.save(train_segmenter.image_file(tmp_path, 0, number), made)
-    train_segmenter.train(options_of(tmp_path, "whole"))
-    with pytest.MonkeyPatch.context() as patch:
-
-        def stopped(options: Namespace, step: int) -> object:
-            if step == 1:
-                raise KeyboardInterrupt
-            return draw(options, step)
-
-        draw = train_segmenter.draw
-        patch.setattr(train_segmenter, "draw", stopped)
-        with pytest.raises(KeyboardInterrupt):
-            train_segmenter.train(options_of(tmp_path, "parts"))
-    train_segmenter.train(options_of(tmp_path, "parts"))
-    one, two = (checkpoint.latest(tmp_path / run) for run in ("whole", "parts"))
-    assert one is not None and two is not None and one.step == two.step == 2
-    for group in ("net", "average", "moments"):
-        a, b = one.tensors(group), two.tensors(group)
-        assert all(torch.equal(a[name], b[name]) for name in a) and set(a) == set(b)
-    assert not torch.equal(one.tensors("net")["head.bias"], one.tensors("average")["head.bias"])
-
-
-@pytest.mark.usefixtures("tools")
-def test_variations_are_drawn_anew_and_keep_classes_on_their_pixels() -> None:
-    import segmenter_vary
-    from segmenter_data import Sample
-
-    given, truth = given_at(STREET)
-    sample = Sample(given.rgb, gather(given), truth.astype(np.uint8))
-    rules = segmenter_vary.Rules(no_returns=0.0, no_ground=0.0, no_boxes=0.0)
-    for seed in range(4):
-        rgb, planes, classes = segmenter_vary.varied(sample, np.random.default_rng(seed), rules)
-        assert rgb.shape == (3, *segmenter_vary.CROP) and rgb.dtype == planes.dtype == np.float32
-        assert np.isfinite(rgb).all() and np.isfinite(planes).all()
-        elevation = planes[PLANES.index("elevation")]
-        assert (elevation[classes == ID["sky"]] > 0).all() and (elevation[classes == ID["road"]] < 0).all()
-        again = segmenter_vary.varied(sample, np.random.default_rng(seed), rules)
-        assert all((a == b).all() for a, b in zip((rgb, planes, classes), again, strict=True))
-    bare = segmenter_vary.disturbed(sample.evidence, np.random.default_rng(0), segmenter_vary.Rules(no_returns=1.0))
-    assert np.isnan(bare.depth_m).all() and not encode(bare)[PLANES.index("measured at all")].any()

@@ -129,16 +129,6 @@ def test_poses_while_a_rolling_shutter_reads():
     refused("ego pose", trajectory.readout_poses, scene.ego, View(view.camera, view.world_from_cam, 9.0))
 
 
-def test_a_rolling_shutter_turns_with_the_vehicle():
-    """In a left turn the heading changes at a constant rate: half of a step's turn within half of its time."""
-    scene = circle(5)
-    view = trajectory.recorded(scene, "front").views[2]
-    rolling = View(dataclasses.replace(view.camera, readout_s=0.1), view.world_from_cam, view.time_s)
-    first, last = trajectory.readout_poses(scene.ego, rolling)
-    turn = last[:3, :3] @ first[:3, :3].T
-    assert math.degrees(math.atan2(turn[1, 0], turn[0, 0])) == pytest.approx(math.degrees(1.2 / 4), abs=1e-9)
-
-
 def test_a_lane_change_and_a_faster_drive_follow_the_axes_of_the_first_frame():
     """On a circle that begins along x: left is y and ahead is x at the first frame, whatever the heading later."""
     scene = circle()

@@ -16,8 +16,6 @@ from mudg.base.types import (
     Clip,
     Condition,
     EgoPath,
-    Frame,
-    FusedCloud,
     Gaussians,
     Observation,
     PointCloud,
@@ -93,20 +91,6 @@ def test_scene_look_ups_name_what_there_is() -> None:
     refused("track", scene.track, "7")
     with pytest.raises(TypeError):
         scene.cameras["rear"] = CAMERA
-
-
-def test_values_are_shown_in_one_short_line() -> None:
-    ego = EgoPath(np.arange(2000.0) / 10, np.tile(np.eye(4), (2000, 1, 1)))
-    frames = tuple(Frame(f"front/{n}", View(CAMERA, np.eye(4), n / 10), Ref(f"{n}.png")) for n in range(500))
-    scene = Scene("log", "/nowhere", {"front": CAMERA}, frames, (), (), ego, {}, Source("x", "y"))
-    assert repr(scene) == "Scene('log', 500 frames, 1 cameras, 0 objects, 199.9 s)"
-    assert repr(ego) == "EgoPath(times_s=float64[2000], world_from_ego=float64[2000, 4, 4])"
-    assert repr(VIEW) == "View(camera='front', world_from_cam=float64[4, 4], time_s=0.0)"
-    planes = (torch.zeros(3, 6, 8), torch.zeros(1, 6, 8), None, torch.ones(1, 6, 8), torch.ones(1, 6, 8))
-    observed = Observation(VIEW, *planes, "virtual", "x")
-    assert "rgb=float32[3, 6, 8], depth=float32[1, 6, 8], confidence=float32[1, 6, 8]" in repr(observed)
-    cloud = PointCloud(np.zeros((900, 3), np.float32), np.zeros((900, 3), np.uint8), "object")
-    assert repr(FusedCloud(cloud, {"a": cloud})).startswith("FusedCloud(static=PointCloud(xyz=float32[900, 3], rgb=")
 
 
 def test_palette_round_trip_and_margin() -> None:

@@ -25,10 +25,9 @@ from waymo_logs import COLUMNS, ingest, write
 
 from mudg.base import geometry
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.base.geometry import from_rotation_translation, invert, matrix_from_quaternion, transform_points, yaw_matrix
+from mudg.base.geometry import invert, transform_points, yaw_matrix
 from mudg.base.types import Scene, Track
 from mudg.city import sensors as rig
-from mudg.formats.importers import RECOGNISERS
 from mudg.formats.importers.waymo import importer as sensors
 from mudg.formats.importers.waymo import logs as tfrecord
 from mudg.formats.importers.waymo import records
@@ -257,12 +256,6 @@ def test_the_real_table_of_poses(shared_data: Callable[[str], Path]) -> None:
     assert np.allclose(table.value(3, column), found[column][3])
 
 
-def random_pose(generator: np.random.Generator, reach_m: float = 3.0) -> np.ndarray:
-    return from_rotation_translation(
-        matrix_from_quaternion(generator.normal(size=4)), generator.uniform(-reach_m, reach_m, 3)
-    )
-
-
 # --- parts against slow twins ---------------------------------------------------------------------
 
 
@@ -326,39 +319,6 @@ def test_no_bytes_raise_anything_but_an_input_error(data: bytes) -> None:
             records.parse_message(data, message, "x")
         except InputError:
             continue
-
-
-@pytest.mark.parametrize("uneven", [True, False])
-@pytest.mark.parametrize("posed", [True, False])
-def test_points_equal_the_conversion_pixel_by_pixel(uneven: bool, posed: bool) -> None:
-    generator = np.random.default_rng(4)
-    rows, columns = 5, 12
-    beams = np.sort(generator.uniform(-0.4, 0.1, rows)) if uneven else ()
-    laser = LaserCalibration("top", tuple(beams), -0.4, 0.1, random_pose(generator))
-    image = generator.uniform(-2, 60, (rows, columns, 4)).astype(np.float32)
-    poses = generator.uniform(-1, 1, (rows, columns, 6)).astype(np.float32) if posed else None
-    frame_pose = random_pose(generator)
-    points = sensors.points_of_scan(LaserScan([image], poses), laser, frame_pose, "x")
-    expected = []
-    heading = np.arctan2(laser.vehicle_from_lidar[1, 0], laser.vehicle_from_lidar[0, 0])
-    for row in range(rows):
-        for column in range(columns):
-            reach = float(image[row, column, 0])
-            if reach <= 0:
-                continue
-            pitch = beams[rows - 1 - row] if uneven else -0.4 + (rows - 1 - row + 0.5) / rows * 0.5
-            azimuth = np.pi * (1 - 2 * (column + 0.5) / columns) - heading
-            local = reach * np.array([np.cos(azimuth) * np.cos(pitch), np.sin(azimuth) * np.cos(pitch), np.sin(pitch)])
-            vehicle = laser.vehicle_from_lidar @ np.r_[local, 1]
-            if poses is not None:
-                roll, tilt, yaw, *place = (float(v) for v in poses[row, column])
-                about_x = np.array([[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]])
-                about_y = np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
-                rotation = yaw_matrix(yaw)[:3, :3] @ about_y @ about_x
-                vehicle = invert(frame_pose) @ from_rotation_translation(rotation, place) @ vehicle
-            expected.append((invert(laser.vehicle_from_lidar) @ vehicle)[:3])
-    assert np.abs(points.xyz - np.array(expected)).max() < 1e-9
-    assert points.without_pose == 0
 
 
 def test_points_without_a_pose_are_left_out_and_counted() -> None:
@@ -489,17 +449,6 @@ def test_frames_out_of_order_are_refused_in_one_file_and_sorted_in_tables(drive:
 
 
 @pytest.mark.parametrize("form", ["v1", "v2"])
-def test_incomplete_frames_are_left_out_when_asked(form: str, drive: made.Log, tmp_path: Path) -> None:
-    lacks_an_image(drive)
-    drive.frames[4]["lasers"] = []
-    scene = ingest(write(drive, form, tmp_path / "log"), tmp_path / "scene", skip_missing=True)
-    assert len(scene.sweeps) == 3
-    assert any("frames 2, 4 lack" in note for note in scene.source.notes)
-    only = ingest(write(drive, form, tmp_path / "log"), tmp_path / "other", cameras=("front",), frames=(0, 4))
-    assert len(only.frames) == 4  # the missing image is of a camera that was not asked for
-
-
-@pytest.mark.parametrize("form", ["v1", "v2"])
 def test_empty_scans_unknown_sensors_and_classes_are_taken_as_they_are(
     form: str, drive: made.Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -594,20 +543,3 @@ def test_tables_that_are_missing_or_damaged(drive: made.Log, tmp_path: Path, mon
     assert refused("empty value", ParquetTable(tmp_path / "holes.parquet").columns, ("a",)).where.endswith("row 1")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     assert "mudg[data]" in refused("pyarrow", ParquetTable, pose, raises=ResourceError).remedy
-
-
-def test_one_log_of_a_folder_is_chosen_by_name(drive: made.Log, tmp_path: Path) -> None:
-    folder = tmp_path / "logs"
-    names = [f"segment-{n}_with_camera_labels" for n in ("111_2", "222_3")]
-    for name in names:
-        made.write_tfrecord(drive, folder / f"{name}.tfrecord")
-    caught = refused("several logs", ingest, folder, tmp_path / "scene", raises=UsageError)
-    assert all(name in caught.expected for name in names)
-    refused("there is no such log", ingest, folder, tmp_path / "scene", sequence="333", raises=UsageError)
-    assert len(ingest(folder, tmp_path / "scene", sequence="222", frames=(0, 1)).frames) == 2
-    assert RECOGNISERS["waymo"](folder)
-    assert RECOGNISERS["waymo"](folder / f"{names[0]}.tfrecord")
-    assert not RECOGNISERS["waymo"](tmp_path)
-    for options in ({"poses": tmp_path}, {"boxes": tmp_path}, {"untwist": "no"}):
-        refused(".", ingest, folder, tmp_path / "other", raises=UsageError, **options)
-    refused("no Waymo log found", ingest, tmp_path / "scene", tmp_path / "other")

@@ -14,7 +14,6 @@ import pytest
 MAX_FILE_LINES = 940
 MAX_FUNCTION_LINES = 100  # without the docstring
 MAX_PARAMETERS = 10  # without self and cls
-MAX_FILES_IN_STAGES = 16
 
 # The rooms from the top down; an import may only reach a lower one, or its own.
 ROOMS = (
@@ -423,13 +422,6 @@ def test_files_and_functions_stay_short(package_dir: Path) -> None:
                 if length > MAX_FUNCTION_LINES:
                     problems.append(f"{name}:{node.lineno}: {node.name} has {length} lines")
     refuse(problems)
-
-
-def test_stages_hold_verbs_only(package_dir: Path) -> None:
-    """Parts of a verb lie in a folder below; a flat folder of fifty files is not read."""
-    flat = sorted(path.name for path in (package_dir / "stages").glob("*.py"))
-    if len(flat) > MAX_FILES_IN_STAGES:
-        refuse([f"stages holds {len(flat)} files: {', '.join(flat)}"])
 
 
 def test_functions_take_few_parameters(package_dir: Path) -> None:
