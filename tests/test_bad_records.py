@@ -28,7 +28,7 @@ from pandas_pickles import frame_bytes, write_frame
 from roundtrip import needs_native
 
 from mudg.formats.importers.common import ImportOptions
-from mudg.formats.importers.pandaset import MAX_BYTES, gunzip, parse_frame, read_frame
+from mudg.formats.importers.pandaset import gunzip, parse_frame, read_frame
 
 pytestmark = needs_native
 
@@ -107,7 +107,7 @@ def brighter(columns: int) -> Change:
 
 
 def brighter_frame(content: bytes) -> bytes:
-    columns = parse_frame(gunzip(content, MAX_BYTES, "i"), "i")
+    columns = parse_frame(gunzip(content, "i"), "i")
     return gzip.compress(frame_bytes({**columns, "i": columns["i"] * 300}))
 
 

@@ -52,6 +52,9 @@ def ply(order: str) -> bytes:
     properties = "".join(f"property {kind}\n" for kind in ("float x", "float y", "float z", "ushort level"))
     header = f"ply\nformat {order} 1.0\ncomment made by hand\nelement vertex 3\n{properties}"
     header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    if order == "ascii":
+        rows = "".join(f"{x} {y} {z} {v}\n" for (x, y, z), v in zip(XYZ.tolist(), LEVEL.tolist(), strict=True))
+        return (header + rows + "3 0 1 2\n").encode()
     mark = "<" if "little" in order else ">"
     layout = np.dtype([("xyz", f"{mark}f4", 3), ("level", f"{mark}u2")])
     rows = np.array([(tuple(p), v) for p, v in zip(XYZ, LEVEL, strict=True)], layout).tobytes()
@@ -68,6 +71,7 @@ GOOD = {
     "a.pcd": pcd("ascii"),
     "b.pcd": pcd("binary"),
     "c.pcd": pcd("binary_compressed"),
+    "a.ply": ply("ascii"),
     "b.ply": ply("binary_little_endian"),
     "c.ply": ply("binary_big_endian"),
     "a.npz": npz(xyz=XYZ, level=LEVEL),
@@ -89,7 +93,7 @@ def test_every_cut_is_refused_and_never_something_else(name: str) -> None:
     reader = clouds.READERS[Path(name).suffix]
     whole = GOOD[name]
     # what may be lost unseen: faces behind the points, and in text the digits of the very last number
-    tail = {"b.ply": 13, "c.ply": 13, "a.pcd": len(b"255\n")}.get(name, 0)
+    tail = {"b.ply": 13, "c.ply": 13, "a.ply": len(b"255\n3 0 1 2\n"), "a.pcd": len(b"255\n")}.get(name, 0)
     for length in range(0, len(whole) - tail, 3):
         with pytest.raises(InputError):
             reader(whole[:length], "x")
@@ -120,7 +124,7 @@ def test_missing_returns_files_without_coordinates_and_other_kinds(tmp_path: Pat
     refused("format is not known", clouds.read_cloud, tmp_path / "a.las")
 
 
-PLY = b"ply\nformat binary_little_endian 1.0\n"
+ASCII = b"ply\nformat ascii 1.0\n"
 
 
 def npy_lie() -> bytes:
@@ -146,11 +150,11 @@ def npy_lie() -> bytes:
         (".pcd", pcd_header("zipped", 3) + bytes(99), "no known kind"),
         (".pcd", pcd_header("binary", 3, "a b", "1 1").replace(b"TYPE F F", b"TYPE Q F") + bytes(99), "unknown type"),
         (".pcd", b"not a cloud at all", "not a PCD file"),
-        (".ply", PLY + b"element vertex 999999999\nproperty float x\nend_header\n1 2\n", "ends within"),
-        (".ply", PLY + b"element vertex 9\nproperty list uchar int x\nend_header\n1 2\n", "has lists"),
-        (".ply", b"ply\nformat ascii 1.0\nelement vertex 9\nproperty float x\nend_header\n", "kind of PLY"),
-        (".npz", npy_lie(), "cannot be read"),
-        (".npz", npz(xyz=np.array([[1, 2, object()]], object)), "cannot be read"),
+        (".ply", ASCII + b"element vertex 999999999\nproperty float x\nend_header\n1 2\n", "count makes no sense"),
+        (".ply", ASCII + b"element vertex 9\nproperty list uchar int x\nend_header\n1 2\n", "no known type"),
+        (".ply", ASCII + b"element face 9\nelement vertex 9\nend_header\n", "do not come first"),
+        (".npz", npy_lie(), "declared size"),
+        (".npz", npz(xyz=np.array([[1, 2, object()]], object)), "plain numbers"),
         (".npz", npz(points=XYZ), "no coordinates"),
         (".npz", npz(xyz=XYZ, level=LEVEL[:2]), "does not fit"),
     ],
@@ -216,7 +220,7 @@ def test_every_header_field_of_a_pcd_may_be_wrong(key: str, value: str, kind: st
 
 @pytest.mark.parametrize("value", ["", " x", " -1", " 1e9", " 9" * 30, " \u0663"])
 def test_counts_of_a_ply_may_be_wrong(value: str) -> None:
-    content = PLY.decode() + f"element vertex{value}\nproperty float x\nend_header\n1\n"
+    content = f"ply\nformat ascii 1.0\nelement vertex{value}\nproperty float x\nend_header\n1\n"
     with pytest.raises(InputError):
         clouds.read_ply(content.encode(), "a.ply")
 

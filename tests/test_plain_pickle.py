@@ -208,6 +208,6 @@ def test_gzip_is_bounded_and_checked(tmp_path: Path, monkeypatch: pytest.MonkeyP
         assert "00.pkl.gz" in refused(words, pandas_frame.read_frame, path).where
     monkeypatch.setattr(pandas_frame, "MAX_BYTES", 1000)
     path.write_bytes(gzip.compress(bytes(10**6)))
-    refused("goes on", pandas_frame.read_frame, path)
+    refused("too much", pandas_frame.read_frame, path)
     monkeypatch.setattr(plain_pickle, "MAX_BYTES", 10)
     refused("too large", read, pickle.dumps(list(range(20))))

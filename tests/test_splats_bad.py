@@ -11,7 +11,6 @@ import zlib
 from collections.abc import Callable
 from typing import Any
 
-import foreign_splats
 import numpy as np
 import pytest
 import toy_splats
@@ -206,23 +205,32 @@ def rotation(document: dict[str, Any], **values: Any) -> None:
         ("sog", lambda meta: meta.update(count=70_000), "impossible size"),
         ("sog", lambda meta: meta.update(count=0), "count"),
         ("sog", lambda meta: meta.update(version=1), "version"),
+        ("sog", lambda meta: meta["means"].update(mins=[0, 0]), "mins"),
         ("sog", lambda meta: meta["means"].update(maxs=[0, 0, 1e9]), "bad.file"),
         ("sog", lambda meta: meta["scales"].update(codebook=[0.0] * 255), "codebook"),
         ("sog", lambda meta: meta["scales"].update(codebook=[1e9] * 256), "too far"),
         ("sog", lambda meta: meta["sh0"].update(files=["../../etc/passwd"]), "missing"),
         ("sog", lambda meta: meta["shN"].update(count=65536), "impossible size"),
+        ("sog", lambda meta: meta["shN"].update(bands=3), "impossible size"),
         ("sog", lambda meta: meta["quats"].update(files=["sh0.webp"]), "names no component"),
         ("glb", lambda d: d.update(meshes=3), "no list"),
         ("glb", lambda d: d["nodes"][0].update(mesh=7), "names nothing"),
+        ("glb", lambda d: d["nodes"][0].update(mesh=-1), "names nothing"),
         ("glb", lambda d: d["nodes"][0].update(children=[0]), "no tree"),
         ("glb", lambda d: d["nodes"][0].update(rotation=[0, 0, 0, 0]), "no quaternion"),
         ("glb", lambda d: d["nodes"][0].update(scale=[1, 2, 1]), "unevenly"),
+        ("glb", lambda d: d["nodes"][0].update(scale=[-1, 1, 1]), "unevenly"),
         ("glb", lambda d: d["nodes"][0].update(translation=["a", 0, 0]), "no list of 3"),
         ("glb", lambda d: d["nodes"][0].update(translation=[10**400, 0, 0]), "beyond what a number can be"),
+        ("glb", lambda d: d["scenes"][0].update(nodes=[0] * 100), "no tree"),
         ("glb", lambda d: rotation(d, count=10**9), "not possible"),
         ("glb", lambda d: rotation(d, count=4), "beyond|differ"),
+        ("glb", lambda d: rotation(d, count=2), "differ"),
         ("glb", lambda d: rotation(d, type="VEC3"), "wrong type"),
+        ("glb", lambda d: rotation(d, componentType=5125), "wrong type"),
+        ("glb", lambda d: rotation(d, byteOffset=-4), "no size"),
         ("glb", lambda d: rotation(d, byteOffset=10**9), "beyond"),
+        ("glb", lambda d: d["bufferViews"][0].update(byteOffset=10**9), "beyond"),
         ("glb", lambda d: d["bufferViews"][0].update(byteStride=4), "beyond"),
         ("glb", lambda d: primitive(d).pop("extensions"), "no Gaussians"),
         ("glb", lambda d: without(d, "SH_DEGREE_0_COEF_0"), "degree out"),
@@ -270,13 +278,13 @@ def broken_frames() -> dict[str, Callable[[Any, bytes], bytes]]:
 @pytest.mark.parametrize("kind", broken_frames())
 def test_broken_frames_of_zstandard_are_refused_in_words_and_little_memory(kind: str) -> None:
     package = pytest.importorskip("zstandard", reason="zstandard is not installed")
-    content = foreign_splats.spz(4)
+    content = spz.to_bytes(toy_splats.cloud(300), 4)
     streams, toc = content[15], int.from_bytes(content[16:20], "little")
     size = struct.unpack_from("<Q", content, toc)[0]
     begin = toc + 16 * streams
     plane = package.ZstdDecompressor().decompress(content[begin : begin + size])
     whole = package.ZstdCompressor().compress(plane)
-    assert len(spz.from_bytes(with_first_plane(content, whole), "x").cloud.means) == 3
+    assert len(spz.from_bytes(with_first_plane(content, whole), "x").cloud.means) == 300
     bad = with_first_plane(content, broken_frames()[kind](package, plane))
     with within(32 << 20), pytest.raises(InputError, match="bad.file"):
         read(bad, "spz")

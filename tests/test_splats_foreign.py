@@ -214,13 +214,70 @@ def test_other_elements_of_a_ply_are_passed_over(around: dict[str, Any], order: 
     assert np.array_equal(read(ply(order=order, **around), axes="world").means, PLACES)
 
 
-def test_fields_of_others_are_passed_over() -> None:
+def test_lists_before_the_gaussians_are_walked_over() -> None:
+    lines = "element face 3\nproperty uchar flag\nproperty list ushort double weights\nproperty list uchar uchar more"
+    body = b"\1" + struct.pack("<Hd", 1, 2.5) + b"\0" + b"\2" + struct.pack("<H", 0) + b"\3abc"
+    body += b"\3" + struct.pack("<H2d", 2, 1, 1) + b"\0"
+    assert np.array_equal(read(ply(before=(lines, body)), axes="world").means, PLACES)
+
+
+def test_fields_of_others_are_passed_over_and_listed_once(capsys: pytest.CaptureFixture[str]) -> None:
     cloud = read(sog(extras={"a": 1}, lod=3, **{"means.order": "morton", "sh0.gamma": 2}), "a.sog")
+    said = capsys.readouterr().err.replace("\n", " ")
+    assert "'extras', 'lod', 'means.order', 'sh0.gamma' in meta.json" in said and "warning" not in said
     assert np.allclose(sorted(np.abs(cloud.means).max(1)), [0, math.e - 1])
     assert read(compressed_ply(-1, 1, more="state"), "a.ply").opacity[0] == pytest.approx(200 / 255, abs=1e-6)
-    used = {"extensionsUsed": ["KHR_gaussian_splatting", "EXT_other"]}
-    assert len(read(glb(kind={"lod": 2, "extras": {}}, node={"foo": 1}, document=used), "a.glb")) == 3
-    assert len(read(ply(rows(foo=1.0, nx=0.0)))) == 3
+    read(
+        glb(kind={"lod": 2, "extras": {}}, document={"extensionsUsed": ["KHR_gaussian_splatting", "EXT_other"]}),
+        "a.glb",
+    )
+    assert "'EXT_other', 'KHR_gaussian_splatting.lod' in the document" in capsys.readouterr().err.replace("\n", " ")
+
+
+OFFICIAL = {
+    "a.ply": ply(rows(nx=0.0, ny=0.0, nz=0.0, red=1.0)),
+    "flat.ply": ply(rows(scale_2=None)),
+    "packed.ply": compressed_ply(-1, 1),
+    "a.sog": sog(asset={"generator": "x"}, model="default", antialias=False),
+    "a.glb": glb(node={"name": "n", "extras": {"a": 1}}, document={"extras": {}, "materials": [], "cameras": []}),
+}
+
+
+@pytest.mark.parametrize("name", OFFICIAL)
+def test_official_fields_that_are_not_read_are_not_worth_a_word(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    read(OFFICIAL[name], name)
+    assert "passed over" not in capsys.readouterr().err
+
+
+ODD = "\x1b]0;t\x07" + "n" * 5000
+MANY = {f"field{number}": 1.0 for number in range(100)}
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "line"),
+    [
+        ("a.ply", ply(rows(foo=1.0)), "passed over: 'foo' in element vertex, which"),
+        ("a.ply", ply(after=("element foo 1\nproperty float x", b"\0" * 4)), "passed over: 'foo' in the header, which"),
+        (
+            "a.ply",
+            ply(before=("element foo 1\nproperty float x", b"\0" * 4)),
+            "passed over: 'foo' in the header, which",
+        ),
+        ("a.ply", ply(rows(**MANY)), "'field7' and 92 more in element vertex, which"),
+        ("a.ply", ply(rows(**{"a\x1b[31m": 0.0})), r"passed over: 'a\x1b[31m' in element vertex, which"),
+        ("a.ply", compressed_ply(-1, 1, more="state"), "passed over: 'state' in element vertex, which"),
+        ("a.sog", sog(**{ODD: 1}), r"passed over: '\x1b]0;t\x07nnnnnn"),
+        ("a.sog", sog(**MANY), "'field7' and 92 more in meta.json, which"),
+        ("a.glb", glb(node={"foo": 1}), "passed over: 'nodes.foo' in the document, which"),
+        ("a.glb", glb(document={ODD: 1, "foo": 2}), r"passed over: '\x1b]0;t\x07nnnnnn"),
+    ],
+)
+def test_fields_of_others_are_named_shortly(
+    name: str, content: bytes, line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    read(content, name)
+    said = [one for one in capsys.readouterr().err.splitlines() if "passed over" in one]
+    assert [line in one and len(one) < 700 and one.isprintable() for one in said] == [True]
 
 
 def test_harmonics_beyond_degree_3_are_lost() -> None:
@@ -260,8 +317,10 @@ HIDDEN = {"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": False}}}
     ("name", "content", "said"),
     [
         ("a.ply", ply(rows(opacity=[0.9, 0.2, 0.7])), "logits are due"),
+        ("a.ply", ply(rows(opacity=1.0)), "logits are due"),
         ("a.ply", ply(rows(**{name: value for name, value in LINEAR.items() if name != "opacity"})), "logarithms are"),
         ("a.ply", ply(rows(opacity=[255.0, 40.0, 128.0])), "from 0 to 255"),
+        ("a.ply", ply(rows(f_dc_0=200.0, f_dc_1=120.0, f_dc_2=90.0)), "from 0 to 255"),
         ("a.ply", ply(rows(trbf_center=0.5, motion_0=0.1)), "motion over time are not read: 'trbf_center', 'motion_0'"),
         ("a.ply", ply(after=("element color_space 1\nproperty uchar color_space", b"\1")), "'color_space' is not read"),
         ("a.ply", ply(FOURTH), "beyond degree 3"),
@@ -279,6 +338,7 @@ HIDDEN = {"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": False}}}
         ("far.glb", glb(rows(x=300_000.0)), "steps of 31.2 mm"),
         ("a.glb", glb(kind={"colorSpace": None}), "names no colorSpace"),
         ("a.glb", glb(kind={"sortingMethod": "zDepth"}), "zDepth"),
+        ("a.glb", glb(kind={"projection": "orthographic"}), "orthographic"),
         ("a.glb", glb(document={"animations": [{"channels": [], "samplers": []}]}), "animations"),
         ("a.glb", glb(node={"extensions": {"EXT_mesh_gpu_instancing": {}}}), "instances"),
         ("a.glb", glb(turn_length=3.0), "length 1"),
@@ -299,7 +359,9 @@ def test_what_a_file_means_besides_is_said(
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
+        *(("a.ply", ply(rows(filter_3D=[0.1, value, 0.1])), "filter_3D") for value in (math.nan, math.inf)),
         ("a.ply", ply(rows(**LINEAR)), r"plain values[\s\S]*log\(scale\)"),
+        ("a.ply", ply(rows(**LINEAR | {"scale_2": None})), "plain values"),
         *(
             ("a.ply", ply(rows(**{column: 1}), kinds={column: "uchar"}), rf"whole numbers[\s\S]*{column}")
             for column in ("opacity", "scale_1", "f_dc_0", "rot_2")
@@ -311,9 +373,11 @@ def test_what_a_file_means_besides_is_said(
             ply(rows(**{f"rot_{n}": [1.0 - n, 0.0, 1.0] for n in range(4)})),
             r"no quaternion[\s\S]*Gaussian 1[\s\S]*1 of 3[\s\S]*take them out",
         ),
+        ("a.ply", ply(rows(scale_1=[0.0, 0.0, math.nan])), r"Gaussian 2[\s\S]*1 of 3[\s\S]*take them out"),
         ("a.ply", ply(rows(x=[math.inf, 0.0, 0.0])), r"Gaussian 0[\s\S]*take them out"),
         # lists
-        ("a.ply", ply(before=("element face 9\nproperty list uchar int vertex_indices", b"\xff" * 3)), "lists last"),
+        ("a.ply", ply(before=("element face 9000000\nproperty list uchar int vertex_indices", b"")), "too many lists"),
+        ("a.ply", ply(before=("element face 9\nproperty list uchar int vertex_indices", b"\xff" * 3)), "a.ply"),
         ("a.ply", ply(before=("element face 1\nproperty list float int vertex_indices", b"")), "not understood"),
         ("a.ply", ply(before=("element vertex 1\nproperty list uchar float features", b"\0")), "lists"),
         # columns of other names
@@ -335,6 +399,7 @@ def test_what_a_file_means_besides_is_said(
         ("a.glb", glb(rows(opacity=-9.0), plain=False, document=by("splat-transform 3.7.0")), "logits"),
         ("a.glb", glb(rows(opacity=0.5), plain=False), r"size[\s\S]*negative[\s\S]*exp\(scale\)"),
         ("a.glb", glb(kind={"colorSpace": "ACEScg"}), r"colour space[\s\S]*srgb_rec709_display[\s\S]*ACEScg"),
+        ("a.glb", glb(kind={"colorSpace": 3}), "colour space"),
         ("a.glb", glb(kind={"kernel": "gabor"}), "ellipsoids"),
         (
             "a.glb",
@@ -346,12 +411,15 @@ def test_what_a_file_means_besides_is_said(
             glb(document={"extensionsRequired": ["KHR_gaussian_splatting", "KHR_draco_mesh_compression"]}),
             "KHR_draco",
         ),
+        ("a.glb", glb(document={"extensionsRequired": "all"}), "no list"),
         ("a.glb", glb(view={"extensions": {"EXT_meshopt_compression": {}}}), "EXT_meshopt_compression"),
         ("a.glb", glb(view={"buffer": 1}), "outside the file"),
         ("a.glb", glb(document={"buffers": [{"byteLength": 9, "uri": "a.bin"}]}), "outside the file"),
         # other files
         ("a.ksplat", b"\0\1" * 99, r"what to do: [\s\S]*splat-transform"),
         ("a.gltf", b'{"asset": {}}', r"what to do: [\s\S]*glb"),
+        ("meta.json", b'{"version": 2}', r"what to do: [\s\S]*\.sog"),
+        ("a.usdz", b"PK\3\4" + bytes(99), r"what to do: [\s\S]*ply, spz or glb"),
         ("a.usda", b"#usda 1.0", r"what to do: [\s\S]*ply, spz or glb"),
         ("a.ckpt", b"\x80\2" * 9, r"what to do: [\s\S]*PLY"),
         ("a.obj", b"hello", r"\.glb, \.ply, \.sog, \.splat, \.spz"),

@@ -59,7 +59,7 @@ def test_round_trip(
     assert scene.ego.world_from_ego[0] == pytest.approx(np.eye(4), abs=1e-12)
     assert scene.frames[0].view.camera.readout_s == pytest.approx(made.READOUT_S, abs=1e-6)
     assert scene.frames[0].view.camera.shutter == "left_to_right"
-    assert any(form in note for note in scene.source.notes)
+    assert any(form in note and "Day, sunny, location_sf" in note for note in scene.source.notes)
     assert {scene.split[f"front/00000{n}"] for n in (0, 1, 2, 3)} == {"train"}
     assert scene.split["front_left/000004"] == "test"
     assert scene.frames[0].view.time_s == pytest.approx(0.05, abs=1e-6)  # the clock begins with the LiDAR's turn
@@ -328,6 +328,23 @@ def test_points_without_a_pose_are_left_out_and_counted() -> None:
     laser = LaserCalibration("top", (), -0.2, 0.1, np.eye(4))
     points = sensors.points_of_scan(LaserScan([image, image], poses), laser, np.eye(4), "x")
     assert (points.without_pose, len(points.xyz)) == (10, 22)
+
+
+@pytest.mark.parametrize("start, duration", [(0.0, 0.1), (-0.004, 0.098), (0.1, -0.1)])
+def test_the_turn_is_measured_from_pixel_poses(start: float, duration: float) -> None:
+    def place(time: np.ndarray) -> np.ndarray:
+        return np.stack([100 + 12 * time, 0.3 * time, np.full_like(time, 4.0)], -1)
+
+    poses = np.zeros((4, 100, 6), np.float32)
+    poses[..., 3:] = place(start + (np.arange(100) + 0.5) / 100 * duration)
+    poses[2:, 40:] = 0
+    times = np.arange(-0.1, 0.25, 0.0125)
+    found = sensors.measure_turn(poses, 5.0, times + 5.0, place(times))
+    assert found is not None
+    assert np.abs(np.array(found) - [start, duration]).max() < 1e-5
+    assert sensors.measure_turn(poses, 5.0, times + 5.0, place(times * 1e-3)) is None
+    nominal = sensors.TurnClock()
+    assert (sensors.median_clock([found]) == nominal) == (start == 0.0)
 
 
 def test_a_view_is_that_of_the_middle_of_the_exposure() -> None:

@@ -225,7 +225,7 @@ def context_message(log: Log) -> bytes:
     for laser in log.lasers:
         beams = doubles(2, laser["inclinations"]) + double(3, laser["min"]) + double(4, laser["max"])
         out += text(3, number(1, laser["number"]) + beams + transform(5, laser["extrinsic"]))
-    return out
+    return out + text(4, text(2, b"Day") + text(3, b"location_sf") + text(4, b"sunny"))
 
 
 def frame_message(log: Log, frame: dict[str, Any]) -> bytes:
@@ -338,4 +338,6 @@ def write_parquet(log: Log, root: Path) -> Path:
     boxes = ((key(f, laser_object_id=b["id"]), b) for f in log.frames for b in f["boxes"])
     boxes = ((keys, [*map(float, (*b["centre"], *b["size"], b["heading"])), b["type"]]) for keys, b in boxes)
     save("lidar_box", "LiDARBox", ((keys, named(names, *values)) for keys, values in boxes))
+    conditions = named("time_of_day location weather", "Day", "location_sf", "sunny")
+    save("stats", "Stats", [(key(log.frames[0]), conditions)])
     return root

@@ -109,8 +109,8 @@ SEEDS: dict[str, list[bytes]] = {
         b"DATA ascii\n1 2 3\n"
     ],
     "cloud-ply": [
-        b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
-        b"property float z\nend_header\n" + bytes(12)
+        b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+        b"end_header\n1 2 3\n"
     ],
     "calibration": [
         b"P0: 1 0 0 0 0 1 0 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0\n"

@@ -59,6 +59,13 @@ class ForeignRecord(StrictRecord):
 
     model_config = ConfigDict(extra="allow")
 
+    def unknown(self, prefix: str = "") -> list[str]:
+        """Names of the fields that were passed over, those of records within as ``record.field``."""
+        own = [prefix + name for name in self.model_extra or ()]
+        inner = {name: getattr(self, name) for name in type(self).model_fields}
+        records = {name: one for name, one in inner.items() if isinstance(one, ForeignRecord)}
+        return own + [field for name, one in records.items() for field in one.unknown(f"{prefix}{name}.")]
+
 
 @functools.cache
 def _field_names(record: type[BaseModel]) -> dict[str, None]:

@@ -41,7 +41,7 @@ def named_once() -> Iterator[None]:
     finally:
         _unknown = None
         for kind, names in found.items():
-            log.info(f"passed over: {listed(names)} in {kind}, which this program does not know")
+            log.info(sentence(names, kind))
 
 
 def note_unknown(kind: str, names: Collection[str], known: frozenset[str]) -> None:
@@ -77,3 +77,8 @@ def listed(names: Iterable[str]) -> str:
     every = [f"'{short(name, _MOST_LETTERS)}'" for name in names]
     more = f" and {len(every) - _MOST_NAMES} more" if len(every) > _MOST_NAMES else ""
     return ", ".join(every[:_MOST_NAMES]) + more
+
+
+def sentence(names: Iterable[str], kind: str) -> str:
+    """What a message says of unknown names in a kind of file."""
+    return f"passed over: {listed(names)} in {kind}, which this program does not know"

@@ -31,6 +31,7 @@ from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
 from mudg.formats.importers import common, drive_log
 from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
 from mudg.formats.importers.drive_log import BoxTracks, DriveLog, ImageRecord, SweepRecord
+from mudg.formats.unknown_fields import note_unknown
 
 Matrix = NDArray[np.float64]
 
@@ -48,6 +49,18 @@ _POSE_SLACK_S: Final = 0.02
 _MAX_OFFSET_NS: Final = 500_000_000
 _POSE: Final = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 _SIZE: Final = ("length_m", "width_m", "height_m")
+SWEEPS: Final = "sensors/lidar/*.feather"
+OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
+    "city_SE3_egovehicle.feather": frozenset({"timestamp_ns", *_POSE}),
+    "egovehicle_SE3_sensor.feather": frozenset({"sensor_name", *_POSE}),
+    "intrinsics.feather": frozenset("sensor_name fx_px fy_px cx_px cy_px k1 k2 k3 width_px height_px".split()),
+    "annotations.feather": frozenset("timestamp_ns track_uuid category num_interior_pts log_id".split()).union(
+        _SIZE, _POSE
+    ),
+    SWEEPS: frozenset({"x", "y", "z", "intensity", "laser_number", "offset_ns"}),
+}
+"""Tables -> their columns."""
+
 LABELS: Final[Mapping[str, str]] = name_table(
     """car: REGULAR_VEHICLE; pedestrian: PEDESTRIAN, OFFICIAL_SIGNALER; bicycle: BICYCLE;
     rider: BICYCLIST, MOTORCYCLIST, WHEELED_RIDER; motorcycle: MOTORCYCLE; wheeled_device: WHEELED_DEVICE;
@@ -166,6 +179,8 @@ def read_feather(path: Path, columns: Sequence[str]) -> common.Columns:
             raise InputError("file not found", where=str(path), remedy="is the log complete?")
         table = pyarrow.feather.read_table(str(path), memory_map=False)
         common.require_columns(columns, table.schema.names, path)
+        kind = path.name if path.name in OFFICIAL else SWEEPS
+        note_unknown(kind, table.schema.names, OFFICIAL[kind])
         empty = [name for name in columns if table.column(name).null_count]
         if empty:
             raise InputError("table has rows without a value", where=f"{path}: {', '.join(empty)}")

@@ -1,4 +1,4 @@
-"""Point cloud files: PCD (ascii, binary, binary_compressed), PLY (binary), KITTI BIN, NPZ.
+"""Point cloud files: PCD (ascii, binary, binary_compressed), PLY (ascii, binary), KITTI BIN, NPZ.
 
 Every size a file declares is compared with the bytes that are there before anything is allocated. Nothing in a file is
 executed: NPZ is read without pickles.
@@ -7,24 +7,36 @@ executed: NPZ is read without pickles.
 from __future__ import annotations
 
 import io
+import math
 import tokenize
-from collections.abc import Callable, Mapping
+import zipfile
+import zlib
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import IO, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import store
 from mudg.base.errors import InputError
-from mudg.formats.splats import binary, ply
+from mudg.formats.importers.common import name_table
+from mudg.formats.unknown_fields import note_unknown
 from mudg.scene.clouds import is_return
 
 MAX_POINTS: Final = 50_000_000
 _MAX_HEADER_BYTES: Final = 1 << 16
 _LZF_MAX_GROWTH: Final = 90
 """A token of 3 bytes makes at most 264."""
+
+USUAL: Final = frozenset(
+    """x y z intensity reflectivity reflectance remission i ring channel laser_id lidar_info line tag t time timestamp
+    time_stamp offset_time offset_ns range distance azimuth elevation ambient noise near_ir signal return_type
+    return_number number_of_returns confidence rgb rgba r g b a red green blue alpha nx ny nz normal_x normal_y
+    normal_z curvature label class classification instance object velocity doppler""".split()
+)
+"""Fields that clouds of LiDARs usually have, whatever their case: no format of clouds closes its list."""
 
 Fields = Mapping[str, NDArray]
 
@@ -39,9 +51,10 @@ class Cloud:
     missing: int
 
 
-def read_cloud(path: Path) -> Cloud:
-    """Read a cloud by the suffix of its name. Raises InputError: unknown suffix, cut off, sizes that contradict each
-    other, no coordinates, values not finite."""
+def read_cloud(path: Path, known: Collection[str] = ()) -> Cloud:
+    """Read a cloud by the suffix of its name; ``known``: fields that the caller reads, or knows to be there, besides
+    ``USUAL``. Raises InputError: unknown suffix, cut off, sizes that contradict each other, no coordinates, values not
+    finite."""
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         what = "point cloud format is not known"
@@ -51,6 +64,7 @@ def read_cloud(path: Path) -> Cloud:
     if absent:
         what = "cloud has no coordinates"
         raise InputError(what, where=str(path), expected="fields x, y, z", got=", ".join(columns) or "no fields")
+    note_unknown(f"*{path.suffix}", [name for name in columns if name.lower() not in USUAL], frozenset(known))
     xyz = np.stack([columns[name].astype(np.float64) for name in "xyz"], 1)
     nowhere = ~is_return(xyz)
     xyz = xyz[~nowhere]
@@ -217,13 +231,48 @@ def _count(word: str, where: str, largest: int = MAX_POINTS) -> int:
 
 
 # --- PLY ------------------------------------------------------------------------------------------
+_PLY_TYPES: Final = name_table(
+    """i1: char, int8; u1: uchar, uint8; i2: short, int16; u2: ushort, uint16; i4: int, int32;
+    u4: uint, uint32; f4: float, float32; f8: double, float64"""
+)
+_PLY_ORDER: Final = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+
+
 def read_ply(content: bytes, where: str) -> dict[str, NDArray]:
-    """Vertices of a binary polygon file; they have plain properties. What follows (faces) is passed over."""
-    tables, _, _ = ply.read_tables(content, where, ("vertex",))
-    if "vertex" not in tables:
-        raise InputError("the PLY file has no vertices", where=where)
-    rows = tables["vertex"]
-    return {name: rows[name].astype(rows.dtype[name].newbyteorder("=")) for name in rows.dtype.names or ()}
+    """Vertices of a polygon file; they must come first and have plain properties. What follows (faces) is passed
+    over."""
+    end = content.find(b"end_header", 0, _MAX_HEADER_BYTES)
+    start = content.find(b"\n", end) + 1
+    if not content.startswith(b"ply") or end < 0 or start == 0:
+        what = "not a PLY file"
+        raise InputError(what, where=where, expected="a header from 'ply' to 'end_header'", got=f"{len(content)} bytes")
+    order, points, properties, element = "?", -1, [], ""
+    for line in content[:end].decode("ascii", "replace").splitlines():
+        words = line.split()
+        if words[:1] == ["format"]:
+            order = words[1] if len(words) > 1 else "?"
+        elif words[:1] == ["element"] and len(words) == 3:
+            element = words[1]
+            if element == "vertex":
+                points = _count(words[2], f"{where}: element vertex")
+            elif points < 0:
+                raise InputError("vertices do not come first", where=where, got=f"element {element}")
+        elif words[:1] == ["property"] and element == "vertex":
+            if len(words) != 3 or words[1] not in _PLY_TYPES:
+                raise InputError("vertex property is of no known type", where=where, got=line.strip()[:80])
+            properties.append((words[2], _PLY_TYPES[words[1]]))
+    if order not in _PLY_ORDER or points < 0 or not properties or len({n for n, _ in properties}) != len(properties):
+        what = "PLY header is incomplete"
+        raise InputError(what, where=where, expected="format, element vertex, properties", got=order)
+    body = content[start:]
+    if order == "ascii":
+        lines = body.split(b"\n", points)  # faces may follow
+        table = _number_table(b"\n".join(lines[:points]), len(properties), points, where)
+        return {name: table[:, index] for index, (name, _) in enumerate(properties)}
+    layout = np.dtype([(name, _PLY_ORDER[order] + kind) for name, kind in properties])
+    _enough(body, points * layout.itemsize, where)
+    rows = np.frombuffer(body, layout, points)
+    return {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name, _ in properties}
 
 
 # --- BIN and NPZ ----------------------------------------------------------------------------------
@@ -256,20 +305,25 @@ def read_bin(content: bytes, where: str) -> dict[str, NDArray]:
     return {name: rows[:, index].copy() for index, name in enumerate(("x", "y", "z", "intensity"))}
 
 
-_OF_HEADERS: Final = (tokenize.TokenError, SyntaxError, RecursionError)
-"""What numpy's parser of headers raises."""
+def npz_arrays(content: bytes, where: str) -> dict[str, NDArray]:
+    """All arrays of a numpy archive by name. Raises InputError: damaged, cut off, or not plain numbers of the declared
+    size."""
+    arrays = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            for entry in archive.infolist():
+                with archive.open(entry) as handle:
+                    member = f"{where}: {entry.filename}"
+                    arrays[entry.filename.removesuffix(".npy")] = read_npy(handle, entry.file_size, member)
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, NotImplementedError, RuntimeError, zlib.error) as error:
+        what = "not a readable NPZ file, or cut off"
+        raise InputError(what, where=where, got=str(error)[:120], remedy="copy the file again") from error
+    return arrays
 
 
 def read_npz(content: bytes, where: str) -> dict[str, NDArray]:
-    """numpy archive: ``xyz`` [N, 3] and any number of arrays [N]; no pickles."""
-    archive, columns = binary.BoundedZip(content, where), dict[str, NDArray]()
-    for name in archive.names:
-        member = io.BytesIO(archive.read(name, MAX_POINTS * 24))
-        try:
-            columns[name.removesuffix(".npy")] = np.lib.format.read_array(member, allow_pickle=False)
-        except (ValueError, TypeError, OverflowError, EOFError, OSError, MemoryError, *_OF_HEADERS) as error:
-            what, remedy = "NPZ array cannot be read", "save it with numpy.savez from an array of numbers"
-            raise InputError(what, where=f"{where}: {name}", got=str(error)[:120], remedy=remedy) from error
+    """numpy archive: ``xyz`` [N, 3] and any number of arrays [N]."""
+    columns = npz_arrays(content, where)
     xyz = columns.pop("xyz", None)
     if xyz is None or xyz.ndim != 2 or xyz.shape[1] != 3 or xyz.dtype.kind not in "fiu":
         what = "NPZ cloud has no coordinates"
@@ -280,6 +334,31 @@ def read_npz(content: bytes, where: str) -> dict[str, NDArray]:
             what, where = "NPZ array does not fit the points", f"{where}: {name}"
             raise InputError(what, where=where, expected=f"numbers [{len(xyz)}]", got=f"{values.dtype} {values.shape}")
     return {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2], **columns}
+
+
+def read_npy(handle: IO[bytes], size: int, where: str) -> NDArray:
+    """One array of an archive, from its member of ``size`` bytes.
+
+    Its header is compared with this size before anything is allocated; arrays of objects (pickles) are refused. Raises
+    InputError: not numbers, or of another size than declared. ValueError, zipfile.BadZipFile, zlib.error: no array, or
+    damaged."""
+    version = np.lib.format.read_magic(handle)
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in readers:
+        raise InputError("array is of a version that is not read", where=where, got=str(version))
+    try:
+        shape, fortran, dtype = readers[version](handle)
+    except (tokenize.TokenError, SyntaxError, RecursionError, MemoryError) as error:  # of numpy's parser
+        what = "array's header makes no sense"
+        raise InputError(what, where=where, got=str(error)[:120], remedy="copy the file again") from error
+    length = math.prod(shape) * dtype.itemsize
+    plain = not dtype.hasobject and dtype.kind in "fiub"
+    if not plain or length > min(size, MAX_POINTS * 24) or handle.tell() + length != size:
+        what, got = "array is not plain numbers of the declared size", f"{dtype} {shape} in {size} bytes"
+        raise InputError(what, where=where, got=got, remedy="save it with numpy.savez from an array of numbers")
+    content = handle.read(length)
+    handle.read(1)  # at its end an archive's member compares its checksum
+    return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran else "C")
 
 
 READERS: Final[dict[str, Callable[[bytes, str], dict[str, NDArray]]]]

@@ -477,7 +477,7 @@ def read_sweep(content: CustomLog, sweep: LogItem, options: ImportOptions) -> Sw
     """The points of a sweep, motion-compensated to its time. Raises InputError: no points, or they contradict what the
     log declares of their fields."""
     lidar, path = content.lidars[sweep.sensor], _file(content, sweep)
-    cloud = read_cloud(path)
+    cloud = read_cloud(path, known=(lidar.intensity_field, lidar.time_field))
     if len(cloud.xyz) == 0:
         remedy = "export it again, or take the sweep out of log.json"
         raise InputError("cloud has no points", where=str(path), expected="at least one return", remedy=remedy)

@@ -59,6 +59,7 @@ from mudg.formats.importers.kitti_files import (
     rotation_entry,
     table_entry,
 )
+from mudg.formats.unknown_fields import note_unknown
 from mudg.scene.motion import GAP_M
 
 # boxes --------------------------------------------------------------------------------------------
@@ -77,6 +78,11 @@ LABEL_OF: Final = name_table(
     vehicle: unknown vehicle"""
 )
 """Classes that become tracks -> the labels of this package. Buildings, poles, vegetation and ground are no tracks."""
+_OFFICIAL: Final = frozenset(
+    """index label category semanticId semanticId_orig instanceId timestamp start_frame end_frame dynamic dynamicSeq
+    dynamicIdx dynamicIndex level_min level_max color transform vertices faces""".split()
+)
+"""Fields of the data set's objects, read or not."""
 VEHICLES: Final = frozenset(("car", "truck", "bus", "caravan", "trailer", "train", "motorcycle", "bicycle"))
 MAX_FILE_BYTES: Final = 8 * 1024**3
 _CHUNK: Final = 1 << 20
@@ -109,6 +115,7 @@ def read_boxes(path: Path, left_out: Counter[str]) -> Iterator[Kitti360Box]:
         where = f"{path}: object {number} ({item.tag})"
         if item.find("transform") is None:
             continue
+        note_unknown(path.name, [field.tag for field in item], _OFFICIAL)
         if item.find("semanticId") is not None:
             label = LABEL_OF_ID.get(_integer(item, "semanticId", where), "")
         else:  # words are told apart by capital letters only
@@ -236,6 +243,10 @@ IMU_FROM_EGO: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 FISHEYES: Final = ("image_02", "image_03")
 FISHEYE_VIEW_DEG: Final = 90.0
 _FISHEYE_VALUES: Final = ("image_width", "image_height", "xi", "k1", "k2", "p1", "p2", "gamma1", "gamma2", "u0", "v0")
+_FISHEYE: Final = frozenset(_FISHEYE_VALUES).union(
+    "model_type camera_name mirror_parameters distortion_parameters projection_parameters".split()
+)
+"""Entries of the data set's fisheye calibrations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -313,6 +324,7 @@ def _read_fisheye(path: Path) -> dict[str, float]:
     if model is None or model[1] != "MEI":
         what = "fisheye calibration is of another camera model"
         raise InputError(what, where=str(path), expected="model_type: MEI", got=model[1] if model else "no model_type")
+    note_unknown(path.name, re.findall(r"^\s*(\w+)\s*:", text, re.MULTILINE), _FISHEYE)
     found: dict[str, float] = {}
     for key, value in re.findall(r"^\s*(\w+)\s*:\s*([-+.\deE]+)\s*$", text, re.MULTILINE):
         try:

@@ -20,6 +20,7 @@ from mudg.base.types import Camera, SweepPoints, Track
 from mudg.formats.importers.clouds import read_float_rows
 from mudg.formats.importers.common import blend_motion, numbered_files, rigid_pose, rigid_rotation, unit_intensity
 from mudg.formats.importers.drive_log import BoxTracks, box_size
+from mudg.formats.unknown_fields import note_unknown
 
 # scans --------------------------------------------------------------------------------------------
 #
@@ -57,6 +58,21 @@ def untwist_scan(points: SweepPoints, velo_at: Callable[[float], Matrix], time_s
 # KITTI counts pixels from the centre of the top-left pixel; this package from its corner. So 0.5 is added to the
 # principal point here, once.
 PIXEL_CENTRE_PX: Final = 0.5
+_NUMBERED = tuple(
+    f"{name}_{number:02d}" for name in ("S", "K", "D", "R", "T", "S_rect", "R_rect", "P_rect") for number in range(4)
+)
+_TEXT = frozenset(
+    "P0 P1 P2 P3 R0_rect R_rect Tr Tr_velo_to_cam Tr_velo_cam Tr_imu_to_velo Tr_imu_velo calib_time".split()
+)
+_OFFICIAL: Mapping[str, frozenset[str]] = {
+    "calib_cam_to_cam.txt": frozenset({"calib_time", "corner_dist", *_NUMBERED}),
+    "calib_velo_to_cam.txt": frozenset({"calib_time", "R", "T", "delta_f", "delta_c"}),
+    "calib_imu_to_velo.txt": frozenset({"calib_time", "R", "T"}),
+    "perspective.txt": frozenset({"calib_time", "corner_dist", *_NUMBERED}),
+    "calib_cam_to_pose.txt": frozenset({"image_00", "image_01", "image_02", "image_03"}),
+}
+"""Entries of the data sets' files, read or not; any other file is the calibration text of an object, a sequence or a
+drive."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,6 +125,7 @@ def read_number_table(path: Path) -> dict[str, NDArray[np.float64]]:
         match = re.match(r"\s*([A-Za-z][\w]*)\s*:?\s+(.*)$", line)
         if match is None:
             continue
+        note_unknown(path.name, (match[1],), _OFFICIAL.get(path.name, _TEXT))
         try:
             numbers = np.array([float(text) for text in match[2].split()])
         except ValueError:
@@ -314,6 +331,12 @@ LABELS: Final = frozenset(
     ("car", "van", "truck", "pedestrian", "person_sitting", "person (sitting)", "person", "cyclist", "tram", "misc")
 )
 """Classes of the benchmarks, in lower case."""
+_TRACKLET = frozenset({"objectType", "h", "w", "l", "first_frame", "poses", "finished"})
+_TRACKLET_POSE = frozenset(
+    """tx ty tz rx ry rz state occlusion occlusion_kf truncation amt_occlusion amt_occlusion_kf amt_border_l
+    amt_border_r amt_border_kf""".split()
+)
+"""Fields of the data set's tracklets, read or not."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -380,12 +403,14 @@ def read_tracklets(path: Path) -> list[KittiBox]:
     boxes = []
     for track, item in enumerate(root.findall("./tracklets/item")):
         where = f"{path}: tracklet {track}"
+        note_unknown(path.name, [field.tag for field in item], _TRACKLET)
         length, width, height = (_xml_number(item, key, where) for key in ("l", "w", "h"))
         size_m = box_size(length, width, height, where)
         first = int(_xml_number(item, "first_frame", where))
         label = (item.findtext("objectType") or "").strip().lower()
         for step, pose in enumerate(item.findall("./poses/item")):
             here = f"{where} pose {step}"
+            note_unknown(path.name, [field.tag for field in pose], _TRACKLET_POSE)
             tx, ty, tz, rz = (_xml_number(pose, key, here) for key in ("tx", "ty", "tz", "rz"))
             boxes.append(KittiBox(first + step, track, label, size_m, yaw_matrix(rz, (tx, ty, tz + height / 2))))
     return boxes

@@ -8,9 +8,9 @@
 
 ``sensor_blobs`` is looked for beside the database and up to four folders above it.
 
-Frames. World: z up, origin and x axis at the first imported vehicle pose (the log's own world lies thousands of
-kilometres from its origin). Frame numbers (``--frames``) count the images of the first chosen camera in the log or
-scene; of other cameras and of clouds, what lies nearest belongs to a frame.
+Frames. World: z up, origin and x axis at the vehicle of the first imported cloud (the log's own world lies thousands of
+kilometres from its origin). Frame numbers (``--frames``) count the clouds of the log or scene. A moment is an image
+time of the cameras; all clouds in between are taken.
 
 Clouds are motion-compensated in the source; ``dt_s`` is 0. Image times are the start of a read-out of about 1/30 s; the
 middle row, and with it the pose, belongs 1/60 s later. Boxes come from an offline tracker, at every cloud.
@@ -18,11 +18,11 @@ middle row, and with it the pose, belongs 1/60 s later. Boxes come from an offli
 
 from __future__ import annotations
 
+import itertools
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
@@ -38,8 +38,9 @@ from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, 
 from mudg.formats.importers import common
 from mudg.formats.importers.clouds import read_cloud
 from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
-from mudg.formats.importers.drive_log import BoxTracks, CameraOptics, DriveLog, ImageRecord, SweepRecord, write_log
-from mudg.formats.importers.images import brown_conrady
+from mudg.formats.importers.drive_log import BoxTracks, SceneContent, SceneImage, SceneSweep, write_scene
+from mudg.formats.importers.images import ImageFit, brown_conrady, fit_images, image_notes
+from mudg.formats.unknown_fields import note_unknown
 from mudg.scene.clouds import near_places
 from mudg.scene.schema import ref_problem
 
@@ -61,6 +62,24 @@ SCHEMA: Final[Mapping[str, tuple[str, ...]]] = {
     "scene": ("token", "name"),
 }
 """Tables and columns that are read."""
+_XYZ: Final = ("x", "y", "z")
+OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
+    "log": frozenset({"vehicle_name", "date", "timestamp", "map_version"}),
+    "ego_pose": frozenset(
+        {"log_token", "epsg", *(f"{name}{axis}" for name in ("v", "acceleration_", "angular_rate_") for axis in _XYZ)}
+    ),
+    "camera": frozenset({"log_token", "model"}),
+    "image": frozenset({"next_token", "prev_token", "ego_pose_token"}),
+    "lidar": frozenset({"log_token", "model"}),
+    "lidar_pc": frozenset({"next_token", "prev_token"}),
+    "lidar_box": frozenset({"token", "next_token", "prev_token", "vx", "vy", "vz", "confidence"}),
+    "track": frozenset({"width", "length", "height"}),
+    "category": frozenset({"description"}),
+    "scene": frozenset({"log_token", "goal_ego_pose_token", "roadblock_ids"}),
+    "scenario_tag": frozenset(),
+    "traffic_light_status": frozenset(),
+}
+"""Tables of the published schema, and those of their columns that are not read."""
 _MAX_CELL_BYTES: Final = 1024 * 1024
 """Calibrations are the longest values, of a few hundred bytes."""
 _MAX_TOKEN_BYTES: Final = 64
@@ -122,6 +141,8 @@ class NuplanLog:
                 raise InputError(what, where=str(self.path), expected=", ".join(SCHEMA), got=got, remedy=remedy)
             there = [str(row[1]) for row in self.rows(f"PRAGMA table_info({table})")]
             common.require_columns(columns, there, f"{self.path}: {table}")
+            note_unknown(f"the table {table}", there, OFFICIAL[table].union(columns))
+        note_unknown("the database", [name for name in tables if not name.startswith("sqlite_")], frozenset(OFFICIAL))
 
     def name(self) -> str:
         """The log's name, e.g. ``2021.05.12.22.00.38_veh-35_01008_01518``."""
@@ -362,8 +383,7 @@ def import_nuplan(source: Path, out: Path, options: ImportOptions) -> Scene:
     common.refuse_options(options, "nuPlan", "poses", "boxes", "untwist")
     path, scene = _find(source, options)
     with open_log(path) as opened:
-        drive = read_log(opened, scene, options)
-    return write_log(drive, out, replace(options, frames=None))
+        return write_scene(_content(opened, _plan(opened, scene, options), options), out, options)
 
 
 def _find(source: Path, options: ImportOptions) -> tuple[Path, str]:
@@ -393,8 +413,33 @@ def _sensor_blobs(path: Path, name: str) -> Path | None:
     return next((folder for folder in found if (folder / name).is_dir()), None)
 
 
-def read_log(opened: NuplanLog, scene: str, options: ImportOptions) -> DriveLog:
-    """The chosen frames of the log, or of one of its scenes; no image or cloud is opened."""
+# --- what is imported -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Shot:
+    """One image: camera's channel, file, time (us)."""
+
+    channel: str
+    file: Path
+    time_us: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _NuplanPlan:
+    """Files, times and poses of an import, before anything large is read: the chosen ``cameras`` by channel, ``clouds``
+    and ``moments`` (images of one) in order of time, and the vehicle over the whole span, in the log's world."""
+
+    name: str
+    cameras: Mapping[str, NuplanCamera]
+    clouds: Sequence[NuplanCloud]
+    moments: Sequence[Sequence[_Shot]]
+    ego_us: NDArray[np.int64]
+    world_from_ego: Matrix
+    notes: Sequence[str]
+
+
+def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
     name, where = opened.name(), str(opened.path)
     blobs = _sensor_blobs(opened.path, name)
     if blobs is None:
@@ -404,93 +449,187 @@ def read_log(opened: NuplanLog, scene: str, options: ImportOptions) -> DriveLog:
     if scene and scene not in opened.scenes():
         what = "the log has no such scene"
         raise UsageError(what, where=where, got=scene, expected=", ".join(opened.scenes()[:12]) or "no scenes")
-    moments = list(opened.clouds(scene))
-    if not moments:
-        raise InputError("the log has no point clouds", where=where, expected="rows of lidar_pc")
-    zero_us = moments[0][1]
-    common.seconds(np.array([time_us for _, time_us in moments]), "us", f"{where}: lidar_pc.timestamp", zero_us)
-    mounts = opened.cameras()
-    folders = {camera.channel for camera in mounts.values() if (blobs / name / camera.channel).is_dir()}
+    every = list(opened.clouds(scene))
+    first, end = options.frames or (0, len(every))
+    chosen = every[first:end]
+    if not chosen:
+        raise InputError("no clouds to import", where=where, expected=f"frames 0 to {len(every)}", got=f"{first}:{end}")
+    common.seconds(np.array([time_us for _, time_us in chosen]), "us", f"{where}: lidar_pc.timestamp", chosen[0][1])
+    notes = [f"clouds {first} to {first + len(chosen) - 1} of {scene or 'the log'}"]
+    lidars = opened.lidars()
+    placed = {token: opened.cloud(token, lidars, blobs) for token, _ in chosen}
+    clouds = [cloud for cloud in placed.values() if cloud is not None]
+    if len(clouds) < len(placed):
+        without = [token.hex() for token, cloud in placed.items() if cloud is None]
+        if not options.skip_missing:
+            what, where = "point cloud has no vehicle pose", f"{where}: lidar_pc {without[0]}.ego_pose_token"
+            got = f"{len(without)} of {len(placed)} clouds have none"
+            remedy = "choose frames with --frames FIRST:END, or add --skip-missing"
+            raise InputError(what, where=where, expected="a token of ego_pose", got=got, remedy=remedy)
+        notes.append(f"{len(without)} clouds without a vehicle pose were left out")
+    lacking = [cloud.file for cloud in clouds if not cloud.file.is_file()]
+    if lacking:
+        _refuse_missing("point cloud", lacking, len(clouds), options)
+        clouds = [cloud for cloud in clouds if cloud.file.is_file()]
+        notes.append(f"{len(lacking)} clouds whose files are missing were left out")
+    by_token = opened.cameras()
+    folders = {camera.channel for camera in by_token.values() if (blobs / name / camera.channel).is_dir()}
     available = {channel: ours for channel, ours in CAMERAS.items() if channel in folders}
     names = common.chosen_cameras(available, options, f"{where}: camera", tuple(CAMERAS))
-    span = zero_us - _REACH_US, moments[-1][1] + _REACH_US
-    shots = [shot for shot in opened.images(*span, blobs) if shot[0] in mounts and mounts[shot[0]].channel in names]
-    if options.frames is not None:
-        reference = [time_us for token, _, time_us in shots if mounts[token].channel == names[0]]
-        window = reference[slice(*options.frames)]
-        if not window:
-            expected, got = f"frames 0 to {len(reference)}", f"{options.frames[0]}:{options.frames[1]}"
-            raise UsageError("no frame lies in the chosen range", where="--frames", expected=expected, got=got)
-        span = window[0] - _PERIOD_US // 2, window[-1] + _PERIOD_US // 2
-        shots = [shot for shot in shots if span[0] <= shot[2] <= span[1]]
-        moments = [moment for moment in moments if span[0] <= moment[1] <= span[1]]
-    seconds = lambda time_us: (time_us - zero_us) / 1e6
-    notes = [f"image poses {IMAGE_DELAY_US / 1e6:.4f} s after the time stamps: the middle of the read-out"]
-    times_us, poses = opened.ego_poses(span[0] - _MARGIN_US, span[1] + _MARGIN_US)
-    if not len(times_us):
-        what, here = "no vehicle poses at the time of the clouds", f"{where}: ego_pose.timestamp"
-        expected, remedy = "microseconds, as lidar_pc.timestamp", "are the two in different units?"
-        raise InputError(what, where=here, expected=expected, remedy=remedy)
-    path = EgoPath(common.seconds(times_us, "us", f"{where}: ego_pose.timestamp", zero_us), poses)
-    ego = common.mended_path(path, options, notes)
-    clouds = _clouds(opened, [token for token, _ in moments], blobs, options, notes)
-    sweeps = [
-        SweepRecord(SENSOR, seconds(c.time_us), c.world_from_lidar, c.file, partial(_read_points, c.file, c.places))
-        for c in clouds
+    cameras = {camera.channel: camera for camera in by_token.values()}
+    span = (chosen[0][1] - _REACH_US, chosen[-1][1] + _REACH_US)
+    shots = [
+        _Shot(by_token[token].channel, file, time_us)
+        for token, file, time_us in opened.images(*span, blobs)
+        if token in by_token and by_token[token].channel in names
     ]
-    images = []
-    for token, file, time_us in shots:
-        camera, time_s = mounts[token], seconds(time_us + IMAGE_DELAY_US)
-        if options.skip_missing and not common.has_pose(ego, time_s):
-            continue
-        pose = common.pose_near(ego, time_s, where=str(file)) @ camera.ego_from_cam
-        images.append(ImageRecord(CAMERAS[camera.channel], time_s, pose, file))
-    if len(images) < len(shots):
-        notes.append(f"{len(shots) - len(images)} images without a vehicle pose were left out")
-    by_channel = {camera.channel: camera for camera in mounts.values()}
-    optics = {CAMERAS[channel]: _optics(by_channel[channel]) for channel in names}
-    cameras = {ours: one.recorded for ours, one in optics.items()}
-    tracks, track_notes = _read_tracks(opened, {c.token: seconds(c.time_us) for c in clouds}, span)
+    moments, moment_notes = _moments(shots, names, options, where)
+    ego_us, poses = opened.ego_poses(span[0] - _MARGIN_US, span[1] + _MARGIN_US)
+    name, chosen_cameras = f"{name}_{scene}" if scene else name, {channel: cameras[channel] for channel in names}
+    return _NuplanPlan(name, chosen_cameras, clouds, moments, ego_us, poses, (*notes, *moment_notes))
+
+
+def _refuse_missing(what: str, missing: Sequence[Path], total: int, options: ImportOptions) -> None:
+    """Refuse missing files, unless that is allowed."""
+    if missing and not options.skip_missing:
+        what = f"file of a {what} is missing"
+        remedy = "download the log's sensor blobs, choose frames with --frames FIRST:END, or add --skip-missing"
+        raise InputError(what, where=str(missing[0]), got=f"{len(missing)} of {total} are missing", remedy=remedy)
+
+
+def _moments(
+    shots: Sequence[_Shot], names: Sequence[str], options: ImportOptions, where: str
+) -> tuple[list[list[_Shot]], list[str]]:
+    """The images of each moment at which all cameras fired, and notes; see ``_by_moment``."""
+    groups = _by_moment(shots, names, where)
+    missing = [shot.file for group in groups for shot in group if not shot.file.is_file()]
+    _refuse_missing("camera image", missing, len(shots), options)
+    complete = [{shot.channel for shot in group} == set(names) for group in groups]
+    kept = [g for g, full in zip(groups, complete, strict=True) if full and all(s.file.is_file() for s in g)]
+    inner = [group for group, full in zip(groups[1:-1], complete[1:-1], strict=True) if not full]
+    if inner and not options.skip_missing:
+        absent = sorted(set(names) - {shot.channel for shot in inner[0]})
+        what, where = "a moment lacks images of some cameras", f"{where}: image at {inner[0][0].time_us}"
+        got = f"no {', '.join(absent)}; {len(inner)} such moments"
+        remedy = "choose cameras with --cameras, or add --skip-missing"
+        raise InputError(what, where=where, got=got, expected="every chosen camera", remedy=remedy)
+    if not kept:
+        what = "no moment has images of all cameras"
+        remedy = "choose cameras with --cameras, or other frames with --frames"
+        raise InputError(what, where=where, got=f"{len(shots)} images", expected=", ".join(names), remedy=remedy)
+    cut = len(groups) - len(kept)
+    return kept, [f"{cut} moments without images of all cameras were left out"] if cut else []
+
+
+def _by_moment(shots: Sequence[_Shot], names: Sequence[str], where: str) -> list[list[_Shot]]:
+    """Images put together by time, in order of time.
+
+    Cameras fire one after another, each at its own part of the period. So an image belongs to the nearest image of the
+    camera that has most of them, after its own camera's median delay is taken off. What lies half a period from all is
+    alone.
+    """
+    by_camera = {name: [shot for shot in shots if shot.channel == name] for name in names}
+    for name, found in by_camera.items():
+        for shot, following in itertools.pairwise(found):
+            if shot.time_us == following.time_us:
+                what, where = "two images of one camera have the same time", f"{where}: image at {shot.time_us}"
+                got = f"{name}: {shot.file.name} and {following.file.name}"
+                remedy = "are rows of the table doubled? copy the file again"
+                raise InputError(what, where=where, expected="a row for every image", got=got, remedy=remedy)
+    leading = max(by_camera.values(), key=len)
+    if not leading:
+        return []
+    beats = np.array([shot.time_us for shot in leading])
+    half_us = float(np.median(np.diff(beats))) / 2 if len(beats) > 1 else _PERIOD_US / 2
+    groups: dict[int, list[_Shot]] = {index: [] for index in range(len(beats))}
+    alone = []
+    for found in by_camera.values():
+        times = np.array([shot.time_us for shot in found], np.int64)
+        late = times - beats[common.nearest_index(beats, times)]
+        usual = float(np.median(late[np.abs(late) <= half_us])) if (np.abs(late) <= half_us).any() else 0.0
+        for shot, index in zip(found, common.nearest_index(beats, times - usual), strict=True):
+            taken = any(other.channel == shot.channel for other in groups[int(index)])
+            if taken or abs(shot.time_us - usual - beats[index]) >= half_us:
+                alone.append([shot])
+            else:
+                groups[int(index)].append(shot)
+    return sorted([*groups.values(), *alone], key=lambda group: min(shot.time_us for shot in group))
+
+
+# --- writing --------------------------------------------------------------------------------------
+
+
+def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> SceneContent[Any]:
+    start_us = plan.clouds[0].time_us if plan.clouds else plan.moments[0][0].time_us
+    found: list[str] = []
+    ego = common.mended_path(_ego_path(plan, start_us, str(opened.path)), options, found)
+    first = ego.pose_at(0.0)
+    if first is None:
+        what, where = "vehicle poses do not cover the log", f"{opened.path}: ego_pose"
+        expected, remedy = f"a pose at {start_us} us", "are pose and cloud times both in microseconds?"
+        raise InputError(what, where=where, expected=expected, got=f"{len(plan.ego_us)} poses near it", remedy=remedy)
+    world_from_source = common.world_from_first(first)
+    ego = EgoPath(ego.times_s, world_from_source @ ego.world_from_ego)
+    fits = {CAMERAS[channel]: _fit(camera, options) for channel, camera in plan.cameras.items()}
+    tracks, track_notes = _read_tracks(opened, plan, start_us, world_from_source)
+    notes = [*plan.notes, *found, *image_notes(fits), common.origin_note(first)]
+    notes.append(f"image poses {IMAGE_DELAY_US / 1e6:.4f} s after the time stamps: the middle of the read-out")
+
+    def taken_s(shot: _Shot) -> float:
+        return (shot.time_us + IMAGE_DELAY_US - start_us) / 1e6
+
+    def convert(item: tuple[int, NuplanCloud | Sequence[_Shot]]) -> Iterable[SceneImage | SceneSweep]:
+        index, what = item
+        if isinstance(what, NuplanCloud):
+            time_s, pose = (what.time_us - start_us) / 1e6, world_from_source @ what.world_from_lidar
+            yield SceneSweep(SENSOR, index, time_s, pose, _read_points(what.file, what.places), str(what.file))
+            return
+        for shot in what:
+            time_s = taken_s(shot)
+            mount = plan.cameras[shot.channel].ego_from_cam
+            world_from_cam = common.pose_near(ego, time_s, where=str(shot.file)) @ mount
+            yield SceneImage(CAMERAS[shot.channel], index, time_s, world_from_cam, shot.file, str(shot.file))
+
+    moments = list(enumerate(plan.moments))
+    if options.skip_missing:
+        moments = [one for one in moments if all(common.has_pose(ego, taken_s(shot)) for shot in one[1])]
+        if len(moments) < len(plan.moments):
+            notes.append(f"{len(plan.moments) - len(moments)} moments without a vehicle pose were left out")
+    items = [*enumerate(plan.clouds), *moments]
     source = Source("nuplan", LICENCE, None, (*notes, *track_notes))
-    name = f"{name}_{scene}" if scene else name
-    return DriveLog(name, cameras, images, sweeps, tracks, ego, source, where, optics, box_times="own")
-
-
-def _clouds(
-    opened: NuplanLog, tokens: Sequence[bytes], blobs: Path, options: ImportOptions, notes: list[str]
-) -> list[NuplanCloud]:
-    """The clouds; those without a vehicle pose are refused, or left out and noted."""
-    lidars = opened.lidars()
-    found = {token: opened.cloud(token, lidars, blobs) for token in tokens}
-    without = [token.hex() for token, cloud in found.items() if cloud is None]
-    if without and not options.skip_missing:
-        what, where = "point cloud has no vehicle pose", f"{opened.path}: lidar_pc {without[0]}.ego_pose_token"
-        got = f"{len(without)} of {len(found)} clouds have none"
-        remedy = "choose frames with --frames FIRST:END, or add --skip-missing"
-        raise InputError(what, where=where, expected="a token of ego_pose", got=got, remedy=remedy)
-    if without:
-        notes.append(f"{len(without)} clouds without a vehicle pose were left out")
-    return [cloud for cloud in found.values() if cloud is not None]
+    name = lambda item: f"{'cloud' if isinstance(item[1], NuplanCloud) else 'moment'} {item[0]}"
+    return SceneContent(plan.name, source, fits, items, convert, name, ego, tracks=lambda: (tracks, ()))
 
 
 def _read_tracks(
-    opened: NuplanLog, time_of: Mapping[bytes, float], span: tuple[int, int]
+    opened: NuplanLog, plan: _NuplanPlan, start_us: int, world_from_source: Matrix
 ) -> tuple[list[Track], list[str]]:
-    """Tracks in the log's world from the boxes of clouds (token -> seconds), and notes."""
+    """Tracks in the scene's world and clock from the boxes of the plan's clouds, and notes."""
     tracks = BoxTracks(f"{opened.path}: lidar_box", LABELS)
+    time_of = {cloud.token: (cloud.time_us - start_us) / 1e6 for cloud in plan.clouds}
+    span = (plan.clouds[0].time_us, plan.clouds[-1].time_us) if plan.clouds else (0, -1)
     for token, track, label, (x, y, z, yaw, length, width, height) in opened.boxes(*span):
         if token in time_of:
-            pose = yaw_matrix(yaw, (x, y, z))
+            pose = world_from_source @ yaw_matrix(yaw, (x, y, z))
             tracks.add(track, tracks.label_of(label), time_of[token], (length, width, height), pose)
     return tracks.tracks()
 
 
-def _optics(camera: NuplanCamera) -> CameraOptics:
+def _ego_path(plan: _NuplanPlan, start_us: int, where: str) -> EgoPath:
+    """The vehicle in the log's world and the scene's clock."""
+    if not len(plan.ego_us):
+        what, where = "no vehicle poses at the time of the clouds", f"{where}: ego_pose.timestamp"
+        expected = "microseconds, as lidar_pc.timestamp"
+        raise InputError(what, where=where, expected=expected, remedy="are the two in different units?")
+    return EgoPath(common.seconds(plan.ego_us, "us", f"{where}: ego_pose.timestamp", start_us), plan.world_from_ego)
+
+
+def _fit(camera: NuplanCamera, options: ImportOptions) -> ImageFit:
     fx, fy, cx, cy = camera.intrinsics
     lens = brown_conrady(*camera.distortion) if any(camera.distortion) else None
     # the calibration counts pixels from the centre of the top-left one, as OpenCV does
     recorded = Camera(CAMERAS[camera.channel], *camera.size, fx, fy, cx + 0.5, cy + 0.5, camera.distortion)
-    return CameraOptics(recorded, lens)
+    return fit_images(recorded, options, lens)
 
 
 def _read_points(path: Path, places: Sequence[Matrix]) -> SweepPoints:

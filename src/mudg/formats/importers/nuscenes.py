@@ -40,6 +40,7 @@ from mudg.formats.importers import common, drive_log
 from mudg.formats.importers.clouds import read_float_rows
 from mudg.formats.importers.common import ImportOptions, LogFiles, name_table, unit_intensity
 from mudg.formats.importers.drive_log import BoxTracks, DriveLog, ImageRecord, SweepRecord
+from mudg.formats.unknown_fields import note_unknown
 
 # nuScenes sensors: cameras from their intrinsics, and ``LIDAR_TOP`` files with the time of every point ----------------
 LICENCE: Final = "CC BY-NC-SA 4.0 and the nuScenes terms of use (Motional; attribution, non-commercial, share-alike)"
@@ -113,6 +114,35 @@ _FLAT: Final = re.compile(rb'\{(?:[^{}"]++|"(?:[^"\\]++|\\.)*+")*+\}', re.DOTALL
 """An object whose fields are not objects; braces may stand in its texts."""
 _TOKEN: Final = re.compile(r"[A-Za-z0-9_\-]{1,128}")
 
+OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
+    "attribute.json": frozenset({"token", "name", "description"}),
+    "calibrated_sensor.json": frozenset({"token", "sensor_token", "translation", "rotation", "camera_intrinsic"}),
+    "category.json": frozenset({"token", "name", "description", "index"}),
+    "ego_pose.json": frozenset({"token", "timestamp", "translation", "rotation"}),
+    "instance.json": frozenset(
+        {"token", "category_token", "nbr_annotations", "first_annotation_token", "last_annotation_token"}
+    ),
+    "sample.json": frozenset({"token", "timestamp", "scene_token", "next", "prev"}),
+    "sample_annotation.json": frozenset(
+        (
+            "token sample_token instance_token attribute_tokens visibility_token translation size rotation "
+            "num_lidar_pts num_radar_pts next prev"
+        ).split()
+    ),
+    "sample_data.json": frozenset(
+        (
+            "token sample_token ego_pose_token calibrated_sensor_token filename fileformat width height "
+            "timestamp is_key_frame next prev"
+        ).split()
+    ),
+    "scene.json": frozenset(
+        {"token", "name", "description", "log_token", "nbr_samples", "first_sample_token", "last_sample_token"}
+    ),
+    "sensor.json": frozenset({"token", "channel", "modality"}),
+}
+"""Tables that are read -> their fields. Source: the release's published schema; ``index`` came with
+nuScenes-lidarseg."""
+
 Row = dict[str, Any]
 
 
@@ -122,6 +152,8 @@ def read_table(path: Path) -> list[Row]:
     rows = store.read_json(path)
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise InputError("table is not an array of records", where=str(path), expected="[ {...}, ... ]")
+    for row in rows:
+        _note_fields(row, path)
     return rows
 
 
@@ -166,7 +198,9 @@ def _search(path: Path, field: str, values: Collection[str], buffer_bytes: int) 
                     record = _FLAT.match(buffer, max(0, buffer.rfind(b"{", 0, match.start())))
                     if record is None or record.end() <= match.start():
                         raise _Unclear
-                    yield store.parse_json(record[0], f"{path}: byte {offset + record.start()}")
+                    row = store.parse_json(record[0], f"{path}: byte {offset + record.start()}")
+                    _note_fields(row, path)
+                    yield row
             if not piece and not buffer.rstrip().endswith(b"]"):
                 expected, remedy = "a JSON array closed by ]", "copy the table again"
                 raise InputError("table is cut off", where=str(path), expected=expected, remedy=remedy)
@@ -175,6 +209,11 @@ def _search(path: Path, field: str, values: Collection[str], buffer_bytes: int) 
                 where, got = f"{path}: byte {offset + end}", repr(buffer[end : end + 20])
                 raise InputError(what, where=where, got=got, expected=expected)
             buffer, offset = buffer[end:], offset + end
+
+
+def _note_fields(row: Row, path: Path) -> None:
+    if path.name in OFFICIAL:
+        note_unknown(path.name, row, OFFICIAL[path.name])
 
 
 def _refuse_missing(path: Path) -> None:

@@ -29,6 +29,7 @@ apart: 1 m at 20 m/s); it is moved to the sweep's time with its track's velocity
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,7 +47,7 @@ from mudg.formats.importers import common
 from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
 from mudg.formats.importers.drive_log import BoxTracks, SceneContent, SceneImage, SceneSweep, Tracks, write_scene
 from mudg.formats.importers.images import ImageFit, fit_images, image_notes, image_size
-from mudg.formats.splats.binary import gunzip
+from mudg.formats.unknown_fields import known, note_unknown, note_unknown_within
 
 # pandas frame -------------------------------------------------------------------------------------
 #
@@ -93,7 +94,22 @@ def read_frame(path: Path) -> dict[str, NDArray[Any]]:
     """Columns of a pickled data frame, gzipped or not, by their names. Raises InputError: missing, cut off, not a data
     frame, or it asks for something that is not plain data."""
     content = store.read_bytes(path)
-    return parse_frame(gunzip(content, MAX_BYTES, str(path)) if content[:2] == b"\x1f\x8b" else content, str(path))
+    return parse_frame(gunzip(content, str(path)) if content[:2] == b"\x1f\x8b" else content, str(path))
+
+
+def gunzip(content: bytes, where: str) -> bytes:
+    """Unpack gzip, not beyond ``MAX_BYTES``. Raises InputError: cut off, damaged, or larger than that."""
+    unpacker = zlib.decompressobj(wbits=31)
+    try:
+        unpacked = unpacker.decompress(content, MAX_BYTES + 1)
+    except zlib.error as error:
+        raise InputError("gzip file is damaged", where=where, got=str(error), remedy="copy the file again") from error
+    if len(unpacked) > MAX_BYTES:
+        raise InputError("gzip file unpacks to too much", where=where, expected=f"<= {MAX_BYTES} bytes")
+    if not unpacker.eof:
+        what = "gzip file is cut off"
+        raise InputError(what, where=where, got=f"{len(content)} bytes, no end", remedy="copy the file again")
+    return unpacked
 
 
 def parse_frame(content: bytes, where: str) -> dict[str, NDArray[Any]]:
@@ -188,7 +204,7 @@ class PointClasses:
         path = self._files.get(frame)
         if path is None:
             return None
-        table = _columns(path, ("class",))
+        table = _columns(path, ("class",), _CLASSES)
         numbers = common.finite_columns(table, ("class",), path)[:, 0].astype(np.int64)
         if len(numbers) != points:
             what, expected = "classes do not fit the points", f"{points} rows, one for each point of the frame's cloud"
@@ -260,6 +276,17 @@ _POINT_COLUMNS: Final = ("x", "y", "z", "i", "t", "d")
 _CUBOID_COLUMNS: Final = tuple(
     "uuid label yaw stationary position.x position.y position.z dimensions.x dimensions.y dimensions.z".split()
 )
+_POINTS, _CUBOIDS, _CLASSES = "lidar/*.pkl.gz", "annotations/cuboids/*.pkl.gz", "annotations/semseg/*.pkl.gz"
+OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
+    _POINTS: frozenset(_POINT_COLUMNS),
+    _CUBOIDS: frozenset((*_CUBOID_COLUMNS, "camera_used", "cuboids.sibling_id", "cuboids.sensor_id")).union(
+        f"attributes.{name}" for name in ("object_motion", "rider_status", "pedestrian_behavior", "pedestrian_age")
+    ),
+    _CLASSES: frozenset({"class"}),
+    "intrinsics.json": frozenset({"fx", "fy", "cx", "cy"}),
+}
+"""Kinds of files -> their fields, read or not."""
+_POSE_FIELDS: Final = known("", heading=known("w x y z"), position=known("x y z"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -464,6 +491,7 @@ def _poses(path: Path, frames: Sequence[int]) -> Matrix:
         ):
             heading = [entry["heading"][key] for key in "wxyz"]
             poses.append(common.pose_from_quaternion(heading, [entry["position"][key] for key in "xyz"], where))
+        note_unknown_within(path.name, entry, _POSE_FIELDS)
     return np.stack(poses)
 
 
@@ -472,6 +500,7 @@ def _fit(folder: Path, name: str, image: Path, options: ImportOptions) -> ImageF
     values = store.read_json(path)
     with common.record_fields("intrinsics are incomplete", path, "fx fy cx cy"):
         fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
+        note_unknown(path.name, values, OFFICIAL[path.name])
     # the data set counts pixels from the centre of the top-left one, as OpenCV does
     return fit_images(Camera(name, *image_size(image), fx, fy, cx + 0.5, cy + 0.5), options)
 
@@ -479,9 +508,10 @@ def _fit(folder: Path, name: str, image: Path, options: ImportOptions) -> ImageF
 # --- points ---------------------------------------------------------------------------------------
 
 
-def _columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+def _columns(path: Path, names: Sequence[str], kind: str) -> dict[str, NDArray[Any]]:
     frame = read_frame(path)
     common.require_columns(names, frame, path)
+    note_unknown(kind, frame, OFFICIAL[kind])
     return frame
 
 
@@ -492,7 +522,7 @@ class _Cloud:
 
     def __init__(self, path: Path, motion: _Motion, index: int) -> None:
         frame_s = float(motion.raw_s[index])
-        frame = _columns(path, _POINT_COLUMNS)
+        frame = _columns(path, _POINT_COLUMNS, _POINTS)
         self.returns = common.returns_of(frame, path)
         self._without = {d: int((frame["d"][~self.returns] == d).sum()) for d in SENSORS}
         frame = {name: values[self.returns] for name, values in frame.items()}
@@ -544,7 +574,7 @@ class _Cloud:
 
 
 def _read_cuboids(path: Path, cloud: _Cloud, motion: _Motion) -> list[_Cuboid]:
-    frame = _columns(path, _CUBOID_COLUMNS)
+    frame = _columns(path, _CUBOID_COLUMNS, _CUBOIDS)
     centre = common.finite_columns(frame, ("position.x", "position.y", "position.z"), path)
     length_width_height = ("dimensions.y", "dimensions.x", "dimensions.z")
     sizes = common.finite_columns(frame, length_width_height, path)

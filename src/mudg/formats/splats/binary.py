@@ -3,12 +3,11 @@ surprises."""
 
 from __future__ import annotations
 
-import contextlib
 import io
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -65,29 +64,47 @@ def gzip_bytes(content: bytes) -> bytes:
     return packer.compress(content) + packer.flush()
 
 
-@contextlib.contextmanager
-def inflating(where: str) -> Iterator[None]:
-    """Code that inflates: damage becomes an InputError."""
-    try:
-        yield
-    except zlib.error as error:
-        remedy = "copy the file again"
-        raise InputError("the compressed content is damaged", where=where, got=str(error), remedy=remedy) from error
+class GzipStream:
+    """The content of a gzip file, inflated as far as it is asked for and no further."""
 
+    def __init__(self, content: bytes, where: str) -> None:
+        self._rest, self._where = content, where
+        self._inflater = zlib.decompressobj(31)
 
-def gunzip(content: bytes, most: int, where: str) -> bytes:
-    """The content of a gzip file, of at most ``most`` bytes; no more is inflated. Raises InputError: it is damaged, cut
-    off, or goes on."""
-    inflater = zlib.decompressobj(31)
-    with inflating(where):
-        inflated = inflater.decompress(content, most + 1)
-    if len(inflated) > most:
-        what, remedy = "the compressed content goes on beyond what it should hold", "get the file again"
-        raise InputError(what, where=where, expected=f"at most {most} bytes", remedy=remedy)
-    if not inflater.eof:
-        got, remedy = f"{len(content)} bytes, no end", "copy the file again"
-        raise InputError("the compressed content is cut off", where=where, got=got, remedy=remedy)
-    return inflated
+    def read(self, size: int, what: str) -> bytes:
+        """The next ``size`` bytes; InputError if there are fewer or they are damaged."""
+        found = self.rest(size)
+        if len(found) < size:
+            what, where = f"the file ends within {what}", self._where
+            remedy = "it was cut off, or its header is damaged: get the file again"
+            raise InputError(what, where=where, expected=f"{size} bytes", got=f"{len(found)} bytes", remedy=remedy)
+        return found
+
+    def rest(self, most: int) -> bytes:
+        """What is left, up to ``most`` bytes."""
+        found = bytearray()
+        while len(found) < most:
+            more = self._inflate(min(most - len(found), 1 << 24))
+            if not more and (self._inflater.eof or not self._rest):
+                break
+            found += more
+        return bytes(found)
+
+    def close(self) -> None:
+        """InputError unless the content ends here, with the right checksum."""
+        more = self._inflate(1)
+        if more or not self._inflater.eof:
+            what = "goes on after its last value" if more else "ends before its checksum"
+            what = f"the compressed content {what}"
+            raise InputError(what, where=self._where, remedy="the header does not fit the content")
+
+    def _inflate(self, most: int) -> bytes:
+        try:
+            more = self._inflater.decompress(self._rest, most)
+        except zlib.error as error:
+            raise InputError("the compressed content is damaged", where=self._where, got=str(error)) from error
+        self._rest = self._inflater.unconsumed_tail
+        return more
 
 
 # -- zips ------------------------------------------------------------------------------------------

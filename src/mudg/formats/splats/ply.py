@@ -17,6 +17,7 @@ resolved, which belongs to size and opacity), elements and lists of others, and 
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -28,14 +29,22 @@ from mudg.base.errors import InputError
 from mudg.core.harmonics import C0
 from mudg.formats.splats import binary
 from mudg.formats.splats.cloud import VERTICAL, SplatCloud, SplatFile, checked, known, logit, spacing_m
-from mudg.formats.unknown_fields import listed
+from mudg.formats.unknown_fields import listed, sentence
 
 MAX_HEADER: Final = 1 << 16
+MOST_LISTS: Final = 2_000_000
+"""Rows of lists that are walked over to reach Gaussians behind them: seconds."""
 FLAT_LOG: Final = float(np.log(1e-6))
 """Thickness of flat Gaussians, whose files state none."""
 _MODES: Final = {"mip": True, "antialiased": True, "antialias": True, "default": False, "classic": False, "2dgs": False}
 _MOTION: Final = tuple("trbf motion omega t_ time scale_t scaling_t rot_r rotation_r velocity duration".split())
 """Beginnings of columns with which methods for moving scenes move their Gaussians."""
+_UNREAD: Final = ("nx", "ny", "nz", "red", "green", "blue", "alpha")
+_ELEMENTS: Final = (
+    "face edge tristrips material camera extrinsic intrinsic image_size frame disparity color_space version".split()
+)
+"""Columns and elements of others that say nothing about Gaussians (from ``extrinsic`` on: ml-sharp). PLY has no closed
+list."""
 _TYPES: Final = {
     name: kind
     for kind, names in {
@@ -87,13 +96,13 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     sh = np.concatenate([first[:, None], coefficient_major(others)[:, :15]], 1)
     classes = None
     # others number classes in whole numbers, and otherwise
-    if "class" in names and table.dtype["class"].kind == "f":
+    if ours := "class" in names and table.dtype["class"].kind == "f":
         with np.errstate(invalid="ignore"):
             ids = np.asarray(table["class"], np.float64)
             classes = np.where((ids >= 0) & (ids <= 255), ids, 255).astype(np.uint8)
     means = np.stack([table[name].astype(np.float64) for name in "xyz"], 1)
     logs = columns_of(table, sizes)
-    notes = list[str]()
+    notes = list(file.notes)
     if flat:
         logs = np.column_stack([logs, np.full(len(logs), FLAT_LOG, np.float32)])
         notes.append("it has no scale_2: read as flat Gaussians (2DGS)")
@@ -103,13 +112,16 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     if filters:
         cloud = _filtered(cloud, np.asarray(table[filters[0]], np.float64), where)
         notes.append("the column filter_3D (Mip-Splatting) went into sizes and opacities")
-    used = {*wanted, *_indexed("f_rest", rest)}
-    moving = [name for name in names if name not in used and name.lower().startswith(_MOTION)]
+    used = {*wanted, *_indexed("f_rest", rest), *_UNREAD, *filters, *(["class"] if ours else [])}
+    passed = [name for name in names if name not in used]
+    moving = [name for name in passed if name.lower().startswith(_MOTION)]
     warnings = list(file.warnings)
     if _REST[rest] > 3:
         warnings.append("harmonics beyond degree 3 were dropped")
     if moving:
         warnings.append(f"columns of motion over time are not read: {listed(moving)}; the Gaussians are as they rest")
+    if len(passed) > len(moving):
+        notes.append(sentence([name for name in passed if name not in moving], "element vertex"))
     single = [axis for axis, name in enumerate("xyz") if table.dtype[name] == np.float32]
     step = spacing_m(means[:, single]) if single else 0.0
     return SplatFile(cloud, file.axes, file.axes_by, step, tuple(notes), tuple(warnings))
@@ -181,24 +193,26 @@ class PlyFile:
     antialias: bool
     axes: str
     axes_by: str
+    notes: tuple[str, ...]
     warnings: tuple[str, ...]
 
 
-def read_tables(
-    content: bytes, where: str, wanted: tuple[str, ...]
-) -> tuple[dict[str, NDArray[Any]], list[str], list[str]]:
-    """The wanted elements of a binary PLY as structured arrays that look into ``content``, the names of other elements,
-    and comments. Raises InputError: no PLY, an ASCII one, a malformed header, lists in the wanted elements or before
-    them, or content that is too short."""
+def read_elements(content: bytes, where: str, wanted: tuple[str, ...]) -> PlyFile:
+    """The wanted elements of a binary PLY as structured arrays that look into ``content``. Raises InputError: no PLY,
+    an ASCII one, a malformed header, wanted elements with lists, or content that is too short."""
     elements, comments, place, order = _parsed_header(content, where)
     tables: dict[str, NDArray[Any]] = {}
     last = max((index for index, element in enumerate(elements) if element.name in wanted), default=-1)
     for element in elements[: last + 1]:
-        lists = [name for length, _, name in element.columns if length]
-        if lists and element.count:
-            here = f"{where}: element {element.name!r}"
-            remedy = "write one property for each number, and elements with lists last"
-            raise InputError("a PLY file has lists here", where=here, got=f"property list {lists[0]!r}", remedy=remedy)
+        lists = any(length for length, _, _ in element.columns)
+        if lists and element.name in wanted:
+            name = next(name for length, _, name in element.columns if length)
+            what, where = "the Gaussians of a PLY file have lists", f"{where}: element {element.name!r}"
+            got = f"property list {name!r}"
+            raise InputError(what, where=where, got=got, remedy="write one property for each number")
+        if lists:
+            place = _after_lists(content, place, element, order, where)
+            continue
         try:
             dtype = np.dtype([(name, order + kind) for _, kind, name in element.columns])
         except ValueError as error:
@@ -209,13 +223,8 @@ def read_tables(
         if dtype.itemsize and element.name in wanted:
             tables[element.name] = np.frombuffer(rows, dtype)
         place += size
-    return tables, [element.name for element in elements if element.name not in wanted and element.count], comments
-
-
-def read_elements(content: bytes, where: str, wanted: tuple[str, ...]) -> PlyFile:
-    """The wanted elements of a PLY of Gaussians, and what its comments say of drawing and axes; see ``read_tables``."""
-    tables, more, comments = read_tables(content, where, wanted)
-    warnings = list[str]()
+    more = [element.name for element in elements if element.name not in wanted and element.count]
+    unknown, warnings = [name for name in more if name not in _ELEMENTS], list[str]()
     antialias = _antialias(comments, warnings)
     axes, by = _axes(comments, warnings)
     offset = next((line for line in comments if re.search(r"(?i)\b(offset|shift|epsg|utm|georef\w*|crs)\b", line)), "")
@@ -226,7 +235,7 @@ def read_elements(content: bytes, where: str, wanted: tuple[str, ...]) -> PlyFil
         warnings.append(
             f"the comment {offset[:80]!r} is not used: places are as the file has them (--origin-m chooses the origin)"
         )
-    return PlyFile(tables, antialias, axes, by, tuple(warnings))
+    return PlyFile(tables, antialias, axes, by, (sentence(unknown, "the header"),) if unknown else (), tuple(warnings))
 
 
 def _parsed_header(content: bytes, where: str) -> tuple[list[_Element], list[str], int, str]:
@@ -268,7 +277,32 @@ def _parsed_header(content: bytes, where: str) -> tuple[list[_Element], list[str
             raise InputError(what, where=where, got=repr(line[:80]), expected=expected)
     if not order or not elements:
         raise InputError("the header of the PLY file names no format or no elements", where=where)
+    for element in elements:
+        if element.name in ("vertex", "chunk", "sh"):
+            binary.refuse_count(element.count, f"{where}: element {element.name}")
     return elements, comments, line_end + 1, order
+
+
+def _after_lists(content: bytes, place: int, element: _Element, order: str, where: str) -> int:
+    """Where the rows of an element with lists, which stand before the Gaussians, end."""
+    if element.count > MOST_LISTS:
+        what, where = "a PLY file has too many lists before its Gaussians", f"{where}: element {element.name!r}"
+        remedy = "write the vertices first"
+        raise InputError(what, where=where, expected=f"at most {MOST_LISTS}", got=str(element.count), remedy=remedy)
+    columns = []
+    for length, kind, _ in element.columns:
+        columns.append((struct.Struct(order + np.dtype(length).char) if length else None, np.dtype(kind).itemsize))
+    try:
+        for _ in range(element.count):
+            for length, size in columns:
+                entries = 1
+                if length is not None:
+                    entries = max(length.unpack_from(content, place)[0], 0)
+                    place += length.size
+                place += entries * size
+    except struct.error as error:
+        raise InputError("the file ends within a list", where=f"{where}: element {element.name!r}") from error
+    return place
 
 
 # -- comments --------------------------------------------------------------------------------------
@@ -447,7 +481,13 @@ def compressed_from_bytes(content: bytes, where: str) -> SplatFile:
     columns = [values.astype(np.float32) for values in (quats, scales, logit(rgba[:, 3]), sh)]
     cloud = checked(SplatCloud(means, *columns, antialias=file.antialias), where)
     step = spacing_m(np.concatenate([low, high])) if chunk.dtype["min_x"].itemsize == 4 else 0.0
-    return SplatFile(cloud, file.axes, file.axes_by, step, warnings=file.warnings)
+    known = {"chunk": _BOUNDS, "vertex": _PACKED, "sh": _indexed("f_rest", max(_COMPRESSED_REST))}
+    unknown = {
+        element: [n for n in table.dtype.names or () if n not in known[element]]
+        for element, table in file.tables.items()
+    }
+    notes = [sentence(names, f"element {element}") for element, names in unknown.items() if names]
+    return SplatFile(cloud, file.axes, file.axes_by, step, (*file.notes, *notes), file.warnings)
 
 
 def _rest(table: NDArray[np.void] | None, count: int, where: str) -> Array:

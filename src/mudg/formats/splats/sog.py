@@ -28,7 +28,7 @@ from mudg.base.errors import InputError
 from mudg.base.records import ForeignRecord, Number, parse_record
 from mudg.formats.splats import binary
 from mudg.formats.splats.cloud import SplatCloud, SplatFile, checked, logit
-from mudg.formats.unknown_fields import listed
+from mudg.formats.unknown_fields import listed, sentence
 
 CODES: Final = 256
 MAX_PALETTE: Final = 65536
@@ -86,6 +86,7 @@ class SogMeta(ForeignRecord):
     quats: SogRotations
     sh0: SogTable
     shN: SogHarmonics | None = None
+    asset: Any = None
     antialias: Any = None
     model: Any = None
 
@@ -236,10 +237,12 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     columns = [values.astype(np.float32) for values in (quats, scales, logit(first[:, 3] / 255.0), sh)]
     antialias = meta.model == "antialiased" if meta.model is not None else bool(meta.antialias)
     cloud = checked(SplatCloud(means, *columns, antialias=antialias), where)
+    unknown = meta.unknown()
+    notes = (sentence(unknown, "meta.json"),) if unknown else ()
     warnings = [] if meta.model in _MODELS else [f"its model {str(meta.model)[:40]!r} is not known: drawn as usual"]
     if pixels.lossy:
         warnings.append("its pictures are compressed with loss, so that values are wrong: write them without")
-    return SplatFile(cloud, warnings=tuple(warnings))
+    return SplatFile(cloud, notes=notes, warnings=tuple(warnings))
 
 
 def _harmonics(stated: SogHarmonics, pixels: _Pictures, where: str) -> Array:

@@ -15,7 +15,6 @@ harmonics (value - 128) / 128, coefficient by coefficient. Rotation of versions 
 from __future__ import annotations
 
 import struct
-import zlib
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -92,24 +91,19 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     if content[:2] != b"\x1f\x8b":
         what = "not an SPZ file"
         raise InputError(what, where=where, expected="a gzip file, or one that begins with NGSP", got=repr(content[:4]))
-    size = struct.calcsize(HEADER)
-    with binary.inflating(where):
-        start = zlib.decompressobj(31).decompress(content, size)
-    magic, *fields, _ = binary.unpacked(HEADER, start, 0, "the header", where)
+    stream = binary.GzipStream(content, where)
+    magic, *fields, _ = struct.unpack(HEADER, stream.read(struct.calcsize(HEADER), "the header"))
     if magic != MAGIC:
         raise InputError("not an SPZ file", where=where, expected="NGSP in the compressed content", got=f"{magic:#x}")
     head = _Header(*fields)
     if head.version not in (1, 2, 3):
         raise InputError("this version of SPZ is not read", where=where, expected="1 to 4", got=str(head.version))
     binary.refuse_bomb(head.count, content, where)
-    sizes = head.sizes(where)
-    # programs with further flags may have further planes
-    further = _MOST_EXTENSIONS if head.flags & ~_ANTIALIAS else 0
-    inflated, place, planes = binary.gunzip(content, size + sum(sizes) + further, where), size, list[bytes]()
-    for name, length in zip(_PLANES, sizes):
-        planes.append(bytes(binary.part(inflated, place, length, f"the {name}", where)))
-        place += length
-    return _file(planes, head, _extensions(inflated[place:], where) if head.flags & _EXTENSIONS else {}, where)
+    planes = [stream.read(size, f"the {name}") for name, size in zip(_PLANES, head.sizes(where))]
+    more = stream.rest(_MOST_EXTENSIONS) if head.flags & _EXTENSIONS else b""
+    if head.flags <= _ANTIALIAS | _EXTENSIONS:  # programs with further flags may have further planes
+        stream.close()
+    return _file(planes, head, _extensions(more, where) if head.flags & _EXTENSIONS else {}, where)
 
 
 def _from_streams(content: bytes, where: str) -> SplatFile:

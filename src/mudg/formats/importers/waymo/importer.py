@@ -41,11 +41,12 @@ from mudg.formats.importers.common import ImportOptions, LogFiles
 from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.formats.importers.images import ImageFit, Lens, brown_conrady, fit_images
 from mudg.formats.importers.waymo import records
-from mudg.formats.importers.waymo.logs import REQUIRED, ParquetLog, TfrecordLog, WaymoLog
-from mudg.formats.importers.waymo.records import CAMERAS, TOP, FrameRecord, LaserCalibration, Matrix
+from mudg.formats.importers.waymo.logs import REQUIRED, ParquetLog, TfrecordLog
+from mudg.formats.importers.waymo.records import CAMERAS, TOP, FrameRecord, LaserCalibration, Matrix, WaymoLog
 
 LICENCE: Final = "Waymo Dataset License Agreement for Non-Commercial Use (non-commercial; attribution)"
 _SAME_POSE: Final = 1e-6
+_CLOCK_FRAMES: Final = 3
 _MOMENT_FRAMES: Final = 4
 _SUFFIX: Final = ".tfrecord"
 
@@ -157,7 +158,7 @@ def _usable_frames(waymo: WaymoLog, options: ImportOptions) -> tuple[list[FrameR
     if not complete:
         what = "no frame is complete"
         raise InputError(what, where=waymo.frames[0].where, got=f"the first has no {', '.join(missing[0][1])}")
-    notes = [f"Waymo Open Dataset, {waymo.form}"]
+    notes = [f"Waymo Open Dataset, {waymo.form}" + (f"; {waymo.conditions}" if waymo.conditions else "")]
     if missing:
         some = ", ".join(str(frame.number) for frame, _ in missing[:8])
         notes.append(f"frames {some} lack images or scans and were left out")
@@ -178,6 +179,7 @@ class _Plan:
     world_from_global: Matrix
     start_us: int
     """Zero of the scene's clock, microseconds of the epoch."""
+    turn: TurnClock
     middle_s: Mapping[int, float]
     """Frame number -> seconds after the frame's timestamp to which the frame's pose belongs."""
     fits: Mapping[str, ImageFit]
@@ -192,7 +194,7 @@ class _Plan:
 
     def dt_s(self, frame: FrameRecord, turn: NDArray[np.float64]) -> NDArray[np.float64]:
         """Seconds after ``pose_s`` at parts of the top LiDAR's turn (0..1)."""
-        return turn * TURN_S - self.middle_s[frame.number]
+        return self.turn.after_timestamp_s(turn) - self.middle_s[frame.number]
 
     def taken(self, frame: FrameRecord, camera: str) -> tuple[Matrix, float]:
         """Where an image was taken (world from camera, f64[4, 4]), and when in the scene's clock."""
@@ -218,7 +220,7 @@ class _Plan:
         if TOP not in frame.lasers or not frame.boxes:
             return np.full(len(frame.boxes), self.middle_s[frame.number])
         centres = np.array([box.centre for box in frame.boxes])
-        return turn_of_direction(centres, self.waymo.lasers[TOP]) * TURN_S
+        return self.turn.after_timestamp_s(turn_of_direction(centres, self.waymo.lasers[TOP]))
 
 
 def _plan(
@@ -234,7 +236,11 @@ def _plan(
     x, y, z = (float(v) for v in place)
     place = f"({x!r}, {y!r}, {z!r})"
     notes.append(f"the world's origin is {place} in the data set's world, its x axis turned by {yaw!r} rad")
-    middles = {frame.number: _pose_moment(frame) for frame in frames}
+    turn = _measure_turn(waymo, frames)
+    if turn.measured:
+        start, duration = f"{turn.start_s * 1e3:.1f} ms", f"{turn.duration_s * 1e3:.1f} ms"
+        notes.append(f"the top LiDAR's turns begin {start} after the timestamp and take {duration}")
+    middles = {frame.number: _pose_moment(frame, turn) for frame in frames}
     assumed = sum(not exact for _, exact in middles.values())
     if assumed:
         notes.append(f"the pose of {assumed} frames is no image's: taken to belong to the middle of the LiDAR's turn")
@@ -248,16 +254,36 @@ def _plan(
         ways = ", ".join(DIRECTIONS[d] if 0 <= d < len(DIRECTIONS) else f"code {d}" for d in rolling)
         notes.append(f"shutters roll {ways}; a view is that of the middle of the exposure")
     middle_s = {number: value for number, (value, _) in middles.items()}
-    return _Plan(waymo, world_from_global, start_us, middle_s, fits)
+    return _Plan(waymo, world_from_global, start_us, turn, middle_s, fits)
 
 
-def _pose_moment(frame: FrameRecord) -> tuple[float, bool]:
+def _pose_moment(frame: FrameRecord, turn: TurnClock) -> tuple[float, bool]:
     """When the vehicle was at the frame's pose, in seconds after the frame's timestamp, and whether that was recorded:
     an image with the same pose has its time. Without one, the middle of the LiDAR's turn is assumed."""
     for shot in frame.shots.values():
         if np.abs(shot.global_from_vehicle - frame.global_from_vehicle).max() < _SAME_POSE:
             return shot.pose_time_s - frame.timestamp_us / 1e6, True
-    return TURN_S / 2, False
+    return float(turn.after_timestamp_s(np.array(0.5))), False
+
+
+def _measure_turn(waymo: WaymoLog, frames: Sequence[FrameRecord]) -> TurnClock:
+    """The top LiDAR's timing, from the frames during which the vehicle moved most."""
+    moved = [
+        (float(np.linalg.norm(after.global_from_vehicle[:3, 3] - before.global_from_vehicle[:3, 3])), index + 1)
+        for index, (before, after) in enumerate(zip(frames[1:-1], frames[2:], strict=True))
+        if TOP in before.lasers
+    ]
+    turns = []
+    for index in sorted(index for _, index in sorted(moved, reverse=True)[:_CLOCK_FRAMES]):
+        shots = [shot for frame in frames[index - 1 : index + 2] for shot in frame.shots.values()]
+        path = {shot.pose_time_s: shot.global_from_vehicle[:3, 3] for shot in shots}
+        times = np.array(sorted(path))
+        poses = waymo.pixel_poses(frames[index])
+        if poses is not None:
+            places = np.stack([path[time] for time in times])
+            found = measure_turn(poses, frames[index].timestamp_us / 1e6, times, places)
+            turns += [found] if found is not None else []
+    return median_clock(turns)
 
 
 def _moment_of_boxes(waymo: WaymoLog, frames: Sequence[FrameRecord], plan: _Plan) -> tuple[records.Moment, str]:
@@ -275,7 +301,7 @@ def _moment_of_boxes(waymo: WaymoLog, frames: Sequence[FrameRecord], plan: _Plan
             continue
         points = _points(plan, frame, TOP, waymo.read(frame, ()).scans[TOP])
         xyz = transform_points(waymo.lasers[TOP].vehicle_from_lidar, points.xyz)
-        seen = points.turn * TURN_S
+        seen = plan.turn.after_timestamp_s(points.turn)
         rotation = plan.world_from_vehicle(frame)[:3, :3]
         for box, late in zip(frame.boxes, plan.seen_s(frame), strict=True):
             if box.id in fast[index]:
@@ -329,7 +355,10 @@ def _points(plan: _Plan, frame: FrameRecord, name: str, scan: records.LaserScan)
 # vehicle's at the moment the middle column was exposed: the recorded one, up to a few milliseconds older or newer,
 # carried on with the recorded velocity. Source: the message description and the data set's conversion.
 TURN_S: Final = 0.1
-"""From the frame's timestamp on, which is that of the first column. Source: the message description."""
+_MIN_MOTION_M: Final = 0.3
+_MAX_FIT_ERROR_S: Final = 0.004
+_CLOCK_ERROR_S: Final = 0.0025
+_MIN_ROWS_SHARE: Final = 0.05
 MAX_POSE_SHIFT_S: Final = 0.05
 DIRECTIONS: Final = ("in an unknown direction", "downwards", "left to right", "upwards", "right to left", "not at all")
 """How a camera reads its image, by the data set's number."""
@@ -446,6 +475,74 @@ def sweep_points(points: ScanPoints, dt_s: NDArray[np.float64]) -> SweepPoints:
     """Points as a sweep holds them; tanh, as is customary, brings intensity, which has no limit, to 0..1."""
     intensity = np.tanh(np.maximum(points.intensity.astype(np.float64), 0))
     return SweepPoints(points.xyz.astype(np.float32), intensity.astype(np.float32), dt_s.astype(np.float32))
+
+
+# --- time -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class TurnClock:
+    """When the columns of the top LiDAR are measured: ``start_s`` after the frame's timestamp the turn begins, and
+    lasts ``duration_s``. ``measured``: found by comparing pixel poses with the vehicle's path; else the nominal
+    turn."""
+
+    start_s: float = 0.0
+    duration_s: float = TURN_S
+    measured: bool = False
+
+    def after_timestamp_s(self, turn: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Seconds after the frame's timestamp for parts of the turn (0..1)."""
+        return self.start_s + turn * self.duration_s
+
+
+def measure_turn(
+    poses: NDArray[np.float32], timestamp_s: float, path_times_s: NDArray[np.float64], path_xyz: NDArray[np.float64]
+) -> tuple[float, float] | None:
+    """Start (after the timestamp) and duration of a turn from where the vehicle was when each column was measured.
+
+    Args:
+        poses: f32[H, W, 6], pixel poses of the frame.
+        timestamp_s: of the frame.
+        path_times_s, path_xyz: f64[T], f64[T, 3]: places of the vehicle at known times around the frame, in time order.
+
+    Returns:
+        Seconds, or None where the vehicle moves too little, or its path does not explain the columns.
+    """
+    known = (poses != 0).any(2) & np.isfinite(poses).all(2)
+    columns = np.flatnonzero(known.sum(0) >= max(1, _MIN_ROWS_SHARE * len(known)))
+    if len(columns) < 10 or len(path_times_s) < 3:
+        return None
+    places = np.stack([poses[known[:, c], c, 3:].astype(np.float64).mean(0) for c in columns])
+    direction = path_xyz[-1] - path_xyz[0]
+    length = float(np.linalg.norm(direction))
+    if length < _MIN_MOTION_M:
+        return None
+    direction /= length
+    along_path = (path_xyz - path_xyz[0]) @ direction
+    along = (places - path_xyz[0]) @ direction
+    inside = (along >= along_path[0]) & (along <= along_path[-1])
+    if (np.diff(along_path) <= 0).any() or np.ptp(along) < _MIN_MOTION_M or inside.sum() < 10:
+        return None
+    times = np.interp(along[inside], along_path, path_times_s) - timestamp_s
+    turn = (columns[inside] + 0.5) / poses.shape[1]
+    duration, start = np.polyfit(turn, times, 1)
+    error = float(np.sqrt(np.mean((start + duration * turn - times) ** 2)))
+    if error > _MAX_FIT_ERROR_S or not 0.5 * TURN_S < abs(duration) < 2 * TURN_S:
+        return None
+    return float(start), float(duration)
+
+
+def median_clock(turns: Sequence[tuple[float, float]]) -> TurnClock:
+    """The clock of a log from the turns that could be measured.
+
+    Where they agree with the nominal turn within what the measurement can tell, and without any, it is the nominal one.
+    """
+    if not turns:
+        return TurnClock()
+    start, duration = (float(value) for value in np.median(np.array(turns), axis=0))
+    if max(abs(start), abs(start + duration - TURN_S)) <= _CLOCK_ERROR_S:
+        return TurnClock()
+    return TurnClock(start, duration, True)
 
 
 # --- cameras --------------------------------------------------------------------------------------

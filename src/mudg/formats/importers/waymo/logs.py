@@ -23,6 +23,7 @@ from mudg.base.errors import InputError
 from mudg.formats.importers.common import arrow_files, require_columns
 from mudg.formats.importers.waymo import records
 from mudg.formats.importers.waymo.records import CAMERAS, CONTEXT, FRAME, LASERS, FrameRecord, LaserScan, parse_message
+from mudg.formats.unknown_fields import note_unknown
 
 MAX_RECORD_BYTES: Final = 512 * 1024 * 1024
 """Real frames have 3 to 8 MB; what declares more than this is refused before any memory is taken."""
@@ -207,6 +208,8 @@ class TfrecordLog:
         self.cameras: Mapping[str, records.CameraCalibration]
         self.cameras = {name: _camera(name, item, where) for name, item in cameras}
         self.lasers: Mapping[str, records.LaserCalibration] = {name: _laser(name, item, where) for name, item in lasers}
+        stats = context.get("stats", {})
+        self.conditions = ", ".join(stats[key] for key in ("time_of_day", "weather", "location") if stats.get(key))
 
     def _compare_context(self, content: bytes, where: str) -> None:
         """Statistics may differ from frame to frame; the log and its calibrations may not."""
@@ -218,7 +221,7 @@ class TfrecordLog:
                 raise InputError("a camera's calibration changes within the log", where=f"{where}: camera {name}")
 
     def read(self, frame: FrameRecord, cameras: Sequence[str]) -> records.FrameContent:
-        """The bulky parts of a frame, of the chosen cameras."""
+        """The bulky parts of a frame; see ``WaymoLog``."""
         message = self._message(frame)
         images: dict[str, bytes] = {}
         panoptic: dict[str, records.Panoptic] = {}
@@ -234,6 +237,13 @@ class TfrecordLog:
             if _has_ranges(item)
         }
         return records.FrameContent(images, panoptic, scans)
+
+    def pixel_poses(self, frame: FrameRecord) -> NDArray[np.float32] | None:
+        """Poses of the top LiDAR's pixels f32[H, W, 6]; see ``WaymoLog``."""
+        for name, item in _named(self._message(frame)["lasers"], LASERS):
+            if name == records.TOP and item.get("return1", {}).get("poses"):
+                return records.float_image(item["return1"]["poses"], 6, f"{frame.where}: pixel poses")
+        return None
 
     def _message(self, frame: FrameRecord) -> dict[str, Any]:
         with store.open_file(self._path) as file:
@@ -305,12 +315,53 @@ _OBJECT: Final = "key.laser_object_id"
 _INTRINSIC: Final = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
 
 
+def _component(title: str, names: str = "", **parts: str) -> tuple[str, tuple[str, ...]]:
+    """Title and columns of a component: plain ``names``, and those of the parts ``part.name``."""
+    inner = (f"{part}.{name}" for part, within in parts.items() for name in within.split())
+    return f"{title}Component", (*names.split(), *inner)
+
+
 _VELOCITY: Final = tuple(f"velocity.{kind}_velocity.{axis}" for kind in ("linear", "angular") for axis in "xyz")
 _EXPOSURE: Final = tuple(
     f"rolling_shutter_params.{name}" for name in ("shutter", "camera_trigger_time", "camera_readout_done_time")
 )
 _BOX: Final = (*(f"box.{part}.{axis}" for part in ("center", "size") for axis in "xyz"), "box.heading")
 _STREAM_BYTES: Final = 1 << 20
+_TWO_RETURNS: Final = {"range_image_return1": "values shape", "range_image_return2": "values shape"}
+OFFICIAL: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
+    "camera_image": _component(
+        "CameraImage", " ".join(("image pose.transform pose_timestamp", *_VELOCITY, *_EXPOSURE))
+    ),
+    "camera_calibration": _component(
+        "CameraCalibration",
+        "extrinsic.transform width height rolling_shutter_direction",
+        intrinsic=" ".join(_INTRINSIC),
+    ),
+    "camera_segmentation": _component(
+        "CameraSegmentationLabel",
+        "panoptic_label panoptic_label_divisor sequence_id num_cameras_covered",
+        instance_id_to_global_id_mapping="local_instance_ids global_instance_ids is_tracked",
+    ),
+    "lidar": _component("LiDAR", **_TWO_RETURNS),
+    "lidar_box": _component(
+        "LiDARBox",
+        " ".join(("type num_lidar_points_in_box num_top_lidar_points_in_box", *_BOX)),
+        speed="x y z",
+        acceleration="x y z",
+        difficulty_level="detection tracking",
+    ),
+    "lidar_calibration": _component("LiDARCalibration", "extrinsic.transform", beam_inclination="min max values"),
+    "lidar_pose": _component("LiDARPose", range_image_return1="values shape"),
+    "stats": _component(
+        "Stats", "time_of_day location weather", lidar_object_counts="types counts", camera_object_counts="types counts"
+    ),
+    "vehicle_pose": _component("VehiclePose", "world_from_vehicle.transform"),
+}
+"""Folders that are read -> name of the component, and its columns, read or not. Source: the data set's published
+components."""
+_KEYS: Final = (_SEGMENT, _TIME, _CAMERA, _LASER, _OBJECT, "index", "__index_level_0__")
+"""Columns that every table may have; the last two are the index of pandas."""
+
 REQUIRED: Final = ("camera_image", "camera_calibration", "vehicle_pose")
 """Components without which there is no scene."""
 
@@ -336,9 +387,10 @@ class ParquetLog:
             remedy = "download the component: without it the scans of a moving vehicle are twisted"
             raise InputError(what, where=str(root), expected=f"lidar_pose/{segment}.parquet", remedy=remedy)
         self.frames: Sequence[FrameRecord] = self._frames(wanted)
+        self.conditions = self._conditions()
 
     def read(self, frame: FrameRecord, cameras: Sequence[str]) -> records.FrameContent:
-        """The bulky parts of a frame, of the chosen cameras. Reading frames in the order of time is fastest."""
+        """The bulky parts of a frame; see ``WaymoLog``. Reading frames in the order of time is fastest."""
         time = frame.timestamp_us
         images = {
             name: bytes(self._images.value(row, "[CameraImageComponent].image"))
@@ -358,16 +410,20 @@ class ParquetLog:
                     scans[name] = self._scan(self._lidar, frame, name, row)
         return records.FrameContent(images, panoptic, scans)
 
+    def pixel_poses(self, frame: FrameRecord) -> NDArray[np.float32] | None:
+        """Poses of the top LiDAR's pixels f32[H, W, 6]; see ``WaymoLog``."""
+        if self._poses is not None:
+            for name, row in self._poses.rows(frame.timestamp_us, _LASER, LASERS):
+                if name == records.TOP:
+                    return self._poses.image(row, "[LiDARPoseComponent].range_image_return1", 6)
+        return None
+
     def _scan(self, lidar: ParquetTable, frame: FrameRecord, name: str, row: int) -> LaserScan:
         found = [lidar.image(row, f"[LiDARComponent].range_image_return{n}", 4) for n in (1, 2)]
-        poses = None
-        if name == records.TOP and self._poses is not None:
-            for other, place in self._poses.rows(frame.timestamp_us, _LASER, LASERS):
-                if other == name:
-                    poses = self._poses.image(place, "[LiDARPoseComponent].range_image_return1", 6)
-            if poses is None:
-                what = "frame has no pixel poses"
-                raise InputError(what, where=f"{frame.where}: lidar_pose", expected="a row for the top LiDAR")
+        poses = self.pixel_poses(frame) if name == records.TOP else None
+        if name == records.TOP and poses is None:
+            what = "frame has no pixel poses"
+            raise InputError(what, where=f"{frame.where}: lidar_pose", expected="a row for the top LiDAR")
         return LaserScan([image for image in found if image is not None], poses)
 
     # --- facts ------------------------------------------------------------------------------------
@@ -418,9 +474,22 @@ class ParquetLog:
                 boxes.setdefault(int(row[_TIME]), []).append(box)
         return boxes
 
+    def _conditions(self) -> str:
+        table = self._table("stats")
+        if table is None:
+            return ""
+        names = tuple(f"[StatsComponent].{name}" for name in ("time_of_day", "weather", "location"))
+        found = table.columns((), optional=names)
+        return ", ".join(str(found[name][0]) for name in names if found[name] and found[name][0])
+
     def _table(self, component: str) -> ParquetTable | None:
         path = self._root / component / f"{self.name}.parquet"
-        return ParquetTable(path) if path.is_file() else None
+        if not path.is_file():
+            return None
+        table, (prefix, columns) = ParquetTable(path), OFFICIAL[component]
+        known = frozenset((*_KEYS, *(f"[{prefix}].{name}" for name in columns)))
+        note_unknown(f"{component}/*.parquet", table.names, known)
+        return table
 
     def _need(self, component: str) -> ParquetTable:
         table = self._table(component)
@@ -538,7 +607,3 @@ class ParquetTable:
         if batch is None or batch.num_rows != 1:
             raise InputError("table has fewer rows than it declares", where=f"{self.path}: row {row}")
         return batch.select(list(names))
-
-
-WaymoLog = TfrecordLog | ParquetLog
-"""A log in one of its two forms."""

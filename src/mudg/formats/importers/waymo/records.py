@@ -11,7 +11,7 @@ import struct
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Track
 from mudg.formats.importers.common import rigid_pose
 from mudg.formats.importers.drive_log import BoxTracks
+from mudg.formats.unknown_fields import note_unknown
 
 Matrix = NDArray[np.float64]
 Numbers = Sequence[float] | NDArray[np.float64]
@@ -141,6 +142,25 @@ class FrameContent:
     images: Mapping[str, bytes]
     panoptic: Mapping[str, Panoptic]
     scans: Mapping[str, LaserScan]
+
+
+class WaymoLog(Protocol):
+    """A log in one of its two forms."""
+
+    name: str
+    form: str
+    cameras: Mapping[str, CameraCalibration]
+    lasers: Mapping[str, LaserCalibration]
+    frames: Sequence[FrameRecord]
+    conditions: str
+
+    def read(self, frame: FrameRecord, cameras: Sequence[str]) -> FrameContent:
+        """The bulky parts of a frame, for the chosen cameras."""
+        ...
+
+    def pixel_poses(self, frame: FrameRecord) -> NDArray[np.float32] | None:
+        """Poses of the top LiDAR's pixels, or None where there are none."""
+        ...
 
 
 # --- records from the numbers of either form ------------------------------------------------------
@@ -407,10 +427,11 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A message description: the fields to keep by their numbers."""
+    """A message description; ``passed``: numbers of the data set's fields that are not kept."""
 
     name: str
     fields: Mapping[int, Field]
+    passed: frozenset[int] = frozenset()
 
 
 def parse_message(data: bytes | memoryview, message: Message, where: str) -> dict[str, Any]:
@@ -434,6 +455,8 @@ def parse_message(data: bytes | memoryview, message: Message, where: str) -> dic
     for start, number, wire, raw in reader.fields():
         field = message.fields.get(number)
         if field is None:
+            if number not in message.passed:
+                note_unknown(f"{message.name} messages", (f"field {number}",), frozenset())
             continue
         packed = wire == _BYTES and field.kind in ("doubles", "floats", "ints")
         if wire != _WIRE[field.kind] and not packed:
@@ -532,10 +555,12 @@ class _MessageReader:
 # --- the messages of the data set -----------------------------------------------------------------
 
 
-def _message(title: str, fields: str, **inner: Message) -> Message:
-    """A description from ``name number kind, ...``; where the name is one of ``inner``, that is its description."""
+def _message(title: str, fields: str, passed: str = "", **inner: Message) -> Message:
+    """A description from ``name number kind, ...``; where the name is one of ``inner``, that is its description.
+    ``passed``: numbers of official fields that are not kept."""
     rows = (row.split() for row in fields.split(","))
-    return Message(title, {int(number): Field(name, kind, inner.get(name)) for name, number, kind in rows})
+    wanted = {int(number): Field(name, kind, inner.get(name)) for name, number, kind in rows}
+    return Message(title, wanted, frozenset(map(int, passed.split())))
 
 
 _TRANSFORM = _message("Transform", "values 1 doubles")
@@ -551,9 +576,10 @@ _LASER_CALIBRATION = _message(
 )
 CONTEXT: Final = _message(
     "Context",
-    "name 1 text, cameras 2 messages, lasers 3 messages",
+    "name 1 text, cameras 2 messages, lasers 3 messages, stats 4 message",
     cameras=_CAMERA_CALIBRATION,
     lasers=_LASER_CALIBRATION,
+    stats=_message("Stats", "time_of_day 2 text, location 3 text, weather 4 text", "1 5"),
 )
 _CAMERA_IMAGE = _message(
     "CameraImage",
@@ -561,21 +587,22 @@ _CAMERA_IMAGE = _message(
     "trigger_s 7 double, done_s 8 double, panoptic 10 message",
     pose=_TRANSFORM,
     velocity=_message("Velocity", "v_x 1 float, v_y 2 float, v_z 3 float, w_x 4 double, w_y 5 double, w_z 6 double"),
-    panoptic=_message("CameraSegmentationLabel", "divisor 1 int, png 2 bytes"),
+    panoptic=_message("CameraSegmentationLabel", "divisor 1 int, png 2 bytes", "3 4 5"),
 )
-_RANGE_IMAGE = _message("RangeImage", "ranges 2 bytes, poses 4 bytes")
+_RANGE_IMAGE = _message("RangeImage", "ranges 2 bytes, poses 4 bytes", "1 3 5 6")
 _BOX = _message(
     "Box", "x 1 double, y 2 double, z 3 double, width 4 double, length 5 double, height 6 double, heading 7 double"
 )
 FRAME: Final = _message(
     "Frame",
     "context 1 bytes, timestamp_us 2 int, pose 3 message, images 4 messages, lasers 5 messages, labels 6 messages",
+    "7 8 9 10 11",
     pose=_TRANSFORM,
     images=_CAMERA_IMAGE,
     lasers=_message(
         "Laser", "name 1 int, return1 2 message, return2 3 message", return1=_RANGE_IMAGE, return2=_RANGE_IMAGE
     ),
-    labels=_message("Label", "box 1 message, type 3 int, id 4 text", box=_BOX),
+    labels=_message("Label", "box 1 message, type 3 int, id 4 text", "2 5 6 7 8 9 10 11 12 13", box=_BOX),
 )
 MATRIX_FLOAT: Final = _message(
     "MatrixFloat", "data 1 floats, shape 2 message", shape=_message("MatrixShape", "dims 1 ints")
