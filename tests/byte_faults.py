@@ -78,6 +78,7 @@ def _within(suffix: str) -> Damage | None:
         ".spz": _in_gzip,
         ".npz": _in_zip,
         ".sog": _in_zip,
+        ".glb": _in_json_of_glb,
         ".tfrecord": _in_record,
         ".png": _in_png,
     }.get(suffix)
@@ -96,6 +97,14 @@ def _in_zip(content: bytes, rng: np.random.Generator) -> bytes:
     files = {name: archive.read(name) for name in archive.namelist()}
     chosen = list(files)[int(rng.integers(len(files)))]
     return binary.stored_zip({**files, chosen: damaged(files[chosen], rng)})
+
+
+def _in_json_of_glb(content: bytes, rng: np.random.Generator) -> bytes:
+    size = int.from_bytes(content[12:16], "little")
+    text = damaged(content[20 : 20 + size], rng)
+    text += b" " * (-len(text) % 4)
+    rest = content[20 + size :]
+    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(rest), len(text), b"JSON") + text + rest
 
 
 def _in_record(content: bytes, rng: np.random.Generator) -> bytes:

@@ -149,6 +149,65 @@ def sog(lossy: str = "", **fields: Any) -> bytes:
     return target.getvalue()
 
 
+def glb(
+    table: Sequence[Mapping[str, float]] = ROWS,
+    *,
+    plain: bool = True,
+    kind: Mapping[str, Any] | None = None,
+    node: Mapping[str, Any] | None = None,
+    document: Mapping[str, Any] | None = None,
+    view: Mapping[str, Any] | None = None,
+    turn_length: float = 1.0,
+    more: str = "",
+) -> bytes:
+    """Gaussians as a GLB file. plain: opacities and sizes as the standard says, else logits and logarithms. kind:
+    fields of the extension. node, document, view: further fields of the node, the document, the first buffer view.
+    more: name of a further attribute."""
+    prefix = "KHR_gaussian_splatting:"
+    width = {"POSITION": 3, "ROTATION": 4, "SCALE": 3, "OPACITY": 1, "SH_DEGREE_0_COEF_0": 3}
+    width |= {more: 3} if more else {}
+    parts = dict.fromkeys(width, b"")
+    for row in table:
+        size = [row[f"scale_{c}"] for c in range(3)]
+        w, x, y, z = (turn_length * row[f"rot_{c}"] for c in range(4))
+        opacity = row["opacity"]
+        parts["POSITION"] += struct.pack("<3f", row["x"], row["y"], row["z"])
+        parts["ROTATION"] += struct.pack("<4f", x, y, z, w)
+        parts["SCALE"] += struct.pack("<3f", *(map(math.exp, size) if plain else size))
+        parts["OPACITY"] += struct.pack("<f", 1 / (1 + math.exp(-opacity)) if plain else opacity)
+        parts["SH_DEGREE_0_COEF_0"] += struct.pack("<3f", *(row[f"f_dc_{c}"] for c in range(3)))
+        if more:
+            parts[more] += bytes(12)
+    offsets = [sum(len(p) for p in list(parts.values())[:n]) for n in range(len(parts))]
+    extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", **(kind or {})}
+    extension = {name: value for name, value in extension.items() if value is not None}
+    attributes = {name if name == "POSITION" else prefix + name: n for n, name in enumerate(width)}
+    primitive = {"mode": 0, "attributes": attributes, "extensions": {"KHR_gaussian_splatting": extension}}
+    types = [{1: "SCALAR", 3: "VEC3", 4: "VEC4"}[w] for w in width.values()]
+    made: dict[str, Any] = {
+        "asset": {"version": "2.0"},
+        "extensionsUsed": ["KHR_gaussian_splatting"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, **(node or {})}],
+        "meshes": [{"primitives": [primitive]}],
+        "buffers": [{"byteLength": sum(map(len, parts.values()))}],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": at, "byteLength": len(p)} for at, p in zip(offsets, parts.values())
+        ],
+        "accessors": [
+            {"bufferView": n, "componentType": 5126, "count": len(table), "type": kind} for n, kind in enumerate(types)
+        ],
+        **(document or {}),
+    }
+    made["bufferViews"][0] |= view or {}
+    text = json.dumps(made).encode()
+    text += b" " * (-len(text) % 4)
+    content = b"".join(parts.values())
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(content), b"BIN\0") + content
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
 def splat(table: Sequence[Mapping[str, float]] = ROWS, logs: bool = False) -> bytes:
     """Gaussians as a .splat file; logs: with logarithms of sizes, which the format does not have."""
     made = b""

@@ -100,7 +100,7 @@ def test_an_independent_reader_finds_what_was_written(name: str, degree: int) ->
     assert_close(as_cloud(READERS[name](content_of(name, cloud))), cloud, steps(name, cloud), activated=True)
 
 
-@pytest.mark.parametrize(("name", "degree"), [case for case in CASES if formats.FORMATS[case[0]].read])
+@pytest.mark.parametrize(("name", "degree"), [case for case in CASES if case[0] != "usda"])
 def test_what_is_read_back_differs_by_at_most_one_step(name: str, degree: int) -> None:
     cloud = toy_splats.cloud(700, degree, 4)
     content = content_of(name, cloud)

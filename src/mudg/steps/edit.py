@@ -133,7 +133,7 @@ class AssetImport(Result):
     examples = ("mudg asset import van.ply --label van --length-m 5.2 --out assets/van.safetensors",)
     result = "asset"
     file: Annotated[Path, Flag("FILE", "first")]
-    """File of Gaussians (.ply, .spz, .splat, .sog)."""
+    """File of Gaussians (.ply, .spz, .splat, .sog, .glb)."""
     out: Annotated[Path, Flag("FILE.safetensors")]
     """File to write; with --kind scene, folder to write."""
     overwrite: bool = False

@@ -150,7 +150,9 @@ FORMATS: Final[Mapping[str, SplatFormat]] = {
         ".ply", "RDF", "harmonics classes antialias", lambda r: ply.to_bytes(r.cloud, True, r.marks), ply.from_bytes
     ),
     "spz": _format(".spz", "RUB", "harmonics antialias", lambda r: spz.to_bytes(r.cloud, r.antialias), spz.from_bytes),
-    "glb": _format(".glb", "FUR", "harmonics motion antialias", lambda r: gltf.to_bytes(r.scene, r.time_s)),
+    "glb": _format(
+        ".glb", "FUR", "harmonics motion antialias", lambda r: gltf.to_bytes(r.scene, r.time_s), gltf.from_bytes
+    ),
     "usda": _format(".usda .usd", axes.WORLD, _MOVING, lambda r: usd.to_text(r.scene, r.time_s, log=r.log)),
     "usdz": _format(".usdz", axes.WORLD, f"{_MOVING} sky", lambda r: usd.to_package(r.scene, r.time_s, r.log)),
     "alpasim": _format(
@@ -175,8 +177,8 @@ _UNREAD: Final[Mapping[str, str]] = {
     ".ksplat": "convert it, for example with splat-transform in.ksplat out.ply",
     ".lcc": "convert it, for example with splat-transform",
     ".json": "give the .sog file that holds meta.json and its pictures (splat-transform meta.json out.sog)",
-    **dict.fromkeys((".glb", ".gltf"), "convert it, for example with splat-transform in.glb out.ply"),
-    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "export it again as ply or spz"),
+    ".gltf": "pack it with its buffers into a .glb file",
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "export it again as ply, spz or glb"),
     ".ckpt": _OF_TRAINING,
     ".pt": _OF_TRAINING,
     ".pth": _OF_TRAINING,
@@ -197,7 +199,7 @@ def format_of(content: bytes, name: str) -> str:
     suffix = PurePath(name).suffix.lower()
     if content[:3] == b"ply":
         return "compressed-ply" if ply.is_compressed(content) else "ply"
-    for mark, found in ((b"\x1f\x8b", "spz"), (b"NGSP", "spz"), (b"PK\x03\x04", "sog")):
+    for mark, found in ((b"\x1f\x8b", "spz"), (b"NGSP", "spz"), (b"glTF", "glb"), (b"PK\x03\x04", "sog")):
         if content.startswith(mark):
             if suffix == ".usdz":
                 break
