@@ -604,4 +604,4 @@ def test_views_agree_and_a_drive_without_green_stays() -> None:
     settings = Conditions(season=SeasonSettings(leaves="bare"))
     assert np.array_equal(relight.in_season(grey, view, settings.season, 1).color, grey.color)
     assert not np.array_equal(weather.apply(buffer, settings, view, 0.0, 1), buffer.color)
-    assert np.array_equal(weather.apply(buffer, Conditions(), view, 0.0, 1).color, buffer.color)
+    assert np.array_equal(weather.apply(buffer, Conditions(), view, 0.0, 1), buffer.color)
