@@ -45,12 +45,14 @@ class DeformationField(StaticNode):
     the log, seconds. ``layers``, ``width``: of the network."""
 
     kind = "deformation"
+    facts = ("name", "span_s", "layers", "width")
     learnt: Table
 
     def __init__(self, name: str, span_s: tuple[float, float], layers: int, width: int, learnt: Table) -> None:
         super().__init__(name)
-        self.span_s, self.layers, self.width, self.learnt = span_s, layers, width, learnt
-        self.network = network_of(layers, width)
+        first, last = map(float, span_s)
+        self.span_s, self.layers, self.width, self.learnt = (first, last), int(layers), int(width), learnt
+        self.network = network_of(self.layers, self.width)
 
     @classmethod
     def fresh(
@@ -71,18 +73,6 @@ class DeformationField(StaticNode):
         return self.network(
             self.learnt["network"], torch.cat([waves(place, PLACE_OCTAVES), same.expand(len(place), -1)], 1)
         )
-
-    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """See ``StaticNode``."""
-        facts = {"name": self.name, "span_s": list(self.span_s), "layers": self.layers, "width": self.width}
-        return facts, self.learnt.state()
-
-    @classmethod
-    def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> DeformationField:
-        """Inverse of ``state``."""
-        first, last = map(float, facts["span_s"])
-        sizes = int(facts["layers"]), int(facts["width"])
-        return cls(str(facts["name"]), (first, last), *sizes, Table.from_state(tensors))
 
 
 def network_of(layers: int, width: int) -> FlatNetwork:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, Final
+from typing import ClassVar, Final
 
 import numpy as np
 import torch
@@ -56,6 +56,7 @@ class VibrationNode(StaticNode):
     state at t - D is carried by D times the average velocity (temporal smoothing, while fitting)."""
 
     kind = "vibration"
+    facts = ("name", "middle_s", "frame_s")
     short_life = 0.01
 
     def __init__(self, name: str, middle_s: float, frame_s: float, early: float = 0.0) -> None:
@@ -92,15 +93,6 @@ class VibrationNode(StaticNode):
         moved = columns["means"] + average_velocity(columns["velocity"], beta) * later[:, None]
         shorter = math.log(SHRINK) * (beta >= self.short_life) if late else torch.zeros_like(beta)
         return {**columns, "means": moved, "tau": columns["tau"] + later, "log_beta": columns["log_beta"] - shorter}
-
-    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """See ``StaticNode``."""
-        return {"name": self.name, "middle_s": self.middle_s, "frame_s": self.frame_s}, {}
-
-    @classmethod
-    def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> VibrationNode:
-        """Inverse of ``state``."""
-        return cls(str(facts["name"]), float(facts["middle_s"]), float(facts["frame_s"]))
 
 
 def average_velocity(velocity: Tensor, beta: Tensor) -> Tensor:

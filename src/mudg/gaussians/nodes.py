@@ -161,11 +161,13 @@ class StaticNode(Node):
     """Rows already in the world."""
 
     kind = "static"
+    facts: ClassVar[tuple[str, ...]] = ("name",)
+    """Attributes that rebuild the node, beside the table of what it learns."""
     short_life: ClassVar[float] = 0.0
     """Life span (column ``log_beta``) above which densification splits a Gaussian in time, below which it copies it."""
 
     def __init__(self, name: str = "background") -> None:
-        self.name = name
+        self.name = str(name)
 
     def born_later(self, columns: Mapping[str, Tensor], noise: Tensor, late: bool) -> dict[str, Tensor]:
         """Children of split rows in time; Gaussians without a life span are there at all times."""
@@ -173,12 +175,13 @@ class StaticNode(Node):
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """What rebuilds the node: plain JSON values and tensors."""
-        return {"name": self.name}, {}
+        return {name: getattr(self, name) for name in self.facts}, {} if self.learnt is None else self.learnt.state()
 
     @classmethod
-    def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> StaticNode:
+    def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Self:
         """Inverse of ``state``."""
-        return cls(str(facts["name"]))
+        learnt = (Table.from_state(tensors),) if tensors else ()
+        return cls(*(facts[name] for name in cls.facts), *learnt)
 
 
 class RigidNode(Node):

@@ -7,8 +7,7 @@ Steps count from 1 to the length of the run; a fit that goes on with a finished 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -27,8 +26,9 @@ from mudg.gaussians.settings import DensifyConfig, FitConfig, StartConfig
 # optimiser. On the CPU each is looked at as soon as it is known. On another device looking means waiting for all that
 # was sent there, so the numbers of a whole step are gathered there and come back in one copy.
 
-Complaint = Callable[[float], None]
-"""Raises for a number that is not finite; returns where it only overflowed."""
+SCENE_REMEDY = "the parameters are those of the step before; report the scene, or leave this view out"
+VIEW_REMEDY = "the parameters are those of the step before; leave this view out"
+TERM_REMEDY = "check this view's image and labels; the parameters are those of the step before"
 
 
 class FiniteCheck:
@@ -36,58 +36,49 @@ class FiniteCheck:
     ``at_once``: look at every number when it is added, not in ``refuse``."""
 
     def __init__(self, step: int, at_once: bool) -> None:
-        self._step = step
-        self._at_once = at_once
-        self._added: list[tuple[Tensor, Complaint]] = []
+        self._step, self._at_once = step, at_once
+        self._numbers: list[Tensor] = []
+        self._facts: list[tuple[str, str, str, tuple[Table, Tensor] | None]] = []
+        """Of each number: what it is, where, the remedy; of a sum of gradients their table and themselves."""
 
     def terms(self, view: str, terms: Mapping[str, Tensor]) -> None:
         """Add the loss terms of a view."""
-        where = f"view {view}, step {self._step}"
-        self._add([(value.detach(), partial(_refuse_term, name, where)) for name, value in terms.items()])
+        for name, value in terms.items():
+            self._numbers.append(value.detach())
+            self._facts.append((f"the loss term {name!r}", f"view {view}, step {self._step}", TERM_REMEDY, None))
+        if self._at_once:
+            self.refuse()
 
     def gradients(self, view: str, model: SceneModel, appearance: Appearance) -> None:
         """Add the gradients after the backward pass of a view, by their sums: the cheapest pass over memory there
         is."""
         learnt = {"gaussians": model.table, **model.node_tables()}
         learnt |= {f"appearance {group}": table for group, table in appearance.tables.items()}
-        numbers: list[tuple[Tensor, Complaint]] = []
         for owner, table in learnt.items():
             remedy = VIEW_REMEDY if owner.startswith("appearance ") else SCENE_REMEDY
             for name, gradient in table.gradients().items():
                 where = f"{owner}.{name}, view {view}, step {self._step}"
-                numbers.append((gradient.sum(), partial(_refuse_gradient, table, gradient, where, remedy)))
-        self._add(numbers)
+                self._numbers.append(gradient.sum())
+                self._facts.append(("a gradient", where, remedy, (table, gradient)))
+        if self._at_once:
+            self.refuse()
 
     def refuse(self) -> None:
         """NumericsError naming the first of the numbers that is not finite, if there is one; no parameter has been
         touched."""
-        added, self._added = self._added, []
-        if added:
-            numbers = torch.stack([number for number, _ in added]).tolist()
-            for number, (_, complain) in zip(numbers, added):
-                if not math.isfinite(number):
-                    complain(number)
-
-    def _add(self, numbers: list[tuple[Tensor, Complaint]]) -> None:
-        self._added += numbers
-        if self._at_once:
-            self.refuse()
-
-
-SCENE_REMEDY = "the parameters are those of the step before; report the scene, or leave this view out"
-VIEW_REMEDY = "the parameters are those of the step before; leave this view out"
-
-
-def _refuse_term(name: str, where: str, number: float) -> None:
-    remedy = "check this view's image and labels; the parameters are those of the step before"
-    raise NumericsError(f"the loss term {name!r} is not finite", where=where, got=str(number), remedy=remedy)
-
-
-def _refuse_gradient(table: Table, gradient: Tensor, where: str, remedy: str, number: float) -> None:
-    count = int((~torch.isfinite(gradient)).sum())
-    if count:  # else the sum overflowed
-        table.clear_gradients()
-        raise NumericsError("a gradient is not finite", where=where, got=f"{count} values", remedy=remedy)
+        numbers = torch.stack(self._numbers).tolist() if self._numbers else []
+        facts, self._numbers, self._facts = self._facts, [], []
+        for number, (what, where, remedy, summed) in zip(numbers, facts):
+            if math.isfinite(number):
+                continue
+            got = str(number)
+            if summed is not None:
+                count = int((~torch.isfinite(summed[1])).sum())
+                if not count:  # only the sum overflowed
+                    continue
+                summed[0].clear_gradients()
+                got = f"{count} values"
+            raise NumericsError(f"{what} is not finite", where=where, got=got, remedy=remedy)
 
 
 # short fits: good enough to learn from what a fit gets wrong, in a few seconds --------------------

@@ -149,19 +149,15 @@ def unseen_maps(
     Pixels without depth count as sky, far away. Depends on the geometry the model has by now.
     """
     chosen = np.unique(np.linspace(0, len(recorded) - 1, min(WITNESSES, len(recorded))).round().astype(int))
-    witnesses = [_witness(model, recorded[i].view, raster) for i in chosen]
+    witnesses = []
+    for view in (recorded[index].view for index in chosen):
+        width = min(WITNESS_WIDTH_PX, view.camera.width)
+        small = view.resized(width, max(1, round(view.camera.height * width / view.camera.width)))
+        render = rasterize(compose(model, view.time_s, semantics=False), small, raster)
+        witnesses.append(_Witness(small, torch.where(render.alpha > 0.5, render.depth, torch.inf)[0].cpu().numpy()))
     objects = [(node.size_m, cache(node.pose_matrix)) for node in model.nodes if isinstance(node, RigidNode)]
     for stored in log.progress(virtual, len(virtual), "finding unseen surfaces"):
         yield stored, _unseen(stored, witnesses, objects)
-
-
-def _witness(model: SceneModel, view: View, raster: RasterConfig) -> _Witness:
-    camera = view.camera
-    width = min(WITNESS_WIDTH_PX, camera.width)
-    small = view.resized(width, max(1, round(camera.height * width / camera.width)))
-    render = rasterize(compose(model, view.time_s, semantics=False), small, raster)
-    depth = torch.where(render.alpha > 0.5, render.depth, torch.inf)
-    return _Witness(small, depth[0].cpu().numpy())
 
 
 def block_centres(size_px: int) -> NDArray[np.intp]:

@@ -25,7 +25,7 @@ from PIL import Image
 from scipy import ndimage
 
 from mudg import native
-from mudg.base import geometry, html, log, palette, store
+from mudg.base import geometry, html, log, store
 from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.processes import one_torch_thread, run_in_processes
@@ -293,7 +293,7 @@ def write_page(scene: Scene, made: set[str], out: Path) -> Path:
         for frame in spread(labelled or scene.frames_of(camera), _FRAMES):
             name = f"pictures/{frame.id.replace('/', '_')}.jpg"
             store.write_image(out / name, picture(scene, frame), quality=88)
-            pictures.append({"file": name, "caption": _caption(scene, frame)})
+            pictures.append({"file": name, "caption": f"{frame.id}, {frame.view.time_s:.2f} s"})
     lead = "Image; depth (near warm, far cold, darker where unsure); classes, with dynamic objects outlined in red; "
     known = {"title": f"Labels of {scene.id}", "kicker": "mudg annotate", "notes": scene.source.notes}
     known |= {"lead": f"{lead}confidence of the classes.", "class_legend": html.class_legend(), "pictures": pictures}
@@ -301,23 +301,15 @@ def write_page(scene: Scene, made: set[str], out: Path) -> Path:
     return out / NAME
 
 
-def _caption(scene: Scene, frame: Frame) -> str:
-    parts = [frame.id, f"{frame.view.time_s:.2f} s"]
-    if "depth" in frame.labels:
-        depth = read_label(scene, frame, "depth")
-        parts.append(f"depth known {100 * np.isfinite(depth).mean():.0f} %")
-    if "semantics" in frame.labels:
-        known = read_label(scene, frame, "semantics") != palette.UNLABELLED
-        parts.append(f"classes known {100 * known.mean():.0f} %")
-    return ", ".join(parts)
-
-
 def picture(scene: Scene, frame: Frame) -> Image.Image:
     """Image, depth, classes and confidence beside each other; what a frame lacks is black."""
     rgb = read_image(scene, frame)
     panels = [rgb, np.zeros_like(rgb), np.zeros_like(rgb), np.zeros_like(rgb)]
     if "depth" in frame.labels:
-        panels[1] = _depth_picture(scene, frame)
+        panels[1] = depth_colors(read_label(scene, frame, "depth"))
+    if "depth_confidence" in frame.labels:
+        sure = read_label(scene, frame, "depth_confidence")
+        panels[1] = (panels[1] * (0.35 + 0.65 * sure[..., None])).astype(np.uint8)
     if "semantics" in frame.labels:
         colors = class_colors(read_label(scene, frame, "semantics"))
         panels[2] = (0.45 * rgb + 0.55 * colors).astype(np.uint8)
@@ -328,14 +320,6 @@ def picture(scene: Scene, frame: Frame) -> Image.Image:
         panels[3] = gray(read_label(scene, frame, "semantics_confidence"))
     height = max(1, round(rgb.shape[0] * _WIDTH_PX / rgb.shape[1]))
     return Image.fromarray(np.concatenate([resize_area(panel, _WIDTH_PX, height) for panel in panels], 1))
-
-
-def _depth_picture(scene: Scene, frame: Frame) -> NDArray[np.uint8]:
-    colors = depth_colors(read_label(scene, frame, "depth"))
-    if "depth_confidence" in frame.labels:
-        sure = read_label(scene, frame, "depth_confidence")
-        colors = (colors * (0.35 + 0.65 * sure[..., None])).astype(np.uint8)
-    return colors
 
 
 # annotate -----------------------------------------------------------------------------------------
