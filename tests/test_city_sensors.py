@@ -32,7 +32,7 @@ from mudg.city.sensors import (
 from mudg.city.world import CityWorld
 from mudg.core.weather.light import srgb_decode, srgb_encode
 from mudg.diffusion import city_clips
-from mudg.diffusion.city_clips import CityLog, record_with_faults
+from mudg.diffusion.city_clips import record_with_faults
 
 needs_native = pytest.mark.skipif(native.library() is None, reason="the native library is not built")
 
@@ -206,17 +206,6 @@ def test_the_image_of_a_view_fits_it_and_the_truth_is_exact(small: CityConfig) -
     sideways = city_clips.shifted_view(log.world, view, 1.0)
     step = log.claimed(sideways).center_world - claimed.center_world
     assert np.linalg.norm(step) == pytest.approx(1.0, abs=1e-9)
-
-
-@needs_native
-def test_without_faults_the_log_is_the_exact_one(small: CityConfig) -> None:
-    log = record_with_faults(small, SensorFaults(), range(4), 77)
-    truth = CityLog(log.world, log.cloud, log.recorded)
-    for a, b in zip(log.tracks(), truth.tracks(), strict=True):
-        assert np.allclose(a.world_from_object, b.world_from_object)
-    view = log.world.frame_views("front")[1]
-    assert np.allclose(log.claimed(view).world_from_cam, view.world_from_cam)
-    assert np.array_equal(log.recorded[1].rgb, log.world.render(view).rgb_u8)
 
 
 # --- the distribution -----------------------------------------------------------------------------

@@ -98,13 +98,6 @@ def test_learning_on_the_same_few_clips_lowers_the_loss(clips, tmp_path):
     assert totals[-1] < 0.95 * totals[0]  # measured: 0.90
 
 
-def test_batches_depend_on_step_only(clips):
-    source = learn.clips_of_cities(tiny(clips), clips)
-    first, again, other = (source.draw(step, 2, 2, "batch") for step in (7, 7, 8))
-    assert all(torch.equal(one.rgb, two.rgb) for one, two in zip(first, again, strict=True))
-    assert not torch.equal(first[0].rgb, other[0].rgb)
-
-
 def test_cities_that_are_skipped_are_never_drawn(clips):
     config = with_settings(tiny(clips, cities=2, first_cities=2), skip_cities=1, augment=False)
     source = learn.clips_of_cities(config, clips)
