@@ -205,7 +205,7 @@ def test_the_finisher_starts_from_the_stated_error_not_from_the_confidence():
 
 def gradients(model, clips):
     model.zero_grad(set_to_none=True)
-    loss = model.loss(clips, BatchPart(0, 0, 0, len(clips)), LossSettings(1.0, 0.2))
+    loss = model.loss(clips, BatchPart(0, 0, 0, len(clips)), LossSettings(None, 1.0, 0.2))
     loss.total.backward()
     return loss, {name: None if p.grad is None else p.grad.clone() for name, p in model.named_parameters()}
 
@@ -262,7 +262,7 @@ def test_a_patch_is_finished_from_its_own_part_of_its_own_clip(monkeypatch, row,
     stated["rgb"][:, :, :3] = functional.avg_pool2d(of_clips, 2).unflatten(0, (2, frames))
     monkeypatch.setattr(model, "refine", refined)
     monkeypatch.setattr(model.finisher, "forward", finished)
-    model._finisher_terms(stated, encoded, clips)
+    model._finisher_terms(stated, encoded, clips, LossSettings(None, 1.0, 0.2))
     made, scale = seen[0]
     assert scale.tolist() == [2.0] * frames
     assert made.rgb.shape == (frames, 3, 2 * side, 2 * side)

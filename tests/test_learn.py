@@ -14,7 +14,7 @@ from mudg.base import checkpoint
 from mudg.base.config import load
 from mudg.base.errors import InputError, NumericsError, ResourceError, UsageError
 from mudg.diffusion import city_clips, learn, model_files, models, score
-from mudg.diffusion.clips import await_shard, read_clip
+from mudg.diffusion.clips import await_shard, class_weights, read_clip
 from mudg.diffusion.model import MDM
 from mudg.diffusion.parallel import TrainingState
 from mudg.diffusion.requests import GeneratedClip
@@ -81,6 +81,12 @@ def test_training_continues_from_a_model(clips, whole, tmp_path):
         await_shard(tmp_path, 1, patience_s=0.0)
 
 
+def test_class_weights_lift_rare_classes(clips):
+    assert torch.equal(class_weights(clips, range(2), 0.0), torch.ones(19))
+    weight = class_weights(clips, range(2), 0.5)
+    assert float(weight[13]) > float(weight[0])
+
+
 def test_numbers_that_are_not_finite_are_named_and_kept_out(clips, tmp_path):
     with pytest.raises(NumericsError, match=r"network(.|\n)*step \d"):
         Learn(out=tmp_path / "run", settings=tiny(clips, lr=1e30, steps=20, checkpoint_every=1)).run()
@@ -120,7 +126,7 @@ def test_schedules(clips):
     assert {learn.learning_rate(constant, step) for step in range(100)} == {1e-5}
     config = with_settings(tiny(clips), first_cities=40)  # fewer than training begins with are not waited for
     assert config.data.cities < config.data.first_cities
-    assert learn.clips_of_cities(config, clips).in_use(0) == range(config.data.cities)
+    assert learn.clips_of_cities(config, clips).weighed() == range(config.data.cities)
 
 
 def test_perfect_samples_score_perfectly_and_confidence_ranks(clips):

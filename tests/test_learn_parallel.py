@@ -17,6 +17,7 @@ from toy_clips import losses_of, tiny, training_words, write_clips
 from mudg.base import checkpoint, store
 from mudg.base.errors import IntegrityError, NumericsError, UsageError
 from mudg.diffusion import learn, model_files, models, parallel
+from mudg.diffusion.clips import class_weights
 from mudg.diffusion.model import MDM, BatchPart, LossSettings
 from mudg.diffusion.parallel import Ranks, TrainingState, read_rows
 from mudg.steps.synthesize import Learn
@@ -137,7 +138,7 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(clips):
     model = MDM(models.model_config(tiny(clips)))
     models.draw_weights(model.net, 0, "weights")
     settings = tiny(clips)
-    rules = LossSettings(refined_share=0.5, reference_dropout=0.2)
+    rules = LossSettings(class_weights(clips, range(2), 0.5), refined_share=0.5, reference_dropout=0.2)
 
     def loss(part, step):
         drawn = learn.clips_of_cities(settings, clips).draw(step, 4, 2, "batch", part)

@@ -101,7 +101,7 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
     @torch.no_grad()
     def losses(step, part):
         drawn = corners(settings, clips, step, 2, 4, "batch", part)
-        return model(drawn, BatchPart(settings.seed, step, part.start, 2), LossSettings(1.0, 0.2))
+        return model(drawn, BatchPart(settings.seed, step, part.start, 2), LossSettings(None, 1.0, 0.2))
 
     for step in range(2):
         whole, parts = losses(step, slice(0, 2)), [losses(step, slice(n, n + 1)) for n in (0, 1)]
@@ -124,7 +124,9 @@ def test_unknown_truth_has_no_part_in_the_loss(converted, clips):
         for clip in drawn
     ]
     with torch.no_grad():
-        terms, without = (model(some, BatchPart(0, 0, 0, 4), LossSettings(1.0, 0.2)).terms for some in (drawn, nothing))
+        terms, without = (
+            model(some, BatchPart(0, 0, 0, 4), LossSettings(None, 1.0, 0.2)).terms for some in (drawn, nothing)
+        )
     assert {"depth", "semantics"} & set(terms)
     assert all(terms[m] > 0 and without[m] == 0 for m in ("depth", "semantics") if m in terms)
 
@@ -175,7 +177,7 @@ def test_frame_0_shows_the_reference_also_where_the_tokens_go_without(converted,
     model = models.starting_model(settings)
     (clip,) = corners(settings, clips, 0, 1, 4, "batch")
     other = replace(clip, condition=replace(clip.condition, reference=1 - clip.condition.reference))
-    rules = LossSettings(1.0, 1.0)
+    rules = LossSettings(None, 1.0, 1.0)
     with torch.no_grad():
         loss, again, changed = (float(model([one], BatchPart(0, 0, 0, 1), rules).total) for one in (clip, clip, other))
     assert loss == again != changed

@@ -172,12 +172,12 @@ def test_pixel_terms_at_known_values():
     weight = 1.0 + 2.0 * (ids == 10).unsqueeze(1)
     assert float(losses.image_error(rgb, square=2.0, gradient=0.5)) == 0
     assert float(losses.depth_code_error(code, code, weight, 1.0)) == 0
-    assert float(losses.class_error(scores, ids)) == pytest.approx(0, abs=1e-6)
+    assert float(losses.class_error(scores, ids, None)) == pytest.approx(0, abs=1e-6)
     assert float(losses.stated_error(torch.full_like(code, -3.0), rgb)) == pytest.approx(-3.0)
     assert float(losses.image_error(rgb + 0.1, square=2.0, gradient=0.5)) == pytest.approx(0.1 + 2 * 0.01, rel=1e-5)
     apart = losses.depth_code_error(code + 0.1, code, weight, log_per_code=2.0)
     assert float(apart) == pytest.approx(5 * float(weight.mean()) * (math.expm1(0.2) - 0.0025), rel=1e-4)
-    assert float(losses.class_error(scores, torch.full_like(ids, 255))) == 0
+    assert float(losses.class_error(scores, torch.full_like(ids, 255), None)) == 0
     error = torch.full((1, 3, 4, 4), 0.3, requires_grad=True)
     log_error = torch.full((1, 1, 4, 4), -1.0, requires_grad=True)
     losses.stated_error(log_error, error).backward()
@@ -194,4 +194,6 @@ def test_latent_terms_at_known_values():
     shares = torch.zeros(1, 1, 3, 1, 2)
     shares[:, :, 0, :, 0] = 1.0  # one cell of class 0, one without a class
     stated = torch.full_like(shares, math.log(1 / 3))
-    assert float(losses.share_cross_entropy(stated, shares)) == pytest.approx(math.log(3) / 2, rel=1e-6)
+    assert float(losses.share_cross_entropy(stated, shares, None)) == pytest.approx(math.log(3) / 2, rel=1e-6)
+    weighted = losses.share_cross_entropy(stated, shares, torch.tensor([2.0, 1.0, 1.0]))
+    assert float(weighted) == pytest.approx(math.log(3), rel=1e-6)

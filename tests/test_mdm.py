@@ -145,7 +145,7 @@ def test_loss_falls_when_a_clip_is_learnt(config):
     totals = []
     for step in range(28):
         # the same draws at every fourth step: a falling loss cannot come from an easier draw
-        losses = model.loss([clip], BatchPart(0, step % 4, 0, 1), LossSettings(1.0, 0.2))
+        losses = model.loss([clip], BatchPart(0, step % 4, 0, 1), LossSettings(None, 1.0, 0.2))
         optimizer.zero_grad()
         losses.total.backward()
         optimizer.step()
@@ -158,7 +158,7 @@ def test_loss_has_gradients_everywhere():
     condition = some_condition()
     ids = torch.randint(0, 19, (1, 3, 16, 24), generator=torch.Generator().manual_seed(0))
     clip = Clip(condition, condition.color, condition.depth, torch.ones_like(condition.valid), ids[0])
-    losses = model.loss([clip], BatchPart(0, 0, 0, 1), LossSettings(1.0, 0.2))
+    losses = model.loss([clip], BatchPart(0, 0, 0, 1), LossSettings(None, 1.0, 0.2))
     losses.total.backward()
     trained = [(n, p) for n, p in model.named_parameters() if not n.startswith("codec.")]
     dead = [n for n, p in trained if p.grad is None or not bool(p.grad.abs().sum() > 0)]
@@ -389,3 +389,16 @@ def test_a_crop_is_refined_as_in_the_whole_image_away_from_its_border():
         part = refiner(codec, {m: z[..., cells, cells] for m, z in latents.items()}, given.crop(pixels, pixels), 2)
     assert torch.allclose(part.rgb[..., 14:40, 14:40], whole.rgb[..., 22:48, 22:48], atol=1e-4)
     assert not torch.allclose(part.rgb[..., :4, :4], whole.rgb[..., 8:12, 8:12], atol=1e-4)
+
+
+def test_class_weights_are_taken_back():
+    codec, refiner, latents, given = some()
+    weights = torch.linspace(0.5, 3.0, 19)
+    with torch.no_grad():
+        before = refiner(codec, latents, given, 4)
+        refiner.take_back(weights)
+        after = refiner(codec, latents, given, 4)
+    lost = before.scores - after.scores
+    assert torch.allclose(lost, weights.log().view(1, -1, 1, 1).expand_as(lost), atol=1e-5)
+    assert torch.equal(before.rgb, after.rgb)
+    assert torch.equal(before.depth_code, after.depth_code)

@@ -327,14 +327,14 @@ FLAT, IMAGE, LABELS, PAIRS = torch.zeros(4, 4), torch.zeros(3, 4, 4), torch.zero
 @pytest.mark.parametrize(
     ("words", "call", "inputs"),
     [
-        ("one shape", native_ops.photometric, (IMAGE, torch.zeros(3, 4, 5))),
-        ("every pixel", native_ops.photometric, (IMAGE, IMAGE, 0.2, FLAT[None])),
+        ("wrong shape", native_ops.photometric, (IMAGE, torch.zeros(3, 4, 5))),
+        ("wrong shape", native_ops.photometric, (IMAGE, IMAGE, 0.2, FLAT[None])),
         ("SSIM", native_ops.photometric, (IMAGE, IMAGE, 1.5)),
         ("odd", native_ops.box_mean, (FLAT[None], 4)),
         ("class loss", native_ops.class_loss, (IMAGE, LABELS[:3], FLAT, 1.0)),
         ("lift", native_ops.class_loss, (IMAGE, LABELS, FLAT, 1.0, (3, FLAT))),
         ("over", native_ops.over, (IMAGE, torch.zeros(1, 4, 5), torch.zeros(3, 2, 2))),
-        ("one shape", adam, (PAIRS, torch.zeros(4, 3), PAIRS, PAIRS, 0.1, 1)),
+        ("wrong shape", adam, (PAIRS, torch.zeros(4, 3), PAIRS, PAIRS, 0.1, 1)),
         ("chosen rows", adam, (PAIRS, PAIRS, PAIRS, PAIRS, 0.1, 1, torch.ones(3, dtype=torch.bool))),
         ("from 1", adam, (PAIRS, PAIRS, PAIRS, PAIRS, 0.1, 0)),
     ],

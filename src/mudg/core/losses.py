@@ -389,9 +389,11 @@ def latent_depth_error(stated: Tensor, truth: Tensor, weight: Tensor, known: Ten
     return (weight * (F.huber_loss(stated, truth, reduction="none", delta=0.2) * 5.0) * known).mean()
 
 
-def share_cross_entropy(log_shares: Tensor, shares: Tensor) -> Tensor:
-    """Mean cross-entropy of class shares ``[B, T, C, h, w]`` under stated logarithms."""
-    return -(shares * log_shares).sum(2).mean()
+def share_cross_entropy(log_shares: Tensor, shares: Tensor, class_weights: Tensor | None) -> Tensor:
+    """Mean cross-entropy of class shares ``[B, T, C, h, w]`` under stated logarithms; weights of the classes ``[C]`` or
+    None."""
+    weighted = shares if class_weights is None else shares * class_weights.view(-1, 1, 1)
+    return -(weighted * log_shares).sum(2).mean()
 
 
 def image_error(error: Tensor, square: float, gradient: float) -> Tensor:
@@ -415,10 +417,11 @@ def depth_code_error(generated: Tensor, truth: Tensor, weight: Tensor, log_per_c
     return 5.0 * (off * weight).mean()
 
 
-def class_error(scores: Tensor, ids: Tensor) -> Tensor:
+def class_error(scores: Tensor, ids: Tensor, class_weights: Tensor | None) -> Tensor:
     """Cross-entropy of scores ``[N, C, H, W]`` summed over labelled pixels of i64[N, H, W], divided by the number of
     all."""
-    return F.cross_entropy(scores, ids, ignore_index=UNLABELLED, reduction="none").mean()
+    weight = None if class_weights is None else class_weights.to(scores.dtype)
+    return F.cross_entropy(scores, ids, weight, ignore_index=UNLABELLED, reduction="none").mean()
 
 
 def stated_error(log_error: Tensor, error: Tensor) -> Tensor:

@@ -28,7 +28,7 @@ scale).
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -484,6 +484,10 @@ class TrainingClips:
         await_shard(self.shards, self.numbers[0])
         return read_clip(self.shards, self.numbers[0], 0, range(1)).fine is not None
 
+    def weighed(self) -> Sequence[int]:
+        """Shards over which classes are counted."""
+        return self.in_use(0)[:20]
+
     def to_score(self) -> Sequence[int]:
         """Shards to score; InputError where none can be used."""
         return self.scored
@@ -504,3 +508,21 @@ def await_shard(folder: Path | ShardSource, city: int, patience_s: float = 900.0
                 remedy="see the errors of the generating processes above",
             )
         time.sleep(0.5)
+
+
+def class_weights(folder: Path | ShardSource, cities: Iterable[int], balance: float) -> Tensor:
+    """Weights f32[19] of the classes in the semantic loss: share^-balance, counted over some cities.
+
+    Scaled so that the mean over labelled pixels is 1; a class that never occurs weighs as much as the rarest that does.
+    """
+    counts = torch.zeros(256, dtype=torch.float64)
+    for city in cities:
+        await_shard(folder, city)
+        ids = read_clip(folder, city, 0, range(1)).semantics
+        counts += torch.bincount(ids.flatten(), minlength=256)
+    counts = counts[: len(CLASSES)]
+    if not bool(counts.any()):  # logs without labels
+        return torch.ones(len(CLASSES))
+    share = counts / counts.sum().clamp(min=1)
+    weight = share.clamp(min=max(float(share[share > 0].min()), 1e-3)) ** -balance
+    return (weight / (weight * share).sum().clamp(min=1e-9)).float()

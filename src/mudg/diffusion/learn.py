@@ -40,7 +40,7 @@ from mudg.base.run_folder import RunDir, VerbOutput
 from mudg.base.types import Clip
 from mudg.diffusion import city_clips, log_clips, model_files, models, parallel, score
 from mudg.diffusion.city_clips import CityClipRules
-from mudg.diffusion.clips import TrainingClips, clips_at, shard_path
+from mudg.diffusion.clips import TrainingClips, class_weights, clips_at, shard_path
 from mudg.diffusion.log_clips import LogClipRules, LogSource
 from mudg.diffusion.memory_plan import choose_bf16
 from mudg.diffusion.model import MDM, BatchPart, LossSettings
@@ -139,6 +139,8 @@ def _train(model: Model, config: LearnConfig, directory: RunDir, ranks: Ranks) -
 
     def finish() -> None:
         made = models.rebuilt(model, weights)
+        if isinstance(made, MDM) and made.refiner is not None and config.loss.class_balance:
+            made.refiner.take_back(class_weights(source.shards, source.weighed(), config.loss.class_balance))
         request = SampleRequest(config.score.steps, config.seed, bf16=bf16)
         scores = score.score(made, source.to_score(), source.shards, request)
         store.write_json(out / "metrics.json", scores)
@@ -433,7 +435,8 @@ def _train_network(model: Model, source: TrainingClips, run_dir: RunDir, bf16: b
     """Train what the model names; returns the weights to use (the moving average), whole, in the leader."""
     config, out = source.config, run_dir.path / "steps"
     state, spread = _begin(model, config, out, ranks)
-    settings = LossSettings(config.loss.refined_share, config.data.reference_dropout)
+    weights = class_weights(source.shards, source.weighed(), config.loss.class_balance).to(ranks.device)
+    settings = loss_settings(config, weights)
 
     def draw(step: int) -> Drawn:
         frames, count, parts = _batch(config, ranks, step)
@@ -508,3 +511,8 @@ def _train_network(model: Model, source: TrainingClips, run_dir: RunDir, bf16: b
 
 def _picture(run_dir: RunDir, step: int) -> Path:
     return run_dir.path / "samples" / f"{step:07d}.png"
+
+
+def loss_settings(config: LearnConfig, weights: Tensor) -> LossSettings:
+    """What a configuration says about the loss."""
+    return LossSettings(weights, config.loss.refined_share, config.data.reference_dropout)

@@ -98,10 +98,12 @@ class BatchPart:
 class LossSettings:
     """What a training run says about the loss.
 
+    class_weights      f32[19], weights of the classes in the cross-entropy; None = all 1
     refined_share      share of each side of the image on which the refiner is trained at a step
     reference_dropout  share of the clips that go without their reference image; the published kind
     """
 
+    class_weights: Tensor | None
     refined_share: float
     reference_dropout: float
 
@@ -281,13 +283,13 @@ class MDM(nn.Module):
         errors = {
             "rgb": losses.latent_error(stated["rgb"], truth.latents["rgb"], weight),
             "depth": losses.latent_depth_error(stated["depth"], truth.latents["depth"], weight, truth.depth_known),
-            "semantics": losses.share_cross_entropy(log_shares, truth.shares),
+            "semantics": losses.share_cross_entropy(log_shares, truth.shares, settings.class_weights),
         }
         terms = {m: float(error.detach()) for m, error in errors.items()}
         total = sum(LOSS_SHARES[m] * errors[m] for m in MODALITIES)
         if self.refiner is not None:
-            errors = self._refiner_terms(stated, encoded, truth.pixels, part, settings.refined_share)
-            errors |= self._finisher_terms(stated, encoded, clips)
+            errors = self._refiner_terms(stated, encoded, truth.pixels, part, settings)
+            errors |= self._finisher_terms(stated, encoded, clips, settings)
             terms |= {name: float(error.detach()) for name, error in errors.items()}
             total = total + sum(errors.values())
         return Losses(total, terms)
@@ -320,18 +322,18 @@ class MDM(nn.Module):
         encoded: ConditionLatents,
         truth: PixelTruth,
         part: BatchPart,
-        share: float,
+        settings: LossSettings,
     ) -> dict[str, Tensor]:
         """Weighted terms of the refiner in a rectangle of the image, at the denoiser's resolution."""
         frames, (h, w) = encoded.planes.shape[1], encoded.planes.shape[-2:]
-        cells = self._refined_window(part, share, h, w)
+        cells = self._refined_window(part, settings.refined_share, h, w)
         latents = {m: z[..., cells[0], cells[1]].flatten(0, 1) for m, z in stated.items()}
         tall, wide = (slice(s.start * self.codec.factor, s.stop * self.codec.factor) for s in cells)
         made = self.refine(latents, encoded.pixels.crop(tall, wide), frames)
-        return self._pixel_terms(made, truth.crop(tall, wide), "pixel")
+        return self._pixel_terms(made, truth.crop(tall, wide), settings, "pixel")
 
     def _finisher_terms(
-        self, stated: dict[Modality, Tensor], encoded: ConditionLatents, clips: Sequence[Clip]
+        self, stated: dict[Modality, Tensor], encoded: ConditionLatents, clips: Sequence[Clip], settings: LossSettings
     ) -> dict[str, Tensor]:
         """Weighted terms of the finisher on the patches that the clips have; denoiser and refiner learn nothing from
         them."""
@@ -348,7 +350,7 @@ class MDM(nn.Module):
             scale = torch.tensor(scales, device=made.rgb.device).repeat_interleave(frames)
         done = self.finisher(made, given, frames, scale)
         found = Refined(done.rgb, done.depth_code, class_scores(done), done.log_error)
-        return self._pixel_terms(found, truth, "fine")
+        return self._pixel_terms(found, truth, settings, "fine")
 
     def _enlarged(
         self, stated: dict[Modality, Tensor], encoded: ConditionLatents, number: int, patch: FinePatch
@@ -372,7 +374,7 @@ class MDM(nn.Module):
         ids = refined.scores.argmax(1, keepdim=True).to(torch.uint8)
         return Made(refined.rgb, refined.depth_code, ids, refined.log_error)
 
-    def _pixel_terms(self, refined: Refined, truth: PixelTruth, name: str) -> dict[str, Tensor]:
+    def _pixel_terms(self, refined: Refined, truth: PixelTruth, settings: LossSettings, name: str) -> dict[str, Tensor]:
         """Weighted terms of refined pixels; depth in the sky counts threefold."""
         codec = self.config.codec
         log_per_code = math.log(codec.far_m / codec.near_m) / 2
@@ -381,7 +383,7 @@ class MDM(nn.Module):
         return {
             f"{name}_rgb": losses.image_error(error, square=2.0, gradient=0.5),
             f"{name}_depth": losses.depth_code_error(refined.depth_code, truth.depth_code, counted, log_per_code),
-            f"{name}_semantics": 0.2 * losses.class_error(refined.scores, truth.ids),
+            f"{name}_semantics": 0.2 * losses.class_error(refined.scores, truth.ids, settings.class_weights),
             f"{name}_error": 0.05 * losses.stated_error(refined.log_error, error),
         }
 

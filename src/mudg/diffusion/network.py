@@ -415,6 +415,14 @@ class Refiner(CellNet):
         self.renders, self.sizes = renders, sizes
         self.reset()
 
+    def take_back(self, class_weights: Tensor) -> None:
+        """Undo what class weights f32[19] in the loss did to the scores: each class loses the logarithm of its
+        weight."""
+        first = sum(self.SIZES[:5])
+        with torch.no_grad():
+            bias = self.leave.bias[first : first + 4 * CLASSES]
+            bias -= class_weights.log().repeat_interleave(4).to(bias.device)
+
     def reset(self) -> None:
         """Output that adds nothing and copies little, whatever the other weights are."""
         with torch.no_grad():

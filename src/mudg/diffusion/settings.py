@@ -259,6 +259,9 @@ class LearnOptimizer:
 class LearnLoss:
     """Terms of the training loss."""
 
+    class_balance: float = setting(default=0.0, ge=0, le=1)
+    """Balance of rare classes in the semantic loss: 0 = as frequent as they are, 1 = all classes count the same. The
+    bias this gives the refiner's class scores is removed after training."""
     refined_share: float = setting(default=0.5, gt=0, le=1)
     """The refiner is trained on a crop whose sides are this share of the image's."""
 

@@ -538,6 +538,16 @@ class ListedClips(TrainingClips):
         """Whether the clips have patches at a higher resolution."""
         return self._drawn(0, 0, 1, "patches").fine is not None
 
+    def weighed(self) -> Sequence[int]:
+        """Some shards that are drawn from the list, where classes are balanced."""
+
+        def usable(number: int) -> int:
+            self.shards.clips_in(number)
+            return number
+
+        count = 20 if self.config.loss.class_balance else 0
+        return [self.shards.draw(seeds.numpy_rng(self.config.seed, n, "class weights"), usable) for n in range(count)]
+
     def to_score(self) -> Sequence[int]:
         """The first shard of every held-out scene."""
         return self.shards.scored()
