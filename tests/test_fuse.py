@@ -128,7 +128,7 @@ def test_point_times_bring_a_fast_car_together() -> None:
     owner, owned = separate(sweep, [track], RULES)
     assert (owner == 0).all()
     assert np.abs(owned[0][:, 0] - along).max() < 1e-4
-    smeared, _ = separate(sweep, [track], replace(RULES, point_times=False))
+    smeared, _ = separate(replace(sweep, points=replace(sweep.points, dt_s=np.zeros_like(dt))), [track], RULES)
     assert (smeared == STATIC).sum() >= 10
 
 

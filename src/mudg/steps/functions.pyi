@@ -602,7 +602,7 @@ def render(
         lidar: Also simulate the log's LiDAR sweeps at every shift: a sensor of the scene, pandar128, at128, hdl64, vlp16, or a JSON file of beams (docs/simulator.md). Empty = none.
         layers: Also write these layers of every view, with its boxes and its trust: ids of objects, normals of surfaces, optical flow to the next view in pixels, distance along the ray in metres, and how certain a pixel is (docs/datasets.md).
         video: Also write one MP4 video per trajectory.
-        repair: Let the diffusion model make every view once more from its render, and mix both by its confidence. Better off the recorded path, slower: half a second a view. --harmonize.model names the model (docs/edit/repair.md).
+        repair: Let the diffusion model make every view once more from its render, and mix both by its confidence and by the distance from the recorded path. Better off the path, slower: half a second a view. --harmonize.model names the model (docs/edit/repair.md).
         harmonize: With an edit script: let the diffusion model repair what the edits touch.
         raster: Rasteriser backend. auto picks the fastest one available and prints its name.
         device: Device: auto (CUDA if there is one), cpu, cuda, cuda:N.
