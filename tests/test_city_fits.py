@@ -61,17 +61,19 @@ def test_a_model_that_uses_no_renders_needs_no_fits(tmp_path, monkeypatch, rende
     assert made[0].fitted == (renders and wanted)
 
 
-def test_only_cities_with_renders_give_renders_and_a_finisher(tmp_path):
-    from_cities = models.starting_model(tiny(tmp_path))
+def test_only_cities_with_renders_add_renders_and_a_finisher(tmp_path):
+    from_cities, _ = models.starting_model(tiny(tmp_path))
     assert from_cities.config.renders and from_cities.finisher is not None
-    on_a_log = tiny(tmp_path, scenes=("log",))
-    model = models.starting_model(on_a_log)
+    model, _ = models.starting_model(tiny(tmp_path, scenes=("log",)))
     assert not model.config.renders and model.finisher is None
-    for made in (from_cities, model):
-        model_files.save(made, tmp_path / "start", "", {})
-        for settings in (tiny(tmp_path), on_a_log):
-            kept = models.starting_model(with_settings(settings, start=str(tmp_path / "start")))
-            assert kept.config == made.config
+    model_files.save(model, tmp_path / "plain", "", {})
+    model_files.save(from_cities, tmp_path / "rendered", "", {})
+    on_a_log = tiny(tmp_path, scenes=("log",), start=str(tmp_path / "plain"))
+    assert models.starting_model(on_a_log)[1] == set()
+    kept, fresh = models.starting_model(with_settings(on_a_log, start=str(tmp_path / "rendered")))
+    assert kept.config == from_cities.config and not fresh
+    grown, fresh = models.starting_model(tiny(tmp_path, start=str(tmp_path / "plain")))
+    assert grown.config == from_cities.config and fresh == {"finisher"}
 
 
 def test_steps_of_fits_are_drawn_from_their_range(tmp_path):

@@ -169,8 +169,9 @@ def test_the_second_stage_takes_over_everything_at_another_size(large_clips, who
     config = tiny(
         large_clips, start=str(whole), steps=1, width=96, height=64, frozen="temporal_transformers", average_decay=0
     )
-    begun = models.starting_model(config)
+    begun, fresh = models.starting_model(config)
     before, start = model_files.load(whole).state_dict(), begun.state_dict()
+    assert not fresh
     assert all(torch.equal(before[name], start[name]) for name in before)
     after = model_files.load(Learn(out=tmp_path / "two", settings=config).run()).state_dict()
     kept = {name for name in before if name.startswith("codec.") or ".temporal." in name}
@@ -183,13 +184,13 @@ def test_the_second_stage_takes_over_everything_at_another_size(large_clips, who
 
 def test_the_modality_embedding_survives_a_change_of_stage(whole, unrefined, clips):
     """It once was overwritten by the time embedding in the published second stage."""
-    for folder in (whole, unrefined):
+    for folder, changes in ((whole, {}), (whole, {"refine_widths": (16, 16)}), (unrefined, {})):
         if folder is unrefined:
             config = LearnConfig(start=str(folder), data=LearnData(clips=str(clips), window=WINDOW))
         else:
-            config = tiny(clips, start=str(folder))
+            config = tiny(clips, start=str(folder), **changes)
         label = model_files.load(folder).net.label.state_dict()
-        begun = models.starting_model(config)
+        begun, _ = models.starting_model(config)
         assert all(torch.equal(value, begun.net.label.state_dict()[name]) for name, value in label.items())
         assert not torch.equal(label["0.weight"], begun.net.time.state_dict()["0.weight"])
 

@@ -66,8 +66,9 @@ def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
     config = published_settings(
         one, large, width=36, height=32, frozen="temporal_transformers", steps=1, batch_frames=4
     )
-    begun = models.starting_model(config)
+    begun, fresh = models.starting_model(config)
     first, start = (published.load(folder).state_dict() for folder in (converted, one))
+    assert not fresh
     assert all(torch.equal(value, start[name]) for name, value in begun.state_dict().items())  # the modality label too
     two = Learn(out=tmp_path / "two", settings=config).run()
     last = published.load(two)
@@ -95,7 +96,7 @@ def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
 def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
     """With dropout inside the network on; terms too, and they have the same names in every part."""
     settings = published_settings(converted, clips)
-    model = models.starting_model(settings)
+    model, _ = models.starting_model(settings)
     model.trained_part().train()
 
     @torch.no_grad()
@@ -117,7 +118,7 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
 
 def test_unknown_truth_has_no_part_in_the_loss(converted, clips):
     settings = published_settings(converted, clips)
-    model = models.starting_model(settings)
+    model, _ = models.starting_model(settings)
     drawn = corners(settings, clips, 0, 4, 4, "batch")
     nothing = [
         replace(clip, depth_valid=torch.zeros_like(clip.depth_valid), semantics=torch.full_like(clip.semantics, 255))
@@ -174,7 +175,7 @@ def test_the_reference_is_left_out_once(converted, clips, tmp_path, monkeypatch)
 
 def test_frame_0_shows_the_reference_also_where_the_tokens_go_without(converted, clips):
     settings = published_settings(converted, clips)
-    model = models.starting_model(settings)
+    model, _ = models.starting_model(settings)
     (clip,) = corners(settings, clips, 0, 1, 4, "batch")
     other = replace(clip, condition=replace(clip.condition, reference=1 - clip.condition.reference))
     rules = LossSettings(None, 1.0, 1.0)
@@ -190,6 +191,7 @@ def test_what_does_not_fit_is_refused_in_words(converted, clips, tmp_path):
         ({"full_window_share": 0.5}, length),
         ({"width": 50}, "multiples of 4"),
         ({"widths": (16, 32, 64)}, "cannot be changed"),
+        ({"frozen": "denoiser"}, "without a refiner"),
     ):
         with pytest.raises(UsageError, match=said):
             Learn(out=tmp_path / said[:8], settings=published_settings(converted, clips, **wrong)).run()

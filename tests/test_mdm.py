@@ -10,7 +10,7 @@ from refusals import refused
 
 from mudg.base.errors import IntegrityError, UsageError
 from mudg.base.types import Camera, Clip, Condition, View
-from mudg.diffusion import model_files, network, requests
+from mudg.diffusion import model_files, models, network, requests
 from mudg.diffusion.model import MDM, BatchPart, LossSettings, MDMConfig
 from mudg.diffusion.network import ConditionPixels, Refiner
 from mudg.diffusion.requests import SampleRequest
@@ -91,6 +91,18 @@ def test_sample_shapes_ranges_and_determinism():
     for name in ("rgb", "depth", "semantics", "confidence"):
         assert torch.equal(getattr(first, name), getattr(again, name)), name
     assert not torch.equal(first.rgb, other.rgb)
+
+
+def test_a_model_with_a_new_refiner_has_the_same_denoiser_and_codec():
+    small = randomised(PLAIN)
+    big = models.extended(small, TINY)
+    state = big.state_dict()
+    assert all(torch.equal(value, state[name]) for name, value in small.state_dict().items())
+    assert any(name.startswith("refiner.") for name in state)
+    refined = randomised(TINY)
+    again = models.extended(refined, replace(TINY, area_px=100)).state_dict()
+    assert all(torch.equal(value, again[name]) for name, value in refined.state_dict().items())
+    refused("another kind", models.extended, small, replace(TINY, widths=(16, 32)), raises=UsageError)
 
 
 def test_given_classes_are_copied_where_they_are_known():

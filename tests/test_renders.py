@@ -12,12 +12,14 @@ from toy_clips import made_up_clip, with_patch
 
 from mudg import native
 from mudg.base import palette
+from mudg.base.errors import UsageError
 from mudg.base.types import Camera, FusedCloud, Photo, PointCloud, RenderPlanes, Track
 from mudg.diffusion import city_clips, clips
 from mudg.diffusion import condition as conditions
 from mudg.diffusion import model as mdm
 from mudg.diffusion.city_clips import CityClipRules
 from mudg.diffusion.condition import build_conditions
+from mudg.diffusion.models import extended
 from mudg.diffusion.requests import SampleRequest
 
 NOTHING = FusedCloud(PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), "world"), {})
@@ -356,6 +358,33 @@ def test_images_of_held_out_moments_are_not_given():
 # the model ----------------------------------------------------------------------------------------
 
 
+def shut(model, value=-40.0):
+    """Close the gates through which a render is copied."""
+    area = model.net.patch**2
+    with torch.no_grad():
+        model.net.leave.bias[-mdm.RENDER_GATES * area :] = value
+        model.refiner.leave.bias[-sum(model.refiner.RENDER_SIZES) :] = value
+    return model
+
+
+@pytest.mark.parametrize("patch", [1, 2])
+def test_an_extended_model_is_the_earlier_one_but_for_the_gates_of_renders(patch):
+    before = randomised(replace(TINY, patch=patch))
+    after = extended(before, replace(WITH_RENDERS, patch=patch)).eval()
+    plain, request = some_condition(), SampleRequest(2, seed=3)
+    old, new = before.sample(plain, request), after.sample(plain, request)
+    # without renders its gates take sigmoid(-8) of the denoiser's and sigmoid(-4) of the refiner's colour from the
+    # condition's own
+    assert float((old.rgb - new.rgb).abs().max()) < 0.05
+    shut(after)
+    for condition in (plain, with_renders(plain), with_renders(plain, 6)):
+        new = after.sample(condition, request)
+        assert torch.allclose(old.rgb, new.rgb, atol=1e-5)
+        assert torch.allclose(old.depth, new.depth, rtol=1e-4)
+        assert torch.equal(old.semantics, new.semantics)
+        assert torch.allclose(old.confidence, new.confidence, atol=1e-5)
+
+
 def test_open_gates_hand_the_render_through():
     model, condition = mdm.MDM(WITH_RENDERS).eval(), with_renders(some_condition())
     condition = replace(condition, renders=replace(condition.renders, alpha=torch.ones_like(condition.renders.alpha)))
@@ -393,3 +422,8 @@ def test_a_model_without_renders_ignores_them():
     model, plain = randomised(TINY), some_condition()
     first, second = (model.sample(c, SampleRequest(1)) for c in (plain, with_renders(plain)))
     assert torch.equal(first.rgb, second.rgb) and torch.equal(first.depth, second.depth)
+
+
+def test_renders_are_not_given_up_again():
+    with pytest.raises(UsageError, match="another kind"):
+        extended(randomised(WITH_RENDERS), TINY)

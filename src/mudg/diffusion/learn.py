@@ -70,7 +70,7 @@ def train(config: LearnConfig, out: Path, output: VerbOutput, open_work: Callabl
     """
     torch.set_num_threads(config.threads)
     with parallel.join_processes(config.compute.device) as ranks:
-        model = starting_model(config)
+        model, fresh = starting_model(config)
         opened: list[RunDir] = []
 
         def open_run() -> str:
@@ -81,7 +81,7 @@ def train(config: LearnConfig, out: Path, output: VerbOutput, open_work: Callabl
         if path:
             work = opened[0] if ranks.leads else RunDir(out, Path(path), output, "", {})
             try:
-                _train(model, config, work, ranks)
+                _train(model, fresh, config, work, ranks)
             except KeyboardInterrupt:
                 if ranks.leads:
                     work.pause()
@@ -118,23 +118,24 @@ def files_read(config: LearnConfig, out: Path, overwrite: bool) -> dict[str, Pat
     return {**read, "clips": "" if own_clips else clips}
 
 
-def _train(model: Model, config: LearnConfig, directory: RunDir, ranks: Ranks) -> None:
+def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir, ranks: Ranks) -> None:
     """Clips, codec, network, scores."""
     out = directory.path
     bf16 = choose_bf16(config.precision, ranks.device)
     source, making = open_clips(config, model, out, ranks)
     with making:
-        if not config.start and isinstance(model, MDM):
+        if "codec" in fresh and isinstance(model, MDM):
             ranks.leader_does(lambda: models.train_codec(model.codec, source, directory, bf16, ranks.device))
             models.load_trained_codec(model.codec, out, ranks)
             models.draw_weights(model.net, config.seed, "weights")
-            for name, part in (("refiner", model.refiner), ("finisher", model.finisher)):
-                if part is not None:
-                    models.draw_weights(part, config.seed, f"{name} weights")
-                    part.reset()
+        for name in ("refiner", "finisher"):
+            part = getattr(model, name, None)
+            if name in fresh and part is not None:
+                models.draw_weights(part, config.seed, f"{name} weights")
+                part.reset()
         model.requires_grad_(False)
         model.trained_part().requires_grad_(True)
-        models.hold_finisher(model, not config.start, source.have_patches())
+        models.hold_finisher(model, fresh, source.have_patches())
         weights = _train_network(model, source, directory, bf16, ranks)
 
     def finish() -> None:

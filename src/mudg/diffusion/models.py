@@ -114,20 +114,22 @@ def _published_start(config: LearnConfig) -> PublishedMDM:
     return model
 
 
-def starting_model(config: LearnConfig) -> Model:
-    """The model to train; without `start` its weights are still to be drawn.
+def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
+    """The model to train, and which of its parts ("codec", "refiner", "finisher") have no weights yet.
 
-    With `start` it is the earlier model. Clips may be of another size and length than before. Inputs for renders and a
-    finisher are learned from generated cities with renders; a model that begins with other clips has neither.
+    With `start` the network is that of the earlier model, extended by a refiner, a finisher and inputs for renders
+    where the settings ask for them. If the settings do not describe that network but are the defaults, it is taken as
+    it is. Clips may be of another size and length than before. Inputs for renders and a finisher are learned from
+    generated cities with renders; from other clips no model gets any that it does not have.
 
     Raises:
         UsageError: the settings ask for another network than the earlier model has, or for clips that it cannot take.
     """
     wanted = model_config(config)
     usual = wanted == model_config(LearnConfig(data=config.data))  # the network is left as it is by default
+    can_grow = config.data.renders and not config.data.scenes
     if not config.start:
-        with_renders = config.data.renders and not config.data.scenes
-        return MDM(wanted if with_renders else replace(wanted, renders=False, finish_widths=(), finish_blocks=()))
+        return MDM(wanted if can_grow else _with_renders_of(wanted, None)), {"codec", "refiner", "finisher"}
     if is_published(config.start):
         if not usual:
             raise UsageError(
@@ -135,39 +137,37 @@ def starting_model(config: LearnConfig) -> Model:
                 where="--start",
                 remedy="leave out the settings of the group network",
             )
-        return _published_start(config)
-    model = model_files.load(config.start)
-    if model.config.window != config.data.window:
+        return _published_start(config), set()
+    before = model_files.load(config.start)
+    if before.config.window != config.data.window:
         log.info(
             f"learn: training on clips of {config.data.window} frames; --start was trained on clips of"
-            f" {model.config.window}"
+            f" {before.config.window}"
         )
-    own = replace(model.config, window=wanted.window, area_px=wanted.area_px)
-    if not usual and own != replace(wanted, **{name: getattr(own, name) for name in _OF_RENDERS}):
-        raise UsageError(
-            "the model to continue from is of another kind",
-            where="--start",
-            expected=str(wanted),
-            got=str(own),
-            remedy="leave out the settings of the group network",
-        )
-    model.config = own
-    return model.train()
+    wanted = wanted if can_grow else _with_renders_of(wanted, before.config)
+    resized = replace(before.config, window=wanted.window, area_px=wanted.area_px)
+    if wanted != resized and not same_denoiser(resized, wanted) and usual:
+        log.info("learn: the network has the shape of --start")
+        wanted = resized
+    grown = {name for name, had in (("refiner", before.refiner), ("finisher", before.finisher)) if had is None}
+    return extended(before, wanted), set() if wanted == resized else grown
 
 
-_OF_RENDERS = ("renders", "finish_widths", "finish_blocks")
-"""What only clips with renders teach: a model to continue from has it or not, whatever the settings say."""
+def _with_renders_of(wanted: MDMConfig, before: MDMConfig | None) -> MDMConfig:
+    """A network that uses renders, and has a finisher, as `before` does (None: neither)."""
+    own = (before.renders, before.finish_widths, before.finish_blocks) if before is not None else (False, (), ())
+    return replace(wanted, renders=own[0], finish_widths=own[1], finish_blocks=own[2])
 
 
-def hold_finisher(model: Model, fresh: bool, patches: bool) -> None:
+def hold_finisher(model: Model, fresh: set[str], patches: bool) -> None:
     """Let the finisher keep its weights if the clips have no patches at a higher resolution to learn it from.
 
     Raises:
-        UsageError: it has no weights yet (`fresh`).
+        UsageError: it has no weights yet.
     """
     if patches or not isinstance(model, MDM) or model.finisher is None:
         return
-    if fresh:
+    if "finisher" in fresh:
         raise UsageError(
             "the training clips have no patches at a higher resolution, from which the finisher is learned",
             where="--data.clips",
@@ -194,7 +194,12 @@ def freeze(model: Model, what: str) -> int:
     """
     if what == "nothing":
         return 0
-    names = model.temporal_parameters("all" if what == "temporal_layers" else "transformers")
+    if what == "denoiser":
+        names = {name for name, _ in model.trained_part().named_parameters() if name.startswith("net.")}
+        if not isinstance(model, MDM) or model.refiner is None:
+            raise UsageError("without a refiner nothing is left to train", where="--frozen", got=what)
+    else:
+        names = model.temporal_parameters("all" if what == "temporal_layers" else "transformers")
     count = 0
     for name, parameter in model.trained_part().named_parameters():
         if name in names:
@@ -317,3 +322,48 @@ def codec_loss(codec: PatchCodec, clips: Sequence[Clip], generator: torch.Genera
     }
     loss = parts["rgb"] + parts["depth"] + 0.1 * parts["semantics"]
     return loss, {name: float(part.detach()) for name, part in parts.items()}
+
+
+# models that go on from an earlier, plainer one ---------------------------------------------------
+
+
+_AFTER_DENOISER = {"refine_widths": (), "refine_blocks": (), "finish_widths": (), "finish_blocks": ()}
+
+
+def same_denoiser(one: MDMConfig, other: MDMConfig) -> bool:
+    """Whether two networks differ at most in what follows the denoiser, in the use of renders, and in the clips trained
+    on."""
+    without = lambda config: replace(config, **_AFTER_DENOISER, renders=False, area_px=0, window=0)
+    return without(one) == without(other)
+
+
+def extended(before: MDM, config: MDMConfig) -> MDM:
+    """A model of `config` with the weights of `before`; a refiner is taken over if `before` has one of the same shape.
+    For continuing the training of an earlier, plainer model. What new inputs weigh is 0, so they change nothing at
+    first.
+
+    Raises:
+        UsageError: the two differ in more than the refiner, the use of renders and the clips trained on.
+    """
+    if not same_denoiser(before.config, config) or (before.config.renders and not config.renders):
+        raise UsageError(
+            "the model to continue from is of another kind",
+            expected=str(config),
+            got=str(before.config),
+            remedy="give its widths, blocks, attention, patch and renders",
+        )
+    model = MDM(config)
+    state = model.state_dict()
+    for name, old in before.state_dict().items():
+        if name in state and state[name].shape == old.shape:
+            state[name] = old
+        elif name in state and name.removesuffix(".weight").removesuffix(".bias") in _WIDENED:
+            larger = torch.zeros_like(state[name]) if name.startswith(_WIDENED[:2]) else state[name].clone()
+            larger[tuple(slice(size) for size in old.shape)] = old  # in its first places
+            state[name] = larger
+    model.load_state_dict(state)
+    return model
+
+
+_WIDENED = ("net.enter", "refiner.enter", "net.leave", "refiner.leave")
+"""Layers that have further inputs or outputs, behind the others, in a model that uses renders."""

@@ -324,9 +324,9 @@ class LearnConfig:
     from scratch)."""
     steps: int = setting(default=2800, ge=1)
     """Training steps of the network."""
-    frozen: Literal["nothing", "temporal_transformers", "temporal_layers"] = "nothing"
+    frozen: Literal["nothing", "temporal_transformers", "temporal_layers", "denoiser"] = "nothing"
     """Layers that keep their weights. temporal_transformers: as in the published second stage. temporal_layers: all
-    layers that mix frames."""
+    layers that mix frames. denoiser: train the refiner only."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Number format of the computation. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32
     elsewhere."""

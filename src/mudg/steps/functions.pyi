@@ -497,7 +497,7 @@ def learn(
     seed: int = 0,
     start: str = '',
     steps: int = 2800,
-    frozen: Literal['nothing', 'temporal_transformers', 'temporal_layers'] = 'nothing',
+    frozen: Literal['nothing', 'temporal_transformers', 'temporal_layers', 'denoiser'] = 'nothing',
     precision: Literal['auto', 'float32', 'bfloat16'] = 'auto',
     threads: int = 1,
     data: Mapping[str, Any] = ...,
@@ -518,7 +518,7 @@ def learn(
         seed: Seed of the cities, the initial weights and all other random numbers.
         start: Model to continue from: a folder written by learn or convert, or "embedded" for the shipped model (empty = train from scratch).
         steps: Training steps of the network.
-        frozen: Layers that keep their weights. temporal_transformers: as in the published second stage. temporal_layers: all layers that mix frames.
+        frozen: Layers that keep their weights. temporal_transformers: as in the published second stage. temporal_layers: all layers that mix frames. denoiser: train the refiner only.
         precision: Number format of the computation. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere.
         threads: Threads of the training process. Results are repeatable for the same number of threads.
         data:
