@@ -141,7 +141,8 @@ def test_point_times_bring_a_fast_car_together() -> None:
     owner, owned = separate(sweep, [track], RULES)
     assert (owner == 0).all()
     assert np.abs(owned[0][:, 0] - along).max() < 1e-4
-    smeared, _ = separate(sweep, [track], replace(RULES, point_times=False))
+    at_once = replace(sweep.points, dt_s=np.zeros(45, np.float32))
+    smeared, _ = separate(replace(sweep, points=at_once), [track], RULES)
     assert (smeared == STATIC).sum() >= 10
 
 
