@@ -93,6 +93,15 @@ def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
     assert len(made) == 5 and bool(torch.isfinite(made[4].rgb).all())
 
 
+def test_the_card_of_a_trained_model_says_how_it_was_trained(converted, clips, monkeypatch):
+    settings = published_settings(converted, clips)
+    monkeypatch.setattr(models, "table", lambda scores: "a table")
+    model, source = models.starting_model(settings)[0], learn.clips_of_cities(settings, clips, points_alone=True)
+    card = models.model_card(model, source, {"clips": 1, "steps": 2})
+    said = f"reference left out in {settings.data.reference_dropout:.0%} of the clips."
+    assert said in card and f"Continued from {settings.start}" in card and "a table" in card
+
+
 def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
     """With dropout inside the network on; terms too, and they have the same names in every part."""
     settings = published_settings(converted, clips)
