@@ -12,7 +12,10 @@ from mudg.city.config import CityConfig
 from mudg.city.light import light_numbers
 from mudg.city.world import CityWorld, library
 from mudg.core.weather.gbuffer import Surroundings
-from mudg.core.weather.light import LUMA, srgb_decode, srgb_encode
+from mudg.core.weather.light import srgb_decode, srgb_encode
+
+LUMA = np.array([0.299, 0.587, 0.114])
+"""Brightness of display values."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,7 +1,7 @@
 """What rules find beside given classes: dense depth, sky and dynamic objects, each pixel with a confidence.
 
 Sky is bright or blue, smooth, above the horizon, connected to the top of the image, and without LiDAR returns. Dense
-depth is filled from the returns (``core.complete``). The rules hold no parameters.
+depth is filled from the returns (``core.depth.complete_depth``). Nothing here is learnt.
 """
 
 from __future__ import annotations

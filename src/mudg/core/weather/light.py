@@ -24,8 +24,6 @@ from mudg.core.weather.ground import noise_seed, sky_light
 
 # camera response ----------------------------------------------------------------------------------
 
-LUMA = np.array([0.299, 0.587, 0.114])
-"""Brightness of display values."""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 """Brightness of linear light."""
 
