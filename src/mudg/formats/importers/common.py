@@ -407,7 +407,7 @@ def pose_near(
 def gap_problem(gap: motion.Gap, time_s: float, where: str) -> InputError:
     """The error about an image or scan in a gap of the vehicle's path."""
     what, got = "vehicle poses have a gap here", f"at {time_s:.3f} s: {gap}"
-    remedy = "leave such frames out with --skip-missing, or lay a curve through the gap with --bridge-gaps"
+    remedy = "leave such frames out with --skip-missing, or (but for NCore) lay a curve with --bridge-gaps"
     return InputError(what, where=where, got=got, expected="poses around every image and scan", remedy=remedy)
 
 
