@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import importlib
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
@@ -41,22 +42,12 @@ EULER: Final = "xyz"
 """Axes about which a box is turned; small letters: fixed ones."""
 
 
-@dataclass(frozen=True, slots=True)
-class NCorePackage:
-    """The modules of the package ``nvidia-ncore``: ``data`` (types), ``v4`` (files), ``sensors`` (projection)."""
-
-    data: Any
-    v4: Any
-    sensors: Any
-    transformations: Any
-
-
-def package() -> NCorePackage:
-    """The package, loaded when it is first asked for. Raises ResourceError: it is not installed."""
+def package() -> Any:
+    """The modules of the package ``nvidia-ncore``, loaded when they are first asked for: ``data`` (types), ``v4``
+    (files), ``sensors`` (projection), ``transformations``. Raises ResourceError: it is not installed."""
+    modules = {"data": "data", "v4": "data.v4", "sensors": "sensors", "transformations": "impl.common.transformations"}
     try:
-        data, files = importlib.import_module("ncore.data"), importlib.import_module("ncore.data.v4")
-        sensors = importlib.import_module("ncore.sensors")
-        return NCorePackage(data, files, sensors, importlib.import_module("ncore.impl.common.transformations"))
+        return SimpleNamespace(**{name: importlib.import_module(f"ncore.{path}") for name, path in modules.items()})
     except ImportError as error:
         what = "NCore files need the package nvidia-ncore, which is not installed"
         raise ResourceError(what, got=str(error), remedy="pip install 'mudg[ncore]'") from error

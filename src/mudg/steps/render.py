@@ -89,7 +89,7 @@ class RenderViews(Output):
         views = partial(render.write_views, self.settings, self.scene, model, edited, path=self.path, fused=self.fused)
         if not self.settings.lidar and not self.settings.layers:
             return views
-        from mudg.datasets import layers
+        from mudg.datasets.write import write_layers
         from mudg.scene.read import read_scene
         from mudg.sim import sweeps
 
@@ -99,7 +99,7 @@ class RenderViews(Output):
         def make(work: RunDir) -> dict[str, Any]:
             summary, drawn = views(work), (self.settings, self.scene, model, script)
             if self.settings.layers:
-                summary["layers"] = layers.write_layers(*drawn, self.path, work.path)
+                summary["layers"] = write_layers(*drawn, self.path, work.path)
             if self.settings.lidar:
                 summary["lidar"] = sweeps.simulate_log(*drawn, work.path)
             return summary
