@@ -94,7 +94,7 @@ class _Named(ForeignRecord):
     name: Name
 
 
-class _Listed(ForeignRecord):
+class _SceneRows(ForeignRecord):
     scenes: list[Annotated[tuple[Name, str, dict[str, str]], Field(strict=False)]]
 
 
@@ -193,7 +193,7 @@ class BatchFolder:
         scenes: set[str] = set()
         for file in (self.own / name for name in _names(self.own) if name.startswith("list.")):
             remedy = "remove it, and give the list again"
-            listed = _checked(_Listed, {"scenes": store.read_json(file)}, str(file), remedy)
+            listed = _checked(_SceneRows, {"scenes": store.read_json(file)}, str(file), remedy)
             scenes.update(row[0] for row in listed.scenes)
         return sorted(scenes)
 

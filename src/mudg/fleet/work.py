@@ -1,7 +1,7 @@
 """One scene: its steps one after another, each a process. A step is made in a folder of its own, published when it has
 ended well, and put on record.
 
-    OUT/_batch/work/<key>.<token>/     inputs/<step>   settings.yaml   result
+    WORK/<key>.<token>/     inputs/<step>   settings.yaml   result
 
 A result counts from its record on. Everything before may happen twice, or be cut off at any point: what another attempt
 left is gone on with. Commands run in this folder and name what is in it by relative names, so that a result does not
