@@ -25,7 +25,7 @@ from mudg.base.types import Frame, FusedCloud, Observation, Photo, PointCloud, S
 from mudg.core import lidar
 from mudg.core.edit import Motion
 from mudg.core.pictures import to_bytes
-from mudg.core.weather.lidar import SOFT, sweep_in_weather
+from mudg.core.weather.air import SOFT, sweep_in_weather
 from mudg.diffusion.condition import Vacated, VacatedAt, ray_directions
 from mudg.editing.apply import SEED, EditedDrive, some_points
 from mudg.editing.model import FLOOR_M, GROUND_CLASSES, STRAY_M

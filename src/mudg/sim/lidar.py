@@ -21,7 +21,7 @@ from mudg.base.errors import UsageError
 from mudg.base.palette import UNLABELLED
 from mudg.base.types import SweepPoints, View
 from mudg.base.weather_settings import WeatherSettings
-from mudg.core.weather.lidar import SOFT, sweep_in_weather
+from mudg.core.weather.air import SOFT, sweep_in_weather
 from mudg.sim.optics import faces_of, nearest, surface
 from mudg.sim.returns import LogReturns
 from mudg.sim.session import Instant, Session
