@@ -29,21 +29,15 @@ def part(content: bytes, start: int, size: int, what: str, where: str) -> memory
     return memoryview(content)[start : start + size]
 
 
-def numbers(content: bytes, start: int, kind: str, count: int, what: str, where: str) -> NDArray[Any]:
-    """``count`` numbers of a numpy type such as ``<f4``, as a view; InputError if the content ends before."""
-    dtype = np.dtype(kind)
-    return np.frombuffer(part(content, start, count * dtype.itemsize, what, where), dtype)
-
-
 def unpacked(layout: str, content: bytes, start: int, what: str, where: str) -> tuple[Any, ...]:
     """``struct.unpack`` within bounds."""
     return struct.unpack(layout, part(content, start, struct.calcsize(layout), what, where))
 
 
 def refuse_count(count: int, where: str) -> None:
-    """InputError for a number of Gaussians that no file holds."""
+    """InputError for a number of Gaussians or points that no file holds."""
     if not 0 < count <= MAX_GAUSSIANS:
-        what = "the number of Gaussians in the header is not possible"
+        what = "the number of rows in the header is not possible"
         raise InputError(what, where=where, expected=f"1 to {MAX_GAUSSIANS}", got=str(count))
 
 
@@ -55,13 +49,21 @@ def refuse_bomb(count: int, content: bytes, where: str) -> None:
         raise InputError(what, where=where, expected=f"at most {20 * len(content) + 65536}", got=str(count))
 
 
+def text_table(body: bytes, columns: int, rows: int, where: str) -> NDArray[np.float64]:
+    """Numbers between spaces as f64[rows, columns]; InputError: others, or more or fewer."""
+    if rows * columns * 2 > len(body) + 1:  # a digit and a separator each
+        raise InputError("the file is cut off", where=where, expected=f"{rows} rows", got=f"{len(body)} bytes")
+    try:
+        table = np.array(body.split(), np.float64)
+    except ValueError as error:
+        raise InputError("a value is no number", where=where, got=str(error)[:120]) from error
+    if len(table) != rows * columns:
+        what = "the file is cut off, or has rows of another length"
+        raise InputError(what, where=where, got=f"{len(table)} numbers", expected=f"{rows} rows of {columns}")
+    return table.reshape(rows, columns)
+
+
 # -- compressed streams ----------------------------------------------------------------------------
-
-
-def gzip_bytes(content: bytes) -> bytes:
-    """One gzip member without a name or a time: the same bytes for the same content."""
-    packer = zlib.compressobj(9, zlib.DEFLATED, 31)
-    return packer.compress(content) + packer.flush()
 
 
 class GzipStream:
@@ -110,6 +112,8 @@ class GzipStream:
 # -- zips ------------------------------------------------------------------------------------------
 
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
+_DAMAGE: Final = (zipfile.BadZipFile, ValueError, EOFError, struct.error, NotImplementedError, OSError)
+"""What zipfile raises for damaged archives."""
 
 
 def stored_zip(files: Mapping[str, bytes], align: int = 1) -> bytes:
@@ -139,7 +143,7 @@ class BoundedZip:
         try:
             self._archive = zipfile.ZipFile(io.BytesIO(content))
             infos = self._archive.infolist()
-        except (zipfile.BadZipFile, ValueError, EOFError, struct.error, NotImplementedError, OSError) as error:
+        except _DAMAGE as error:
             raise InputError("not a readable zip file", where=where, got=str(error)) from error
         if len(infos) > 100_000:
             what = "the zip lists too many files"
@@ -164,16 +168,7 @@ class BoundedZip:
             with self._archive.open(info) as handle:
                 content = handle.read(most + 1)
                 rest = b"" if len(content) <= most else content[most:]
-        except (
-            zipfile.BadZipFile,
-            zlib.error,
-            EOFError,
-            ValueError,
-            NotImplementedError,
-            RuntimeError,
-            OSError,
-            struct.error,
-        ) as error:
+        except (*_DAMAGE, RuntimeError, zlib.error) as error:
             raise InputError("a file in the zip is damaged", where=where, got=str(error)) from error
         if rest or len(content) != info.file_size:
             what = "a file in the zip has another size than listed"

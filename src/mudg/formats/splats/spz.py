@@ -15,6 +15,7 @@ harmonics (value - 128) / 128, coefficient by coefficient. Rotation of versions 
 from __future__ import annotations
 
 import struct
+import zlib
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -56,7 +57,7 @@ def to_bytes(cloud: SplatCloud, antialias: bool = False) -> bytes:
     if float(np.abs(cloud.means).max(initial=0)) * (1 << bits) > (1 << 23) - 1:
         raise InputError("a Gaussian lies too far from the origin for SPZ", expected="at most 8388 km")
     head = struct.pack(HEADER, MAGIC, 3, len(cloud), cloud.degree, bits, _ANTIALIAS * antialias, 0)
-    return binary.gzip_bytes(head + b"".join(_planes(cloud, bits)))
+    return zlib.compress(head + b"".join(_planes(cloud, bits)), 9, 31)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,10 +119,10 @@ def _from_streams(content: bytes, where: str) -> SplatFile:
     if streams != len(sizes) or toc < 32:
         what = "the header of the SPZ file does not fit its content"
         raise InputError(what, where=where, expected=f"{len(sizes)} streams", got=f"{streams} streams, table at {toc}")
-    table = binary.numbers(content, toc, "<u8", 2 * streams, "the table of streams", where).reshape(-1, 2)
+    table = struct.iter_unpack("<QQ", binary.part(content, toc, 16 * streams, "the table of streams", where))
     extensions = _extensions(content[32:toc], where) if head.flags & _EXTENSIONS else {}
     package, place, planes = _zstandard(), toc + 16 * streams, list[bytes]()
-    for name, size, (packed, raw) in zip(_PLANES, sizes, table.tolist()):
+    for name, size, (packed, raw) in zip(_PLANES, sizes, table):
         if raw != size:
             what = f"the {name} have another size than the header says"
             raise InputError(what, where=where, expected=str(size), got=str(raw))
