@@ -562,7 +562,7 @@ def _by_moment(shots: Sequence[_Shot], names: Sequence[str], where: str) -> list
 def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> SceneContent[Any]:
     start_us = plan.clouds[0].time_us if plan.clouds else plan.moments[0][0].time_us
     found: list[str] = []
-    ego = common.mended_path(_ego_path(plan, start_us, str(opened.path)), options, found)
+    ego = common.mended_path(_ego_path(plan, start_us, str(opened.path)), found)
     first = ego.pose_at(0.0)
     if first is None:
         what, where = "vehicle poses do not cover the log", f"{opened.path}: ego_pose"
