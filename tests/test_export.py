@@ -29,12 +29,9 @@ from mudg.base.errors import InputError, MudgError, ResourceError, UsageError
 from mudg.base.types import PointCloud, Scene, View
 from mudg.baselines.bezier import BezierNode
 from mudg.baselines.pvg import VibrationNode, starting_columns
-from mudg.core.edit import HeightMap, Motion
 from mudg.core.metrics import psnr
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.editing.apply import background_of, read_asset
-from mudg.editing.plan import EditWorld, place_background
-from mudg.editing.runs import find_run
+from mudg.editing.apply import read_asset
 from mudg.exporting import export
 from mudg.exporting.settings import ExportConfig, ImportConfig
 from mudg.formats.exporters import messages as ros2
@@ -257,24 +254,6 @@ def test_a_file_becomes_a_scene(tmp_path: Path) -> None:
         imported(tmp_path / "a.ply", tmp_path / "fit2", kind="scene", label="car")
 
 
-def test_a_street_of_a_file_lies_where_the_vehicle_begins(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    ground = np.column_stack([rng.uniform(100, 130, 3000), rng.uniform(-4, 4, 3000), rng.normal(7, 0.01, 3000)])
-    wall = np.column_stack([rng.uniform(100, 130, 300), rng.uniform(3, 4, 300), rng.uniform(7, 12, 300)])
-    means = np.concatenate([ground, wall]).astype(np.float32)
-    cloud = replace(toy_splats.cloud(3300), means=means, logits=np.full(3300, 3, np.float32))
-    (tmp_path / "a.ply").write_bytes(formats.ply.to_bytes(cloud))
-    imported(tmp_path / "a.ply", tmp_path / "street", kind="scene", axes="world", origin_m=(100, 0, 0))
-    found = background_of(find_run(tmp_path / "street"), "street")
-    assert abs(np.median(found.ground_xyz[:, 2]) - 7) < 0.02 and len(found.ground_xyz) > 500
-    pose = geometry.yaw_matrix(0.5, (20, 5, 1))
-    flat = np.stack(np.meshgrid(np.arange(0, 60, 0.4), np.arange(-20, 40, 0.4)), -1).reshape(-1, 2)
-    mine = HeightMap.from_points(np.column_stack([flat, np.full(len(flat), 1.0)]))
-    moves = np.stack([pose @ geometry.yaw_matrix(0.0, (x, 0, 0)) for x in (0.0, 10.0)])
-    placed = place_background(EditWorld({}, Motion.recorded([0.0, 1.0], moves), mine), found)
-    assert np.allclose(placed, geometry.yaw_matrix(0.5, (20, 5, 1 - 7)), atol=0.05)
-
-
 def test_what_cannot_be_imported_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.obj").write_bytes(b"v 0 0 0")
     faint = replace(toy_splats.cloud(5), logits=np.full(5, -9, np.float32))
@@ -372,7 +351,7 @@ def test_colmap_binaries_hold_the_poses_and_one_rig(tmp_path: Path) -> None:
     assert camera == (1, 1, 24, 12, *both.cameras["front"].intrinsics)
 
 
-# --- logs as messages of ROS 2 and recordings of rerun: read by other readers, and put back together -----------------
+# --- logs as messages of ROS 2: read by other readers, and put back together --------------------------------------
 
 
 def read_bag(folder: Path) -> tuple[dict[str, list[tuple[int, Any]]], dict[str, Any]]:
@@ -509,23 +488,18 @@ def test_the_same_log_gives_the_same_bag_in_bounded_memory(exported: tuple[Scene
     assert (folder / "out" / "log_0.mcap").read_bytes() == first
 
 
-@pytest.mark.parametrize(
-    "name, out, package, extra",
-    [("mcap", "a.mcap", "mcap", "ros"), ("ros2", "bag", "rosbags", "ros"), ("rerun", "a.rrd", "rerun", "rerun")],
-)
+@pytest.mark.parametrize(("name", "out", "package"), [("mcap", "a.mcap", "mcap"), ("ros2", "bag", "rosbags")])
 def test_a_missing_package_is_named_with_its_extra(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, out: str, package: str, extra: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, out: str, package: str
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     for module in [key for key in sys.modules if key.startswith(f"{package}.")]:
         monkeypatch.delitem(sys.modules, module)
     street(tmp_path / "scene")
-    save_model(toy(), tmp_path / "fit")
-    source = tmp_path / ("fit" if name == "rerun" else "scene")
-    with pytest.raises(ResourceError, match=rf"mudg\[{extra}\]"):
-        Export(format=name, source=source, out=tmp_path / out, settings=ExportConfig()).run()
+    with pytest.raises(ResourceError, match=r"mudg\[ros\]"):
+        Export(format=name, source=tmp_path / "scene", out=tmp_path / out, settings=ExportConfig()).run()
     assert not (tmp_path / out).exists()
-    assert app.main(["export", name, str(source), "--out", str(tmp_path / "a.txt")]) != 0
+    assert app.main(["export", name, str(tmp_path / "scene"), "--out", str(tmp_path / "a.txt")]) != 0
 
 
 def test_what_has_no_log_or_is_damaged_is_refused(tmp_path: Path) -> None:
@@ -539,31 +513,3 @@ def test_what_has_no_log_or_is_damaged_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MudgError):
         Export(format="ros2", source=tmp_path / "scene", out=tmp_path / "bag", settings=ExportConfig()).run()
     assert not (tmp_path / "bag" / "metadata.yaml").exists() and not (tmp_path / "bag" / "log_0.mcap").exists()
-
-
-# -- rerun -----------------------------------------------------------------------------------------
-
-
-def test_a_recording_of_rerun_holds_log_and_gaussians(tmp_path: Path) -> None:
-    pytest.importorskip("rerun")
-    from rerun.chunk import RrdReader
-
-    scene, out = street(tmp_path / "scene"), tmp_path / "a.rrd"
-    save_model(toy(), tmp_path / "fit")
-    Export(format="rerun", source=tmp_path / "fit", scene=tmp_path / "scene", out=out, settings=ExportConfig()).run()
-    columns: dict[tuple[str, str], list[Any]] = {}
-    for chunk in RrdReader(tmp_path / "a.rrd").stream().to_chunks():
-        batch = chunk.to_record_batch()
-        for name in batch.schema.names:
-            columns.setdefault((chunk.entity_path, name), []).extend(batch.column(name).to_pylist())
-    pictures = columns["/world/camera/front", "EncodedImage:blob"]
-    assert [bytes(p[0]) for p in pictures] == [(tmp_path / "scene" / f.image.path).read_bytes() for f in scene.frames]
-    assert columns["/world/camera/front", "Pinhole:resolution"] == [[[24.0, 12.0]]]
-    mounted = columns["/world/camera/front", "Transform3D:translation"]
-    assert np.allclose(np.squeeze(mounted), [f.view.center_world for f in scene.frames])
-    assert len(columns["/world/gaussians/background", "Points3D:positions"][0]) == 640
-    assert len(columns["/world/gaussians/background", "Points3D:radii"][0]) == 640
-    points = {path.replace("\\", ""): rows for (path, name), rows in columns.items() if name == "Points3D:positions"}
-    assert len(points["/world/gaussians/car-1"][0]) == 50
-    assert len(columns["/world/objects/car-1", "Boxes3D:half_sizes"]) == 1
-    assert len(columns["/world/lidar/lidar", "Points3D:positions"]) == 3

@@ -33,7 +33,7 @@ with atheris.instrument_imports(include=["mudg"]):
     from mudg.formats.splats.cloud import SplatCloud, SplatNode, SplatScene
     from mudg.formats.splats.formats import FORMATS, WriteRequest
     from mudg.scene import schema
-    from mudg.sim import tables
+    from mudg.sim import lidar as tables
 
 STATS = ("number_of_executed_units", "slowest_unit_time_sec", "peak_rss_mb")
 LIMITS = ("-timeout=1", "-rss_limit_mb=1024", "-max_len=4096", "-print_final_stats=1")

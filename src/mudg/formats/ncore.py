@@ -9,7 +9,6 @@ time. A box is turned about x, then y, then z of the fixed frame.
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, Final
@@ -45,12 +44,15 @@ EULER: Final = "xyz"
 def package() -> Any:
     """The modules of the package ``nvidia-ncore``, loaded when they are first asked for: ``data`` (types), ``v4``
     (files), ``sensors`` (projection), ``transformations``. Raises ResourceError: it is not installed."""
-    modules = {"data": "data", "v4": "data.v4", "sensors": "sensors", "transformations": "impl.common.transformations"}
     try:
-        return SimpleNamespace(**{name: importlib.import_module(f"ncore.{path}") for name, path in modules.items()})
+        import ncore.data.v4
+        import ncore.impl.common.transformations
+        import ncore.sensors
     except ImportError as error:
         what = "NCore files need the package nvidia-ncore, which is not installed"
         raise ResourceError(what, got=str(error), remedy="pip install 'mudg[ncore]'") from error
+    transformations = ncore.impl.common.transformations
+    return SimpleNamespace(data=ncore.data, v4=ncore.data.v4, sensors=ncore.sensors, transformations=transformations)
 
 
 def close(reader: Any) -> None:

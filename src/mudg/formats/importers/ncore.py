@@ -321,7 +321,7 @@ def files_of_ncore(source: Path, options: ImportOptions) -> LogFiles:
 def import_ncore(source: Path, out: Path, options: ImportOptions) -> Scene:
     """Import a recording: a folder of stores, one of them, or the ``.json`` that lists them. ``options.sequence``: its
     name, or the beginning of it. ResourceError: the package is not installed."""
-    common.refuse_options(options, "NCore", "poses", "boxes", "bridge_gaps")
+    common.refuse_options(options, "NCore", "poses", "boxes")
     package()
     stores = _choose(source, options)
     for path in stores:

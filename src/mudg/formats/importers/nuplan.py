@@ -409,7 +409,7 @@ def _drive(opened: NuplanLog, scene: str, options: ImportOptions) -> DriveLog:
         remedy = "are the two in different units?"
         raise InputError(what, where=f"{where}: ego_pose.timestamp", expected=expected, remedy=remedy)
     ego = EgoPath(common.seconds(ego_us, "us", f"{where}: ego_pose.timestamp", start_us), poses)
-    ego = common.mended_path(ego, options, notes)
+    ego = common.mended_path(ego, notes)
     by_token = opened.cameras()
     folders = {channel for channel, _, _ in by_token.values() if (blobs / name / channel).is_dir()}
     available = {channel: ours for channel, ours in CAMERAS.items() if channel in folders}

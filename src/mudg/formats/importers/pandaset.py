@@ -372,7 +372,7 @@ class _Motion:
         self.world_from_source = common.world_from_first(forward[first])
         notes.append(common.origin_note(forward[first]))
         path = EgoPath(common.seconds(raw_s, "s", str(file), self.start_s), self.world_from_source @ forward)
-        self.path = common.mended_path(path, options, notes)
+        self.path = common.mended_path(path, notes)
         self.raw_s = raw_s[[number - known[0] for number in frames]]
         self.camera_s: dict[str, NDArray[np.float64]] = {}
         self.world_from_cam: dict[str, Matrix] = {}
