@@ -56,14 +56,6 @@ def test_a_kitti_folder_is_recognised_and_equals_a_direct_import(tmp_path: Path)
     assert any("resized" in note for note in small.source.notes)
 
 
-def test_flags_reach_the_importer_and_what_is_odd_is_said(tmp_path: Path) -> None:
-    drive = made.write_raw_drive(tmp_path / "day")
-    scene = read_scene(run(drive, tmp_path / "out", frames="1:6", test_every=2, untwist="no"))
-    assert len(scene.frames) == 5
-    assert sorted(i for i, s in scene.split.items() if s == "test") == ["front/000002", "front/000004"]
-    assert not read_points(scene, scene.sweeps[0]).dt_s.any()
-
-
 def test_the_number_of_workers_changes_nothing_and_is_no_other_configuration(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
     out = run(drive, tmp_path / "one", workers=1)

@@ -26,7 +26,7 @@ from mudg.base.processes import computed_ahead
 from mudg.base.records import understood
 from mudg.base.types import Observation
 from mudg.core.pictures import class_colors, depth_colors, error_image, resize_nearest, resize_rgb, to_bytes
-from mudg.formats.exporters.video import Encoding, jpeg_bytes, mp4_within, video_encoders
+from mudg.formats.exporters.video import jpeg_bytes, mp4_within, video_encoders
 from mudg.scene.observations import ObservationSet, list_observation_sets, read_observations
 from mudg.scoring.tables import (
     FLOOR,
@@ -555,7 +555,7 @@ VIEWER: Final = "viewer.html"
 VIEWER_FOLDER: Final = "viewer_page/index.html"
 SAME_TIME_S: Final = 1e-4
 ROWS: Final = tuple(name for name, _ in PANEL_ROWS)
-ENCODING: Final = Encoding(FPS, first_crf=33, last_crf=45, preset="veryfast")
+QUALITY: Final = (33, 45)
 
 
 @dataclass(frozen=True)
@@ -626,7 +626,7 @@ def _video(trajectory: Mapping[str, Any], folders: Mapping[str, Mapping[str, Pat
     columns = _columns(trajectory, folders)
     size = panel_size(int(trajectory["width"]), int(trajectory["height"]), PANEL_WIDTH)
     order = list(folders)
-    video = mp4_within(lambda: _frames(columns, order, size), ENCODING, budget) if budget else b""
+    video = mp4_within(lambda: _frames(columns, order, size), FPS, QUALITY, budget) if budget else b""
     poster = jpeg_bytes(next(_frames(columns, order, size, first=columns.frames // 2)), quality=60)
     return TrajectoryVideo(
         name=trajectory["name"],
