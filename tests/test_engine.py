@@ -17,9 +17,9 @@ from mudg import app, steps
 from mudg.base import store
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.run_folder import RunDir
-from mudg.steps.batch import stage_lines
 from mudg.steps.command import parse, words_of
 from mudg.steps.engine import Make, Output, Result, paths_of
+from mudg.steps.run import stage_lines
 from mudg.steps.step import Flag
 
 LINES = {
