@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from mudg.base.errors import InputError, UsageError, similar_path
 from mudg.base.layout import SCENE_FILES
-from mudg.base.plugins import plugins
+from mudg.base.versions import plugins
 from mudg.steps.engine import Make, Output
 from mudg.steps.step import SCENE, Flag, usage
 
@@ -21,10 +21,6 @@ if TYPE_CHECKING:
     from mudg.scene.settings import FuseConfig
 
 FORMATS = ("kitti360", "waymo", "nuscenes", "argoverse2", "pandaset", "nuplan", "ncore", "custom", "kitti")
-
-
-OF_A_LOG = ("format", "frames", "cameras", "sequence", "poses", "boxes", "resolution", "skip_missing", "untwist")
-"""Settings that a generated city does not have."""
 
 
 class Ingest(Output):
@@ -43,9 +39,6 @@ class Ingest(Output):
         *("resolution", "frames", "cameras", "sequence", "test_every"),
         *("city.seed", "city.n_frames", "city.width", "city.height"),
     )
-    parts = {"city": "Generate a city: a scene with exact truth."} | {
-        name: f"Convert a log in the format {name} to a scene directory." for name in FORMATS
-    }
     log: Annotated[str, Flag("[FORMAT] LOG [OUT]", "first")]
     """LOG: folder of a dataset log, a scene directory, or the word city. FORMAT: its format, only needed if it is not
     recognised. OUT: the folder to write, in place of --out."""
@@ -70,10 +63,6 @@ class Ingest(Output):
         if left:
             raise UsageError("too many words", expected=usage(cls), got=" ".join(words))
         return values
-
-    @classmethod
-    def applies(cls, part: str, name: str, text: str) -> bool:
-        return name not in OF_A_LOG if part == "city" else not name.startswith("city.") and name != "format"
 
     @functools.cached_property
     def kind(self) -> str:
