@@ -58,7 +58,7 @@ def _read(folder: Path) -> GalleryEntry:
     if (folder / "bench.json").is_file():
         found = store.read_json(folder / "bench.json")
         name = str(found.get("bench", "")) if isinstance(found, dict) else ""
-        own = pages(page=folder / "page.html", tables=folder / "bench.md")
+        own = pages(tables=folder / "bench.md")
         return GalleryEntry(folder, f"bench {name}".strip(), None, "", None, own)
     state = store.read_json(folder / store.RUN_STATE) if (folder / store.RUN_STATE).is_file() else {}
     state = state if isinstance(state, dict) else {}
