@@ -188,13 +188,12 @@ class RigidNode(Node):
     """A tracked dynamic object: rows in the frame of its box, carried by the box's pose.
 
     The pose at a time comes from the two neighbouring keys of the track. Each key may be corrected by offsets in the
-    frame of the box, ``corrected = world_from_object @ (yaw about z, then dx dy dz)``; **both** neighbours' corrected
+    frame of the box, ``corrected = world_from_object @ (yaw about z, then dx dy dz)``; both neighbours' corrected
     positions and rotations are interpolated (straight line, slerp). Outside the track's span the object does not exist.
 
     The offsets, one row per key: ``shift`` [K, 3] metres and ``yaw`` [K] radians; ``learn_pose``: whether a fit may
-    change them, not by gradient steps but by ``gaussians/poses.py``. Poses are worked out on the CPU, also where the
-    offsets are on another device: a copy of them is kept here, and what moves the rows at a time goes there once.
-    """
+    change them, not by gradient steps but by ``gaussians/corrections.py``. Poses are worked out on the CPU, also where
+    the offsets are on another device: a copy is kept here, and what moves the rows at a time goes there once."""
 
     kind = "rigid"
 

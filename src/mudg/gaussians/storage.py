@@ -18,7 +18,7 @@ from mudg.base.records import understood
 from mudg.base.run_folder import run_state
 from mudg.base.types import Camera, Scene, View
 from mudg.core.table import Table
-from mudg.gaussians.appearance import Appearance
+from mudg.gaussians.corrections import Appearance
 from mudg.gaussians.model import CERTAINTY, SceneModel
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.rendering import DRAWING, drawing_facts, raster_of, render_view

@@ -23,7 +23,7 @@ from torch import Tensor
 from mudg.base import geometry, log, seeds
 from mudg.base.types import Render, View
 from mudg.core.raster.rasterize import RasterConfig, rasterize
-from mudg.gaussians.appearance import Appearance
+from mudg.gaussians.corrections import Appearance
 from mudg.gaussians.model import SceneModel, compose, compose_as_read, composite_sky
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.start import StartPoints, voxel_filter

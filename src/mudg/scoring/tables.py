@@ -23,18 +23,16 @@ WEIGHT_FLAGS: Final = {
         ("--lpips-vgg-weights", "lpips_vgg"),
         ("--fid-weights", "fid kid"),
         ("--fvd-weights", "fvd"),
-        ("--dino-weights", "fd_dinov2 subject_consistency"),
-        ("--clip-weights", "cmmd clip_f clip_v"),
+        ("--clip-weights", "clip_f clip_v"),
         ("--detections", "nta_iou"),
         ("--lanes", "ntl_iou"),
     )
     for metric in metrics.split()
 }
 """Metric -> the flag of ``mudg score`` that names the weights or files it needs."""
-SET_SIZES: Final = {"distribution": ("fid", "kid"), "video": ("fvd",), "dinov2": ("fd_dinov2",), "clip": ("cmmd",)}
+SET_SIZES: Final = {"distribution": ("fid", "kid"), "video": ("fvd",)}
 """Entry of a result with the sizes of its sets -> their metrics."""
-_MADE: Final = {"distribution": "distributions", "video": "videos"}
-SET_METRICS: Final = {metric: _MADE.get(entry, entry) for entry, metrics in SET_SIZES.items() for metric in metrics}
+SET_METRICS: Final = {metric: f"{entry}s" for entry, metrics in SET_SIZES.items() for metric in metrics}
 """Metric of sets of images or clips -> the entry of metrics.json that says how it was made."""
 FLOOR: Final = "Floor: the truth itself"
 TITLES: Final[dict[str, str]] = {
@@ -53,7 +51,7 @@ LIDAR_COLUMNS: Final[Mapping[str, tuple[str, str, int]]] = {
     "intensity": ("intensity error", "", 3),
 }
 """Column -> title, unit, digits."""
-LIDAR_TITLES: Final = {"nearest": "nearest sweep, moved", "fused": "8 sweeps, fused"}
+LIDAR_TITLES: Final = {"nearest": "nearest sweep, moved"}
 LIDAR_RULES: Final = (
     "LiDAR: a beam is right where it returns as in the truth (F1). Errors of range (median) and intensity (mean) are "
     "those of beams that return in both; chamfer is the mean of both directions.",
@@ -61,10 +59,10 @@ LIDAR_RULES: Final = (
     "sensor's rows and columns. No row uses the held-out sweeps, but the clouds that the fit started from hold them.",
 )
 _DIGITS: Final = {
-    **dict.fromkeys(("fid", "fvd", "fd_dinov2"), 1),
+    **dict.fromkeys(("fid", "fvd"), 1),
     **dict.fromkeys(("psnr", "psnr_movers", "flicker", "rmse_m"), 2),
     **dict.fromkeys(("lidar_rmse_m", "lidar_psnr", "lane_psnr", "ntl_iou"), 2),
-    **dict.fromkeys(("kid", "warp_error", "temporal_flickering", "clip_f", "clip_v", "subject_consistency"), 4),
+    **dict.fromkeys(("kid", "warp_error", "temporal_flickering", "clip_f", "clip_v"), 4),
 }
 """Digits of metrics that do not have 3."""
 
@@ -152,11 +150,9 @@ def _further_rules(facts: Mapping[str, Any]) -> list[str]:
     if facts.get("lpips"):
         how = "in -1..1" if facts["lpips"]["input"] == "correct" else "unscaled, in 0..1"
         rules.append(f"LPIPS gets its colours {how}.")
-    if facts.get("dinov2"):
-        rules.append(f"FD-DINOv2 is made with {facts['dinov2']['network']}; read it beside the floor.")
     if facts.get("clip"):
         pairs = "CLIP-F (neighbouring views) and CLIP-V (recorded frame of the same time)"
-        rules.append(f"CMMD, {pairs} are made with {facts['clip']['network']}.")
+        rules.append(f"{pairs} are made with {facts['clip']['network']}.")
     detections = facts.get("detections", {})
     if of := detections.get("nta_iou"):
         of = f"true boxes {of['boxes']}; classes: {of['classes']}; points: {of['points']}"
