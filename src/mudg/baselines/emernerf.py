@@ -427,9 +427,6 @@ def _numbers(terms: Mapping[str, Tensor]) -> dict[str, float]:
     return {"psnr": round(-10 * math.log10(max(named["loss_color"], 1e-10)), 3), **named}
 
 
-# ---- checkpoints -------------------------------------------------------------
-
-
 def save_checkpoint(state: RadianceState, folder: RunDir) -> None:
     """All that changes: parameters, moments, the error map, the step."""
     field = {name: value.cpu() for name, value in state.field.state_dict().items()}

@@ -127,9 +127,6 @@ def summary_table(out: Path) -> str:
         return score_tables.plain(store.read_json(Path(out) / "metrics.json"))
 
 
-# ---- the baseline ----
-
-
 def baseline_of(scene: Scene, cloud: FusedCloud) -> Baseline:
     """The fused points drawn at a view, every hole taking the nearest point in the image: no learning at all."""
 
@@ -141,10 +138,8 @@ def baseline_of(scene: Scene, cloud: FusedCloud) -> Baseline:
 
 
 def nearest_fill(cloud: FusedCloud, world_from_object: Mapping[str, NDArray[np.float64]], view: View) -> Observation:
-    """Draw a cloud and fill what no point covers with the nearest covered pixel's colour, depth and class.
-
-    A view that sees no point at all is black, without depth and class.
-    """
+    """Draw a cloud and fill what no point covers with the nearest covered pixel's colour, depth and class. A view that
+    sees no point at all is black, without depth and class."""
     drawn = project.project_cloud(cloud, world_from_object, view, BASELINE_DRAWING)
     height, width = view.camera.height, view.camera.width
     index = drawn.index.numpy()
@@ -162,9 +157,6 @@ def nearest_fill(cloud: FusedCloud, world_from_object: Mapping[str, NDArray[np.f
     depth = torch.where(depth > 0, depth, torch.nan).float()
     mask = torch.ones(1, height, width, dtype=torch.bool)
     return Observation(view, rgb, depth, semantics, drawn.valid.float(), mask, "virtual", BASELINE)
-
-
-# ---- one trajectory ----
 
 
 @dataclass(frozen=True)

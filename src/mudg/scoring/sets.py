@@ -37,7 +37,7 @@ from mudg.scoring.truth import SAME_TIME_S, Reference, ScoredTrajectory
 
 # -- weights ---------------------------------------------------------------------------------------
 #
-# Of the networks of the scores: a published file -> a folder with ``weights.safetensors`` and its origin.
+# A published file -> a folder with ``weights.safetensors`` and its origin.
 
 WEIGHTS_FILE: Final = "weights.safetensors"
 DESCRIPTION_FILE: Final = "model.json"
@@ -161,10 +161,9 @@ class TrajectorySets:
 
 @dataclass
 class EmbeddingFiles:
-    """Features of sets of images by a network, kept in a folder: what went through the same network before is read.
-    ``network``: images ``[n, 3, h, w]`` -> ``[n, width]``. ``prepare``: an image u8[H, W, 3] as the network wants it.
-    ``width``: of the features. ``key``: weights and rules, by which kept files are found. ``folder``: where they lie.
-    ``device``: of the network."""
+    """Features of sets of images by a network, kept in a folder: what went through the same network before is read, by
+    the hash of ``key`` (weights and rules) and pixels. ``network``: images ``[n, 3, h, w]`` -> ``[n, width]``.
+    ``prepare``: an image u8[H, W, 3] as the network wants it."""
 
     network: Callable[[Tensor], Tensor]
     prepare: Callable[[NDArray[np.uint8]], Tensor]

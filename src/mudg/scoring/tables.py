@@ -1,4 +1,4 @@
-"""Scores as a document (metrics.json), as Markdown and as plain text for a terminal. Plain values only; no torch."""
+"""Scores as a document (metrics.json), as Markdown and as plain text for a terminal. No torch."""
 
 from __future__ import annotations
 
@@ -89,11 +89,10 @@ def document(
     rows: Mapping[str, Mapping[str, Any]],
     facts: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Everything ``metrics.json`` holds. ``scene``: what was scored. ``exact``: whether truth exists at any view.
-    ``trajectories``: as JSON values. ``methods``: in the order of the tables. ``results``: one entry per method and
-    trajectory. ``rows``: title, unit, better and needs of each metric. ``facts``: how the numbers were made:
-    ``depth_limit_m``, beyond which depths do not count; ``anchors``; and by the entries of ``SET_METRICS``,
-    ``detections`` and ``lpips`` what is known of their metrics; entries that are missing were not computed."""
+    """Everything ``metrics.json`` holds. ``exact``: whether truth exists at any view. ``methods``: in the order of the
+    tables. ``results``: one entry per method and trajectory. ``rows``: title, unit, better and needs of each metric.
+    ``facts``: how the numbers were made: ``depth_limit_m``, ``anchors``, and by metric or entry of ``SET_METRICS`` what
+    is known of those that were computed."""
     held_out, limit = len(scene.frames_in("test")), f"{facts['depth_limit_m']:g} m"
     off = "A recorded log has no ground truth off its path: shifted views are shown, not scored."
     no_split = "No frame was held out: on the recorded path the frames that were learned from are scored."
@@ -231,11 +230,9 @@ def floors_by_distance(document: Mapping[str, Any]) -> dict[float, dict[str, flo
 def plain(document: Mapping[str, Any]) -> str:
     """The main numbers for a terminal: one block per distance, best values marked with a star."""
     values_of = values_by_distance(document)
-    distances = sorted({d for _, d in values_of})
     names = (*TERMINAL_METRICS, *(name for name, entry in SET_METRICS.items() if entry in document))
-    floors = floors_by_distance(document)
-    lines = []
-    for distance in distances:
+    floors, lines = floors_by_distance(document), []
+    for distance in sorted({d for _, d in values_of}):
         of_methods = {m["name"]: values_of.get((m["name"], distance), {}) for m in document["methods"]}
         for wanted in (names, WITHOUT_TRUTH):
             columns = [m for m in document["metrics"] if m["name"] in wanted]
@@ -244,29 +241,25 @@ def plain(document: Mapping[str, Any]) -> str:
         else:
             lines += [f"{distance_title(document, distance)}: nothing to score against (no truth)", ""]
             continue
-        lines.append(distance_title(document, distance))
-        heads = [f"{m['title']}{' ' + m['unit'] if m['unit'] else ''}" for m in columns]
-        widths = [max(14, len(head) + 2) for head in heads]
-        lines.append("  " + " " * 28 + "".join(f"{head:>{width}}" for head, width in zip(heads, widths, strict=True)))
+        rows = [["", *(f"{m['title']} {m['unit']}".strip() + " " for m in columns)]]
         for method in document["methods"]:
-            cells = []
-            for metric, width in zip(columns, widths, strict=True):
+            rows.append([method["title"]])
+            for metric in columns:
                 across = {name: of.get(metric["name"]) for name, of in of_methods.items()}
                 star = "*" if method["name"] in best_of(metric["better"], across, metric["name"]) else " "
-                cells.append(f"{number_text(metric['name'], across[method['name']]) + star:>{width}}")
-            lines.append(f"  {method['title']:<28}" + "".join(cells))
+                rows[-1].append(number_text(metric["name"], across[method["name"]]) + star)
         if distance in floors:
-            found = [number_text(c["name"], floors[distance].get(c["name"])) + " " for c in columns]
-            cells = [f"{text:>{width}}" for text, width in zip(found, widths, strict=True)]
-            lines.append(f"  {FLOOR:<28}" + "".join(cells))
-        lines.append("")
+            rows.append([FLOOR, *(number_text(c["name"], floors[distance].get(c["name"])) + " " for c in columns)])
+        lines += [distance_title(document, distance), *_aligned(rows), ""]
     for title, heads, rows in _lidar_tables(document):
-        widths = [len(head) + 3 for head in heads[1:]]
-        texts = ([title, *heads[1:]], *rows)
-        for first, *cells in texts:
-            lines.append(f"  {first:<32}" + "".join(f"{c:>{w}}" for c, w in zip(cells, widths, strict=True)))
-        lines.append("")
+        lines += [*_aligned([[title, *heads[1:]], *rows]), ""]
     return plain_lines(lines).rstrip()
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table whose first column stands left, the others right."""
+    widths = [max(map(len, column)) + 2 for column in zip(*rows, strict=True)]
+    return ["  " + f"{row[0]:<{widths[0]}}" + "".join(f"{c:>{w}}" for c, w in zip(row[1:], widths[1:])) for row in rows]
 
 
 def markdown(document: Mapping[str, Any]) -> str:

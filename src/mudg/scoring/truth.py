@@ -183,6 +183,7 @@ def _lidar_depth(scene: Scene, view: View) -> Tensor | None:
 
 
 # -- the LiDAR points of a log, for truth at views that no camera recorded -------------------------
+
 MERGED_SWEEPS: Final = 6
 """Sweeps of each LiDAR whose points tell what the shown cameras saw."""
 KEPT_SWEEPS: Final = 96
@@ -362,6 +363,7 @@ def known_of(facts: ViewFacts) -> set[str]:
 
 
 # -- trajectories ----------------------------------------------------------------------------------
+
 _NAME: Final = re.compile(r"(?P<camera>.+?)_(?:recorded|shift(?P<shift>[+-]\d+(?:\.\d+)?))(?P<more>.*)")
 
 Baseline = Callable[[View], Observation]
@@ -370,10 +372,9 @@ PairDistance = Callable[[metrics.Pair], float | None]
 
 @dataclass(frozen=True)
 class ScoredTrajectory:
-    """One trajectory to score. ``name``: trajectory name. ``camera``: its camera. ``shift_m``: 0 = the recorded path,
-    None = neither it nor a plain shift. ``views``: at the common size. ``frames``: the recorded frame of each view on
-    the recorded path, else None. ``sets``, ``indices``: the methods that have it, and which of their views stand beside
-    ``views``."""
+    """One trajectory to score. ``shift_m``: 0 = the recorded path, None = neither it nor a plain shift. ``views``: at
+    the common size. ``frames``: the recorded frame of each view on the recorded path, else None. ``sets``, ``indices``:
+    of the methods that have it, and which of their views stand beside ``views``."""
 
     name: str
     camera: str
