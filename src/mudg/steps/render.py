@@ -98,8 +98,8 @@ class RenderViews(Output):
 
 
 _FILES = (
-    *("lpips_weights", "lpips_vgg_weights", "fid_weights", "fvd_weights", "dino_weights"),
-    *("clip_weights", "detections", "lanes"),
+    *("lpips_weights", "lpips_vgg_weights", "fid_weights", "fvd_weights", "clip_weights"),
+    *("detections", "lanes"),
 )
 """Settings that name files and folders to read."""
 
