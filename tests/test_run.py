@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import socket
 import subprocess
 import sys
@@ -156,34 +155,13 @@ def test_what_stopped_a_run_is_recorded_and_the_repeat_continues(
     ledger = store.read_json(tmp_path / "out" / "run.json")
     assert ledger["state"] == state and ledger["steps"]["synthesize"]["state"] == "interrupted"
     assert ledger["steps"]["fuse"]["state"] == "complete" and "score" not in ledger["steps"]
-    page = tmp_path / "out" / "report.html"
-    assert "Repeat the same command to go on" in page.read_text(), "the report of a run grows with it"
-    assert 'http-equiv="refresh"' not in page.read_text()
     chain(tmp_path)
     assert store.read_json(tmp_path / "out" / "run.json")["state"] == "complete"
-    assert "Repeat the same command" not in page.read_text()
 
 
 def test_the_shares_name_every_step_of_a_run(tmp_path: Path) -> None:
     steps = pipeline.steps_of(RunConfig(), tmp_path / "scene", tmp_path, overwrite=False)
     assert list(pipeline.PERCENT_OF_A_RUN) == [*steps, "viewer", "report"]
-
-
-def test_the_page_of_a_run_shows_its_steps_while_it_goes_on(tmp_path: Path, verbs: dict[str, Any]) -> None:
-    """It names what is done and what runs, renews itself, and never takes the place of a report."""
-    page, texts = tmp_path / "out" / "report.html", []
-    verbs["during"]["synthesize"] = lambda: texts.append(page.read_text())
-    chain(tmp_path)
-    (text,) = texts
-    assert 'http-equiv="refresh"' in text and "Synthesize, step 3 of 9" in text
-    done = ("ingest", "fuse", "fit without diffusion")
-    states = re.findall(r'<th scope="row">([a-z ]+)</th><td>([a-z]*)</td>', text)
-    assert states[:4] == [*((name, "done") for name in done), ("synthesize", "running")]
-    assert len(states) == 10 and all(state == "" for _, state in states[4:])
-    report = page.read_text()
-    chain(tmp_path)
-    assert page.read_text() == report
-    assert len(texts) == 1 or texts[1] == report
 
 
 def test_other_settings_are_refused_at_once_and_named(tmp_path: Path, verbs: dict[str, Any]) -> None:

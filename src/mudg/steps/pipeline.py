@@ -88,7 +88,6 @@ def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: boo
     from mudg.viewer import report as run_report
 
     ledger, page = _Ledger.open(out, config, str(source), overwrite), out / "report.html"
-    log.info(f"report: {page} (open it now: it grows while the run goes on)")
     config = with_device(config)
     try:
         scene = _prepare_scene(config, source, out, ledger, overwrite)
@@ -269,8 +268,6 @@ class _Ledger:
         self._asked = dict(asked)
         self._steps: dict[str, dict[str, Any]] = dict(before.get("steps", {}))
         self._report = dict(before.get("report", {}))
-        self._now = ""
-        """The step that runs."""
         self.digests: dict[str, str] = {}
         self.ahead: list[str] = []
         """Names of the steps on a labelled scene, once they are known."""
@@ -354,18 +351,6 @@ class _Ledger:
         left_s = sum(spent[step] for step in done) * (1 / share - 1)
         return f"{standing}, about {duration_text(left_s)} left" if left_s >= 60 else standing
 
-    def _show(self, state: str) -> None:
-        """Write the page of the unfinished run, but not over a report."""
-        from mudg.viewer.report import PROGRESS, progress_page
-
-        page = self._out / "report.html"
-        if page.is_file() and PROGRESS not in store.read_text(page):
-            return
-        names, spent = dict.fromkeys((*self._steps, self._now, *self.ahead)), self.seconds()
-        of = lambda name: "done" if self.has_done(name) else state if name == self._now else ""
-        steps = [(name, of(name), spent.get(name, 0.0)) for name in names if name]
-        store.write_text(page, progress_page(self._out, steps, state, self._standing(self._now).capitalize()))
-
     def timed(self, name: str, result: Path, run: Callable[[], Any]) -> Any:
         """Do one step, which makes a folder or file, and add its seconds, also when it is interrupted; a reused result
         adds none. The next step begins with the memory that this one took given back."""
@@ -374,7 +359,6 @@ class _Ledger:
         finished = self.has_done(name) and result.exists()
         meter, state = Meter(), "interrupted"
         log.info(f"== {self._standing(name)}")
-        self._now = name
         self.save("running")
         try:
             made = run()
@@ -402,9 +386,7 @@ class _Ledger:
         }
 
     def save(self, state: str) -> None:
-        """Write OUT/run.json, and until the end the page of the unfinished run."""
+        """Write OUT/run.json."""
         record = {"schema": 1, "state": state, "asked": self._asked, "steps": self._steps, "digests": self.digests}
         record |= {"report": self._report, "environment": environment()}
         store.write_json(self._out / "run.json", store.with_check(record))
-        if state != "complete":
-            self._show(state)
