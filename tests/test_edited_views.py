@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from test_clips import RULES, image_of_wall, stripes, view_at, wall
 from tiny_networks import small_mdm
 
@@ -19,6 +21,7 @@ from mudg.base.palette import ID
 from mudg.base.types import FusedCloud, Observation, Photo, PointCloud, RenderPlanes, View
 from mudg.base.weather_settings import Conditions
 from mudg.core.edit import Motion
+from mudg.core.pictures import to_bytes
 from mudg.core.weather import DriveFacts
 from mudg.core.weather.gbuffer import Surroundings
 from mudg.core.weather.light import srgb_decode, srgb_encode
@@ -31,13 +34,21 @@ from mudg.diffusion.settings import SynthesizeConfig
 from mudg.diffusion.synthesize import JobInputs, view_maker
 from mudg.editing.edit import boxes_mask, cleared_cloud, photos_of_edited, vacated_at
 from mudg.editing.plan import Actor, EditPlan, EditWorld, plan_edits
-from mudg.editing.render import REPAIR_STEPS, off_path_m
+from mudg.editing.render import REPAIR_STEPS, RenderMixer, off_path_m
 from mudg.editing.script import parse_edits
 from mudg.editing.settings import EditConfig, RenderConfig
+from mudg.gaussians.rendering import raster_of, render_view
+from mudg.gaussians.storage import load_model
 from mudg.scene.observations import read_observations
+from mudg.scene.read import read_scene
+from mudg.sim.optics import Pinhole
+from mudg.sim.session import CameraRequest, Instant, Session
 from mudg.steps.edit import Edit
 from mudg.steps.render import RenderViews
 from mudg.steps.synthesize import Synthesize
+from mudg.viewer.live import FrameRequest, FrameSource
+from mudg.viewer.settings import ViewConfig
+from mudg.viewer.view import server_of
 
 CAR = (0.6, 1.0, 1.0)
 
@@ -260,6 +271,41 @@ def test_distances_from_a_path_are_those_of_its_densest_places() -> None:
     assert off_path_m(path[0] + [0, 3, 4], path[:1]) == pytest.approx(5)
 
 
+def test_sessions_and_exact_frames_are_repaired_like_renders(run: Path) -> None:
+    """Pictures of a session and frames of the viewer against one view of ``RenderMixer``, with the shipped model."""
+    scene, model = read_scene(run / "scene"), load_model(run / FITTED)
+    raster = raster_of(model)
+    frame = scene.frames_of("front")[1].view
+    pose = frame.world_from_cam @ geometry.from_rotation_translation(np.eye(3), [-0.5, 0.0, 0.0])
+    view, camera = replace(frame, world_from_cam=pose), frame.camera
+    mixer = RenderMixer(JobInputs(run / "scene", run / "fuse", run / FITTED), device="cpu")
+    render = render_view(model, view, raster)
+    wanted = to_bytes(mixer(view, render).rgb)
+    assert np.abs(wanted.astype(int) - to_bytes(render.rgb)).max() > 5
+    session = Session(run, device="cpu", repair=True)
+    start = Instant(view.time_s, pose)
+    asked = CameraRequest(
+        optics=Pinhole(camera.width, camera.height, *camera.intrinsics), start=start, layers=("rgb",), colors_of="front"
+    )
+    assert np.abs(session.render([asked])[0].layers["rgb"].astype(int) - wanted).max() <= 1
+    for other in (
+        replace(asked, start=replace(start, objects={})),
+        replace(asked, end=Instant(view.time_s + 0.1, pose)),
+    ):
+        with pytest.raises(UsageError, match="cannot be repaired"):
+            session.render([other])
+    with pytest.raises(UsageError, match="repaired here"):
+        Session(run / FITTED, scene=run / "scene", repair=True)
+    source = FrameSource(lambda _: [model], scene, 1600, torch.device("cpu"), [mixer])
+    lens = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    at = {"eye": pose[:3, 3].tolist(), "axes": pose[:3, :3].T.tolist(), "time_s": view.time_s}
+    question = FrameRequest(scene=0, layer="color", hidden=[], camera="front", **lens, **at)
+    shown = lambda request: np.asarray(Image.open(io.BytesIO(source.png(request)[0]))).astype(int)
+    assert np.abs(shown(question) - wanted).max() <= 1
+    plain = render_view(model.without_nodes(["car"]), view, raster)
+    assert np.abs(shown(question.model_copy(update={"hidden": ["car"]})) - to_bytes(plain.rgb)).max() <= 1
+
+
 def test_what_cannot_be_repaired_is_refused(run: Path, tmp_path: Path) -> None:
     parts = {"scene": run / "scene", "model": run / FITTED, "out": tmp_path / "out"}
     settings, edits = RenderConfig(shifts_m=(0.0,), video=False, repair=True), script(tmp_path, CAR_GONE)
@@ -273,6 +319,11 @@ def test_what_cannot_be_repaired_is_refused(run: Path, tmp_path: Path) -> None:
         with pytest.raises(UsageError, match=message):
             RenderViews(**parts | more, settings=settings).run()
     assert not (tmp_path / "out").exists()
+    whole = Edit(source=run, script=edits, out=tmp_path / "whole", settings=EditConfig()).run()
+    with pytest.raises(UsageError, match="as it was recorded"):
+        Session(whole, device="cpu", repair=True)
+    with pytest.raises(UsageError, match="as it was recorded"):
+        server_of(ViewConfig(repair=True, images=0, port=0, device="cpu"), whole, None, None)
 
 
 def test_synthesize_shows_the_edited_drive(run: Path, tmp_path: Path) -> None:

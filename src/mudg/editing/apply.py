@@ -504,14 +504,11 @@ def drawer(model: SceneModel) -> Drawer:
 
 def weather_of(draw: Drawer, conditions: Conditions, scene: Scene) -> InWeather:
     """Weather for all views of a drive, with its light and ground. ``draw``: the views as they are, with depth and
-    classes. ``scene``: its recorded views tell the light of the drive, its path where wheels went and how fast the
-    cameras are. InputError: views without depth or classes."""
+    classes. ``scene``: its recorded views tell the light of the drive, its path how fast the cameras are. InputError:
+    views without depth or classes."""
     views = sorted((frame.view for frame in scene.frames), key=lambda view: (view.time_s, view.camera.name))
     witnesses = [_shown(draw(view)) for view in spread(views, WITNESSES)]
-    poses = scene.ego.world_from_ego
-    path = np.column_stack([poses[:, 0, 3], poses[:, 1, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])])  # x, y, yaw
-    drive = drive_facts(witnesses, path)
-    return InWeather(conditions, drive, SEED, functools.partial(trajectory.velocity, scene.ego))
+    return InWeather(conditions, drive_facts(witnesses), SEED, functools.partial(trajectory.velocity, scene.ego))
 
 
 def in_weather(draw: Drawer, how: InWeather) -> Drawer:

@@ -80,10 +80,8 @@ def prepare(
         return None
     drawing_device(config.device, "render", config.raster)
     edited = None if script is None and not config.repair else _scene_and_fit(scene, model, script)
-    if edited is not None and config.repair and FACT in edited[1].facts:
-        what = "only a fit of the drive as it was recorded can be repaired"
-        got, expected = "Gaussians of an edited drive", "Gaussians made by fit"
-        raise UsageError(what, where="--repair", expected=expected, got=got, remedy="leave it out")
+    if edited is not None and config.repair:
+        check_as_recorded(edited[1], "--repair")
     return edited
 
 
@@ -217,6 +215,14 @@ def _write_video(observations: Path, path: Path) -> None:
 # -- repairs ---
 
 
+def check_as_recorded(fitted: SceneModel, where: str) -> None:
+    """UsageError if the Gaussians are of an edited drive: photographs may still show what was removed."""
+    if FACT in fitted.facts:
+        what = "only a fit of the drive as it was recorded can be repaired"
+        got, expected = "Gaussians of an edited drive", "Gaussians made by fit"
+        raise UsageError(what, where=where, expected=expected, got=got, remedy="leave it out")
+
+
 class RenderMixer:
     """Views of a fit, each mixed with what the diffusion model makes of it.
 
@@ -232,7 +238,7 @@ class RenderMixer:
         UsageError: a published-type model, which makes clips of many frames from noise, or one that uses no renders.
     """
 
-    def __init__(self, inputs: JobInputs, model: str, device: str) -> None:
+    def __init__(self, inputs: JobInputs, model: str = "embedded", device: str = "auto") -> None:
         if is_published(model):
             what, expected = "a published-type model uses no renders and cannot repair them", "a small model"
             raise UsageError(what, where="--repair-model", expected=expected, got=model)

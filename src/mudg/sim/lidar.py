@@ -26,7 +26,7 @@ from mudg.base.records import Number, StrictRecord, parse_record
 from mudg.base.types import Scene, Sweep, SweepPoints, View
 from mudg.base.weather_settings import WeatherSettings
 from mudg.core.trajectory import ego_left_world, trajectory_name
-from mudg.core.weather.lidar import SOFT, sweep_in_weather
+from mudg.core.weather.air import SOFT, sweep_in_weather
 from mudg.editing.script import EditScript
 from mudg.editing.settings import RenderConfig
 from mudg.scene.beams import Beams, beams_of, with_silent

@@ -19,10 +19,12 @@ from numpy.typing import ArrayLike, NDArray
 from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import UNLABELLED
-from mudg.base.types import Camera, Gaussians, Scene, Shutter, View
+from mudg.base.types import Camera, Gaussians, Observation, Scene, Shutter, View
 from mudg.core.pictures import to_bytes
 from mudg.core.raster.rasterize import MAX_EXTRA_CHANNELS, drawing_device, rasterize
+from mudg.diffusion.synthesize import JobInputs
 from mudg.editing.apply import carry_out
+from mudg.editing.render import RenderMixer, check_as_recorded
 from mudg.editing.runs import find_run, scene_at
 from mudg.editing.script import EditScript, read_edits
 from mudg.gaussians.model import SceneModel, compose
@@ -191,9 +193,13 @@ class Session:
         run: folder of ``mudg run``, ``mudg demo`` or ``mudg fit``, or a model in memory.
         edits: an edit script, or its file, to carry out before. scene: the log that the fit belongs to; a folder of a
             run has its own. device: where pictures are drawn: ``auto``, ``cpu``, ``cuda``, ``cuda:N``.
+        repair: let the diffusion model make every picture once more, and mix both by its confidence, as
+            ``mudg render --repair`` (about half a second a picture). Needs the folder of a run, and requests with a
+            pinhole, one moment, and the objects as recorded.
 
     Raises:
-        InputError: no fitted scene, or edits that cannot be carried out. ResourceError: no such device.
+        InputError: no fitted scene, or edits that cannot be carried out. ResourceError: no such device. UsageError:
+            repairs without the clouds of a run, or of an edited one.
     """
 
     def __init__(
@@ -202,11 +208,20 @@ class Session:
         edits: str | Path | EditScript | None = None,
         scene: Scene | str | Path | None = None,
         device: str = "auto",
+        repair: bool = False,
     ) -> None:
-        if not isinstance(run, SceneModel):
-            parts = find_run(Path(run))
+        parts = None if isinstance(run, SceneModel) else find_run(Path(run))
+        self._mixer = None
+        if repair:
+            if parts is None or parts.scene is None or parts.fused is None or edits is not None:
+                what, expected = "pictures cannot be repaired here", "the folder of a finished mudg run, without edits"
+                raise UsageError(what, where="repair", expected=expected)
+            self._mixer = RenderMixer(JobInputs(parts.scene, parts.fused, parts.model), device=device)
+        if parts is not None:
             scene = scene if scene is not None else parts.scene
             run = load_model(parts.model)
+        if repair:
+            check_as_recorded(run, "repair")
         if isinstance(scene, str | Path):
             scene = read_scene(scene_at(Path(scene)))
         self._gone = None
@@ -362,9 +377,14 @@ class Session:
     # -- a picture ---------------------------------------------------------------------------------
 
     def picture(self, request: CameraRequest) -> CameraReply:
-        """What a camera sees. UsageError: an object that the scene does not have."""
+        """What a camera sees. UsageError: an object that the scene does not have, or a picture that the session cannot
+        repair."""
         width, height = request.optics.width, request.optics.height
         plain = request.optics.camera if isinstance(request.optics, Pinhole) else None
+        if self._mixer is not None and (plain is None or request.end is not None or request.start.objects is not None):
+            what = "this picture cannot be repaired"
+            expected = "a pinhole without distortion, one moment, and the objects as recorded"
+            raise UsageError(what, where="CameraRequest", expected=expected, remedy="open a session without repair")
         name = request.colors_of or next(iter(self.cameras), "sim")
         rays, canvas = rays_of(request.optics), Canvas(width, height)
         wants_instances = "instances" in request.layers or "motion" in request.layers
@@ -374,7 +394,10 @@ class Session:
                 shape = part.shape[:2]
                 cx, cy = plain.cx - columns.start, plain.cy - rows.start
                 camera = Camera(name, shape[1], shape[0], plain.fx, plain.fy, cx, cy)
-                planes = self.pinhole(View(camera, pose, moment.time_s), moment, wants_instances)
+                view = View(camera, pose, moment.time_s)
+                planes = self.pinhole(view, moment, wants_instances)
+                if self._mixer is not None:
+                    planes = replace(planes, seen=_repaired(self._mixer, view, planes.seen))
                 canvas.take((rows, columns), planes, part)
                 continue
             for face in faces_of(part, rays_per_radian(rays)):
@@ -478,6 +501,17 @@ class Canvas:
         self.certainty[place] = nearest(_certainty(seen), face.uv)
         if planes.instances is not None:
             self.instances[place] = nearest(planes.instances, face.uv)
+
+
+def _repaired(mixer: RenderMixer, view: View, rendered: RenderedCondition) -> RenderedCondition:
+    """A rendered view with colour and depth mixed with what the diffusion model makes of it."""
+    everywhere = torch.ones_like(rendered.depth, dtype=torch.bool)[None]
+    render = Observation(
+        view, rendered.rgb, rendered.depth[None], None, everywhere.float(), everywhere, "virtual", "mudg_s"
+    )
+    mixed = mixer(view, render)
+    depth = rendered.depth if mixed.depth is None else mixed.depth[0]
+    return replace(rendered, rgb=mixed.rgb, depth=depth)
 
 
 def _background(model: SceneModel) -> Matrix:

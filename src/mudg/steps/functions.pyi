@@ -283,7 +283,7 @@ def export(
     """Write a fitted scene for other programs: PLY, SPZ, glTF, USD, SOG; cameras for nerfstudio and COLMAP.
 
     Args:
-        format: Gaussians: ply, alpasim, spz, glb, usda, usdz, compressed-ply, sog, splat. Cameras: nerfstudio, colmap. The log over time: mcap, ros2, rerun, ncore.
+        format: Gaussians: ply, alpasim, spz, glb, usda, usdz, compressed-ply, sog, splat. Cameras: nerfstudio, colmap. The log over time: mcap, ros2, ncore.
         source: Gaussian scene written by fit, or folder of a finished mudg run; for cameras also a scene directory.
         out: File to write, with the suffix of the format; for cameras, ros2 and ncore, folder to write.
         scene: Scene directory that a Gaussian scene was fitted to. A run has its own.
@@ -458,7 +458,6 @@ def ingest(
     poses: str = '',
     boxes: str = '',
     skip_missing: bool = False,
-    bridge_gaps: bool = False,
     untwist: Literal['auto', 'yes', 'no'] = 'auto',
     city: Mapping[str, Any] = ...,
 ) -> Any:
@@ -480,7 +479,6 @@ def ingest(
         poses: File (or folder of GPS/IMU packets) with vehicle poses (empty = search in the log).
         boxes: File with tracked boxes (empty = search in the log).
         skip_missing: Skip frames with a missing image, scan or vehicle pose instead of refusing the log.
-        bridge_gaps: Bridge gaps between vehicle poses with curves instead of refusing the frames in them.
         untwist: Compensate LiDAR scans for the vehicle's motion during a sweep (auto = if the dataset's scans need it).
         city:
     """

@@ -36,6 +36,7 @@ from mudg.editing.apply import (
 )
 from mudg.editing.model import motion_of
 from mudg.editing.plan import EditPlan
+from mudg.editing.render import RenderMixer
 from mudg.editing.runs import find_run
 from mudg.editing.script import EditScript, conditions_of, parse_edits, read_edits
 from mudg.gaussians.model import SceneModel
@@ -258,11 +259,18 @@ def over_ground(model: SceneModel) -> SceneModel:
 class FrameSource:
     """Draws frames of one or two fitted scenes, one at a time. ``edited``: the scenes with a script carried out; "" =
     as they are. ``scene``: the log; its recorded views tell the light of the drive, where a script asks for other
-    weather or light. ``widest``: pixels of the widest frame."""
+    weather or light. ``widest``: pixels of the widest frame. ``mixers``: by number of the scene, what repairs frames of
+    it as it was fitted."""
 
     def __init__(
-        self, edited: Callable[[str], Sequence[SceneModel]], scene: Scene, widest: int, device: torch.device
+        self,
+        edited: Callable[[str], Sequence[SceneModel]],
+        scene: Scene,
+        widest: int,
+        device: torch.device,
+        mixers: Sequence[RenderMixer] = (),
     ) -> None:
+        self._mixers = mixers
         self._edited, self._scene, self._widest, self._device = edited, scene, widest, device
         self._edits: str | None = None
         self._models: list[SceneModel] = []
@@ -302,6 +310,8 @@ class FrameSource:
         gone = [name for name in request.hidden if name in model.node_names()]
         seen = model if request.camera else over_ground(model)
         draw = drawer(seen.without_nodes(gone) if gone else seen)
+        if self._mixers and request.layer != "class" and not gone and not request.edits.strip():
+            return lambda view: self._mixers[index](view, draw(view))
         conditions = conditions_of(model.facts.get(FACT, {}).get("script", ()))
         if conditions is None or request.layer != "color":
             return draw

@@ -34,6 +34,9 @@ class ViewConfig(PageConfig):
     loopback address)."""
     browser: bool = True
     """Open the page in a browser where there is one."""
+    repair: bool = False
+    """Let the diffusion model make every exact frame once more, and mix both by its confidence: half a second a frame.
+    For the drive as it was fitted; frames with edits, or with objects hidden, are as rendered."""
     width_px: int = setting(default=1600, ge=16, le=8192)
     """Widest exact frame, pixels."""
     device: DeviceName = "auto"

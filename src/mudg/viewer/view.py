@@ -19,7 +19,9 @@ from mudg.base.run_folder import ResultFile, refuse_overlap
 from mudg.base.types import FusedCloud, Scene
 from mudg.core.edit import HeightMap
 from mudg.core.raster.rasterize import drawing_device
+from mudg.diffusion.synthesize import JobInputs
 from mudg.editing.apply import ground_of
+from mudg.editing.render import RenderMixer, check_as_recorded
 from mudg.editing.runs import RunParts, find_run
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.storage import load_model, model_of_scene
@@ -255,7 +257,15 @@ def server_of(
     edits_out: Path | None = None,
 ) -> tuple[SiteServer, Site]:
     """The server of a run's page, listening, and what it serves."""
-    token, shown = token_for(config.host, config.token), find_sources(config, run, scene, compare).read()
+    token, sources = token_for(config.host, config.token), find_sources(config, run, scene, compare)
+    shown, mixers = sources.read(), list[RenderMixer]()
+    if config.repair:
+        if sources.cloud is None:
+            what, remedy = "exact frames are repaired from the clouds of a run", "give the folder of a run"
+            raise UsageError(what, where="--repair", got=str(run), remedy=remedy)
+        for (folder, _), (_, fitted) in zip(sources.fits, shown.fits, strict=True):
+            check_as_recorded(fitted, "--repair")
+            mixers.append(RenderMixer(JobInputs(sources.scene, sources.cloud, folder), device=config.device))
     desk = desk_for([model for _, model in shown.fits], shown.scene, shown.cloud, Path(run), edits, edits_out)
     live = {"layers": list(LAYERS), "token": token, "edits": desk.entries(), "place": desk.place.name, "run": desk.run}
     page, facts = replace(page_of(config, shown, live=live), effort=1), dict[str, Any]()  # nothing leaves this machine
@@ -265,6 +275,7 @@ def server_of(
     report = Path(run) / "report.html"
     if report.is_file():
         served["report.html"] = store.read_bytes(report)
-    source = FrameSource(desk.edited, shown.scene, config.width_px, drawing_device(config.device, "view"))
+    device = drawing_device(config.device, "view")
+    source = FrameSource(desk.edited, shown.scene, config.width_px, device, mixers)
     site = Site(served, {"edits": desk.answer, "frame": source.png}, token)
     return open_server(site, config.host, config.port), site
