@@ -193,16 +193,13 @@ class ViewScene(Step):
     """Edit script (docs/edit.md) that the page begins with."""
     edits_out: Annotated[Path | None, FILE_YAML] = None
     """Where edits made on the page are saved (without it: edits.yaml beside RUN, or in the current folder)."""
-    overwrite: bool = False
-    """Save edits over a file that mudg view did not write."""
     settings: ViewConfig
 
     def act(self) -> dict[str, Any]:
-        from mudg.viewer import live as edits
         from mudg.viewer import view
 
-        files = edits.EditFiles(self.edits, self.edits_out, self.overwrite)
-        return view.run_view(self.settings, self.source, self.compare, scene=self.scene, files=files)
+        places = {"scene": self.scene, "edits": self.edits, "edits_out": self.edits_out}
+        return view.run_view(self.settings, self.source, self.compare, **places)
 
 
 class Page(Step):

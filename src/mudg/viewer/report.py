@@ -10,7 +10,7 @@ import base64
 import json
 import math
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -41,29 +41,16 @@ from mudg.scoring.tables import (
     values_by_distance,
 )
 
-# -- command lines: what to do with a run next, and its steps one by one ---------------------------
+# -- command lines: what to do with a run next ------------------------------------------------------
 
-PLAIN: Final = "fit/street_gaussians"
 GUIDED: Final = "fit/mudg_s"
-STEPS: Final = (
-    *("scene", "annotate", "fuse", PLAIN, "synthesize", GUIDED),
-    *("render/street_gaussians", "render/mudg_s", "score"),
-)
-"""Folders of the chain, in the order in which they are made."""
-INPUTS: Final = {
-    "fused": ("--fused", "fuse"),
-    "fitted": ("--fitted", PLAIN),
-    "start": ("--start-from", PLAIN),
-    "observations": ("--observations", "synthesize"),
-}
-"""Inputs that a step's record names: their flag, and the folder of the chain."""
-VIEWS: Final = {"street_gaussians": "render/street_gaussians", "mudg_r": "synthesize", "mudg_s": "render/mudg_s"}
 
 
 def next_commands(out: Path, source: str) -> list[tuple[str, tuple[str, ...]]]:
     """What a run can be used for, as (title, lines). Each block works by itself, in the folder from which the run was
     started."""
-    run, scene = str(out), scene_of(out, source)
+    run = str(out)
+    scene = next((f"{out}/{name}" for name in ("annotate", "scene") if (out / name / "scene.json").is_file()), source)
     try:  # an object that an edit script can name
         nodes = store.read_json(out / GUIDED / "model.json")["nodes"]
         movable = next((str(node["name"]) for node in nodes if "label" in node), "")
@@ -94,34 +81,6 @@ def next_commands(out: Path, source: str) -> list[tuple[str, tuple[str, ...]]]:
     return [(title, tuple(map(_line, lines))) for title, lines in blocks]
 
 
-def step_commands(out: Path, source: str) -> list[str]:
-    """The steps of a run, each as a command with the settings that it had: as it stands it verifies the result and
-    reuses it."""
-    found = []
-    for folder in STEPS:
-        try:
-            inputs: Sequence[str] = list(store.read_json(out / folder / store.RUN_STATE)["inputs"])
-            verb = str(store.read_json(out / folder / store.RUN_STATE)["verb"])
-        except (InputError, KeyError, TypeError):
-            continue
-        words = [verb, source if folder == "scene" else scene_of(out, source, labelled=folder != "annotate")]
-        for name in inputs:
-            if name in INPUTS:
-                words += [INPUTS[name][0], f"{out}/{INPUTS[name][1]}"]
-        if verb == "render":
-            words += ["--model", f"{out}/fit/{Path(folder).name}"]
-        if verb == "score":
-            words += ["--views", *(f"{name}={out}/{place}" for name, place in VIEWS.items() if name in inputs)]
-        found.append(_line([*words, "--config", f"{out}/{folder}/run.yaml", "--out", f"{out}/{folder}"]))
-    return found
-
-
-def scene_of(out: Path, source: str, labelled: bool = True) -> str:
-    """The scene that the steps of a run read: labelled by it, made by it, or given to it."""
-    names = ("annotate", "scene") if labelled else ("scene",)
-    return next((f"{out}/{name}" for name in names if (out / name / "scene.json").is_file()), source)
-
-
 def _line(words: Sequence[str]) -> str:
     return words[0] if len(words) == 1 else f"mudg {shlex.join(words)}"
 
@@ -139,8 +98,6 @@ GROUPS: Final = (
 OPTIONAL: Final = frozenset({"At LiDAR points", "Vehicles and lanes", "Steadiness"})
 """Groups that are left out, and distances of them, where no method has a number."""
 CHARTED: Final = ("psnr", "abs_rel", "miou")
-CURVES: Final = (("psnr", "PSNR, dB", SENSES["higher"]), ("loss_color", "Loss of colour", SENSES["lower"]))
-"""Columns of the logs of fits that are drawn: title, and which way is better."""
 FIRST_M: Final = 2.0
 """The page begins beside the recorded path, as near to here as there are views."""
 NEAR_M: Final = 2.0
@@ -182,15 +139,13 @@ def page(
     columns: Sequence[str],
     viewer: str = "",
     out: Path = Path(),
-    curves: Sequence[Mapping[str, Any]] = (),
 ) -> str:
     """The text of the page. ``scores``: ``metrics.json``. ``ledger``: ``run.json`` of the chain. ``settings``:
     ``run.yaml``. ``videos``: one per trajectory. ``columns``: panel columns in the order in which they stand in the
     videos. ``viewer``: relative address of the page that shows the fitted scene, or empty. ``out``: folder of the run,
-    for commands. ``curves``: as of ``fit_charts``."""
+    for commands."""
     scene = scores["scene"]
     heading, lead = headline(scores)
-    source = str(ledger.get("asked", {}).get("source", "LOG"))
     return html.render(
         "report.html.j2",
         title=f"{scene['id']}: mudg report",
@@ -199,14 +154,12 @@ def page(
         lead=lead,
         scene=scene,
         viewer=viewer,
-        curves=curves,
         facts=_facts(scores, ledger),
         rules=scores["rules"],
         methods=scores["methods"],
         settings=settings,
         provenance=_provenance(scores, ledger),
-        next_commands=next_commands(out, source),
-        step_commands=step_commands(out, source),
+        next_commands=next_commands(out, str(ledger.get("asked", {}).get("source", "LOG"))),
         **_player_values(scores, videos, columns),
         **_score_values(scores),
         **_time_values(ledger),
@@ -333,7 +286,11 @@ def _score_values(scores: Mapping[str, Any]) -> dict[str, Any]:
             groups.append(_score_group(scores, title, [metrics[n] for n in names if n in metrics], there))
     made_of_sets = [metrics[name] for name, entry in SET_METRICS.items() if entry in scores]
     if made_of_sets:
-        groups.append(_with_floor(scores, _score_group(scores, "Distribution", made_of_sets, distances), distances))
+        group, floors = _score_group(scores, "Distribution", made_of_sets, distances), floors_by_distance(scores)
+        true = [(m["name"], floors.get(distance, {}).get(m["name"])) for distance in distances for m in made_of_sets]
+        cells = [{"text": number_text(name, value), "classes": ""} for name, value in true]
+        group["rows"].append({"method": "truth", "title": FLOOR, "cells": cells})  # what the truth itself scores
+        groups.append(group)
     has_number = lambda name: any(isinstance(r["values"].get(name), float) for r in scores["results"])
     numeric = [metric for metric in metrics.values() if has_number(metric["name"])]
     results = []
@@ -375,14 +332,6 @@ def _score_group(
     return {"title": title, "distances": titles, "metrics": metrics, "rows": rows}
 
 
-def _with_floor(scores: Mapping[str, Any], group: dict[str, Any], distances: Sequence[float]) -> dict[str, Any]:
-    """The group with a last row: what the truth itself scores."""
-    floors = floors_by_distance(scores)
-    values = [(m["name"], floors.get(distance, {}).get(m["name"])) for distance in distances for m in group["metrics"]]
-    cells = [{"text": number_text(name, value), "classes": ""} for name, value in values]
-    return {**group, "rows": [*group["rows"], {"method": "truth", "title": FLOOR, "cells": cells}]}
-
-
 def chart_points(scores: Mapping[str, Any], metric: str) -> dict[str, list[tuple[float, float]]]:
     """Method -> (shift in metres, mean value over cameras), left of the road first."""
     shifts = {t["name"]: t["shift_m"] for t in scores["trajectories"] if t["shift_m"] is not None}
@@ -411,59 +360,26 @@ def _chart(scores: Mapping[str, Any], metric: Mapping[str, Any]) -> dict[str, An
     """Values of the macro ``chart``: one line per method over the lateral shift, left of the road on the left; None
     with fewer than two shifts."""
     points = chart_points(scores, metric["name"])
-    shifts = {s for line in points.values() for s, _ in line}
+    shifts = sorted({-shift for line in points.values() for shift, _ in line})
     if len(shifts) < 2:
         return None
-    lines = {method: [(-shift, value) for shift, value in line] for method, line in points.items()}
-    better = SENSES[metric["better"]]
-    figure = _figure(lines, sorted(-shift for shift in shifts), lambda value: number_text(metric["name"], value))
-    return {
-        **figure,
-        "title": metric["title"] + (f", {metric['unit']}" if metric["unit"] else ""),
-        "better": better,
-        "label": f"{metric['title']} over the lateral shift, {better}",
-        "begin": "left" if max(shifts) > 0 else "",
-        "end": "right, m" if min(shifts) < 0 else "m",
-    }
-
-
-def fit_charts(out: Path) -> list[dict[str, Any]]:
-    """Values of the macro ``chart``: what the fits of a run logged of recorded views, over their steps; empty where
-    there is no log."""
-    rows: dict[str, list[dict[str, Any]]] = {}
-    for method in (WITHOUT, WITH):
-        path = out / "fit" / method / "log.jsonl"
-        if path.is_file():
-            found = (store.parse_json(line, str(path)) for line in store.read_text(path).splitlines())
-            rows[method] = [row for row in found if "step" in row]
-    made = []
-    for key, title, better in CURVES:
-        lines = {method: [(row["step"], row[key]) for row in own if key in row] for method, own in rows.items()}
-        lines = {method: line for method, line in lines.items() if len(line) > 1}
-        if lines:
-            steps = axis_ticks(0, max(x for line in lines.values() for x, _ in line))
-            figure = _figure(lines, steps, "{:g}".format)
-            words = {"title": title, "better": better, "label": f"{title} over the steps of the fits, {better}"}
-            made.append({**figure, **words, "begin": "", "end": "steps"})
-    return made
-
-
-def _figure(
-    lines: Mapping[str, Sequence[tuple[float, float]]], marks: Sequence[float], text: Callable[[float], str]
-) -> dict[str, Any]:
-    """Places of lines and axes in a chart; ``marks``: of the axis below, increasing."""
-    numbers = [value for line in lines.values() for _, value in line]
+    numbers, better = [value for line in points.values() for _, value in line], SENSES[metric["better"]]
     ticks = axis_ticks(min(numbers), max(numbers))
     left, right, top, bottom = 40.0, 330.0, 8.0, 150.0
-    x = lambda value: round(left + (value - marks[0]) / (marks[-1] - marks[0]) * (right - left), 1)
+    x = lambda value: round(left + (value - shifts[0]) / (shifts[-1] - shifts[0]) * (right - left), 1)
     y = lambda value: round(bottom - (value - ticks[0]) / (ticks[-1] - ticks[0]) * (bottom - top), 1)
     return {
         "left": left,
         "right": right,
         "bottom": bottom,
-        "y_ticks": [{"at": y(value), "text": text(value)} for value in ticks],
-        "x_ticks": [{"at": x(value), "text": f"{abs(value):g}"} for value in marks],
-        "lines": [{"method": m, "points": [(x(a), y(b)) for a, b in line]} for m, line in lines.items()],
+        "y_ticks": [{"at": y(value), "text": number_text(metric["name"], value)} for value in ticks],
+        "x_ticks": [{"at": x(value), "text": f"{abs(value):g}"} for value in shifts],
+        "lines": [{"method": m, "points": [(x(-a), y(b)) for a, b in line]} for m, line in points.items()],
+        "title": metric["title"] + (f", {metric['unit']}" if metric["unit"] else ""),
+        "better": better,
+        "label": f"{metric['title']} over the lateral shift, {better}",
+        "begin": "left" if shifts[0] < 0 else "",
+        "end": "right, m" if shifts[-1] > 0 else "m",
     }
 
 
@@ -596,7 +512,7 @@ def write_page(out: Path, videos: Sequence[TrajectoryVideo]) -> Path:
     with understood("a scored run", str(out)):
         scores, ledger = store.read_json(out / "score" / "metrics.json"), store.read_json(out / "run.json")
         columns = list(_folders(out, scores))
-        content = page(scores, ledger, text, videos, columns, viewer_address(out), out, fit_charts(out))
+        content = page(scores, ledger, text, videos, columns, viewer_address(out), out)
     store.write_text(out / "report.html", content)
     return out / "report.html"
 
