@@ -25,8 +25,6 @@ from toy_scene import ToyStreet
 from mudg.base import store
 from mudg.base.errors import UsageError
 from mudg.benchmarks import chain
-from mudg.benchmarks import run as bench
-from mudg.benchmarks.settings import BenchConfig
 from mudg.city.config import CityConfig
 from mudg.core import trajectory
 from mudg.diffusion import convert

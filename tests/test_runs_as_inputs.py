@@ -20,9 +20,8 @@ import mudg
 from mudg import FittedScene, app, steps
 from mudg.base import store
 from mudg.benchmarks import run as bench
-from mudg.formats import importers
+from mudg.formats.importers import FORMATS
 from mudg.scoring import score
-from mudg.steps import ingest
 from mudg.steps.engine import Result, paths_of
 
 

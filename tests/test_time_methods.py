@@ -510,7 +510,12 @@ FOREIGN = {
 
 
 @pytest.mark.parametrize("method, flag", FOREIGN.items())
-def test_settings_of_other_methods_are_refused(method, flag):
+def test_help_shows_the_settings_of_a_method_and_others_are_refused(method, flag):
+    page = command.help_page(Fit, everything=True, choice=method)
+    assert flag not in page.split() and "--iterations" in page
+    assert flag in command.help_page(Fit, everything=True).split()
+    assert command.chosen(Fit, ["--out", "x", f"--method={method}"]) == method
+    assert command.chosen(Fit, ["--method", method]) == method
     value = {"--radiance.size": "tiny"}.get(flag, "1")
     words = ["scene", "--out", "x", "--method", method, flag, value]
     assert flag in str(refused(f"does not apply to --method {method}", command.parse, Fit, words, raises=UsageError))

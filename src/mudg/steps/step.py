@@ -67,6 +67,8 @@ class Step:
     """Inputs that come from the run at `scene` where they are not given."""
     parts: ClassVar[Mapping[str, str]] = {}
     """First words that choose what the verb does, each with a page of help of its own, and what each does."""
+    choice: ClassVar[str] = ""
+    """The setting whose value says which other settings apply (`suits`)."""
     if typing.TYPE_CHECKING:
         __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
 
@@ -141,6 +143,11 @@ class Step:
     @classmethod
     def applies(cls, part: str, name: str, text: str) -> bool:
         """Whether a part of the verb takes a field or setting, by its dotted name and its text."""
+        return True
+
+    @classmethod
+    def suits(cls, choice: str, name: str) -> bool:
+        """Whether a setting, by its dotted name, applies where `choice` has this value."""
         return True
 
     @classmethod

@@ -136,9 +136,7 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
         for fit in content.fits.values():
             writer.add_camera(fit.camera)
         total = content.total or (len(content.items) if isinstance(content.items, Sequence) else 0)
-        common.for_each(
-            content.items, convert, f"importing {dataset}", total, options.workers, content.item_name
-        )
+        common.for_each(content.items, convert, f"importing {dataset}", total, options.workers, content.item_name)
         tracks, notes = content.tracks()
         tracks, turned = turned_back(tracks)
         notes = [*notes, *turned]

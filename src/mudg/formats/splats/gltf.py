@@ -192,8 +192,8 @@ _ATTRIBUTE: Final = re.compile(
     r"POSITION|NORMAL|TANGENT|(TEXCOORD|COLOR|JOINTS|WEIGHTS)_\d+|" + re.escape(PREFIX) + r".*", re.DOTALL
 )
 _STANDARD: Final = frozenset(
-    """extensions extras name camera skin weights indices material mode targets max min cameras images materials samplers
-    skins textures""".split()
+    """extensions extras name camera skin weights indices material mode targets max min cameras images materials
+    samplers skins textures""".split()
 )
 """Fields of glTF 2.0 that are not read."""
 _ROUNDING: Final = 1e-3
