@@ -1,14 +1,15 @@
-"""KITTI importer: raw drives, odometry and tracking sequences.
+"""KITTI importer: raw drives, odometry and tracking sequences, single object frames.
 
 What is read (the parts that are there are found by looking, and each choice is logged):
 
 =========== =============================================================================================
 images      ``image_02/data``, ``image_02``, ``image_2``, or ``image_02/<sequence>``
 scans       ``velodyne_points/data``, ``velodyne``, or ``velodyne/<sequence>``
-calibration ``calib.txt``, ``calib/<sequence>.txt``, or the day's ``calib_*_to_*.txt`` here or one folder up
+calibration ``calib.txt``, ``calib/<frame or sequence>.txt``, or the day's ``calib_*_to_*.txt`` here or one folder up
 poses       ``oxts/data`` (raw) or ``oxts/<sequence>.txt``; ``poses.txt``; ``poses_velo.txt``; ``poses_cam0.txt``; also
             in ``derived/``
-boxes       ``tracklet_labels.xml``; ``label_02.txt`` or ``label_02/<sequence>.txt``, also in ``derived/``
+boxes       ``tracklet_labels.xml``; ``label_02.txt`` or ``label_02/<sequence>.txt``, also in ``derived/``;
+            ``label_2/<frame>.txt``
 times       ``timestamps.txt`` per sensor, ``times.txt``; without them 10 Hz is assumed, and said
 =========== =============================================================================================
 
@@ -17,7 +18,7 @@ the velodyne. Camera ``image_02`` is called ``front``.
 
 Scans of raw drives are distorted by the vehicle's motion. They are untwisted here when poses come from GPS/IMU packets:
 the sensor turns counter-clockwise in 0.1 s and faces forward at the scan's time, so a point at azimuth a was measured a
-/ 2 pi turns later, and ``dt_s`` says so. The odometry and tracking benchmarks document their scans as
+/ 2 pi turns later, and ``dt_s`` says so. The odometry, tracking and object benchmarks document their scans as
 compensated; those keep ``dt_s`` = 0.
 """
 
@@ -54,10 +55,12 @@ def looks_like_kitti(source: Path) -> bool:
 
 
 def files_of_kitti(source: Path, options: ImportOptions) -> LogFiles:
-    """The folder, with the calibration and poses beside it; of a folder with many sequences only what is chosen."""
+    """The folder, with the calibration and poses beside it; of a folder with many sequences or frames only what is
+    chosen."""
     beside = sorted(p for p in (*source.parent.glob("calib_*.txt"), *_odometry_poses(source)) if p.is_file())
-    wanted = options.sequence
-    chosen = [path for path in sorted(source.glob("*/*")) if wanted and path.stem == wanted]
+    wanted, number = options.sequence, int(options.sequence) if options.sequence.isdigit() else -1
+    paths = sorted(source.glob("*/*")) if wanted else ()
+    chosen = [p for p in paths if p.stem == wanted or (p.stem.isdigit() and int(p.stem) == number)]
     if not chosen:
         return LogFiles((source, *beside))
     here = [path for path in sorted(source.iterdir()) if path.is_file() or path.name == "derived"]
@@ -105,7 +108,7 @@ class _Recording:
     """The files of one recording and what they tell, read in the order of the constructor.
 
     ``images``: scene camera name -> frame number -> file, ``numbers``: its KITTI number; ``scans`` may be empty.
-    ``frames``: the numbers that are imported.
+    ``single``: one frame of the object benchmark, without a clock or motion. ``frames``: the numbers that are imported.
     ``image_s`` by camera and frame and ``scan_s`` by frame: seconds since the first frame, which is ``start_s`` in the
     source. ``untwist``: whether scans are to be untwisted with the vehicle's path ``ego``.
     """
@@ -113,9 +116,11 @@ class _Recording:
     def __init__(self, folder: Path, options: ImportOptions) -> None:
         self.folder, self.options = folder, options
         self.notes: list[str] = []
+        benchmark = (folder / "image_2").is_dir() and (folder / "calib").is_dir()
+        self.single = benchmark and not (folder / "times.txt").is_file()
         self._find_files()
         stamps = self._read_stamps()
-        self.frames = self._complete_frames(stamps)
+        self.frames = [self._single_frame()] if self.single else self._complete_frames(stamps)
         self.calibration = self._read_calibration()
         self._set_clock(stamps)
         if options.poses is not None and not options.poses.exists():
@@ -130,31 +135,50 @@ class _Recording:
     # --- files and frames ---
 
     def _find_files(self) -> None:
-        sequence, where = self.options.sequence, str(self.folder)
+        sequence = "" if self.single else self.options.sequence
         images: dict[str, dict[int, Path]] = {}
         for folder in CAMERA_NAMES:
-            names = (f"{folder}/data", f"{folder}/{sequence}", f"{folder.replace('_0', '_')}/{sequence}")
-            found = [common.numbered_files(self.folder / name, (".png", ".jpg", ".jpeg")) for name in names]
-            if any(found):
-                images[folder] = next(files for files in found if files)
+            for name in (f"{folder}/data", f"{folder}/{sequence}", f"{folder.replace('_0', '_')}/{sequence}"):
+                found = common.numbered_files(self.folder / name, (".png", ".jpg", ".jpeg"))
+                if found:
+                    images[folder] = found
+                    break
         if not images:
-            folders = (path for name in ("image_02", "image_2") for path in (self.folder / name).glob("*/"))
-            sequences = sorted(path.name for path in folders if path.name != "data")
-            if sequences:
-                what, got = "the folder holds several sequences", self.options.sequence or "none chosen"
-                expected = "--sequence with one of " + ", ".join(sequences[:12])
-                raise UsageError(what, where=where, expected=expected, got=got)
-            what, expected = "no KITTI images found", "image_02/data, image_02 or image_2 with numbered PNG files"
-            remedy, got = "give the folder of one drive, sequence or training set", common.folder_contents(self.folder)
-            raise InputError(what, where=where, got=got, expected=expected, remedy=remedy)
+            self._refuse_without_images()
         usual = "image_02" if "image_02" in images else next(iter(images))
         available = {folder: CAMERA_NAMES[folder] for folder in images}
-        chosen = common.chosen_cameras(available, self.options, where, (usual,))
+        chosen = common.chosen_cameras(available, self.options, str(self.folder), (usual,))
         self.images = {CAMERA_NAMES[folder]: images[folder] for folder in chosen}
         self.numbers = {CAMERA_NAMES[folder]: int(folder[-1]) for folder in chosen}
         scans = common.numbered_files(self.folder / "velodyne_points" / "data", (".bin",))
         self.scans = scans or common.numbered_files(self.folder / "velodyne" / sequence, (".bin",))
         self._streams = {**self.images, **({SENSOR: self.scans} if self.scans else {})}
+
+    def _refuse_without_images(self) -> None:
+        folders = (path for name in ("image_02", "image_2") for path in (self.folder / name).glob("*/"))
+        sequences = sorted(path.name for path in folders if path.name != "data")
+        where = str(self.folder)
+        if sequences:
+            what, expected = "the folder holds several sequences", "--sequence with one of " + ", ".join(sequences[:12])
+            raise UsageError(what, where=where, expected=expected, got=self.options.sequence or "none chosen")
+        what, expected = "no KITTI images found", "image_02/data, image_02 or image_2 with numbered PNG files"
+        remedy, got = "give the folder of one drive, sequence or training set", common.folder_contents(self.folder)
+        raise InputError(what, where=where, got=got, expected=expected, remedy=remedy)
+
+    def _single_frame(self) -> int:
+        numbers, options = list(next(iter(self.images.values()))), self.options
+        if options.sequence.isdigit() and int(options.sequence) in numbers:
+            numbers = [int(options.sequence)]
+        if options.frames is not None:
+            numbers = [n for n in numbers if options.frames[0] <= n < options.frames[1]]
+        if len(numbers) != 1:
+            what, where = "an object-benchmark folder holds unrelated frames; a scene is one of them", str(self.folder)
+            got = f"{len(numbers)} frames: {common.number_ranges(numbers)}"
+            raise UsageError(what, where=where, expected="--sequence with one frame number, e.g. 000008", got=got)
+        if self.scans and numbers[0] not in self.scans:
+            where = str(self.folder / "velodyne")
+            raise InputError("frame has no scan", where=where, expected=f"{numbers[0]:06d}.bin")
+        return numbers[0]
 
     def _complete_frames(self, stamps: Stamps) -> list[int]:
         """The frames that all chosen cameras and scans have, with a time stamp where there are any."""
@@ -168,11 +192,18 @@ class _Recording:
         return frames
 
     def _read_calibration(self) -> KittiCalibration:
-        path = common.first_file(self.folder / "calib.txt", self.folder / "calib" / f"{self.options.sequence}.txt")
+        calib = self.folder / "calib"
+        path = common.first_file(
+            self.folder / "calib.txt",
+            *([calib / f"{self.frames[0]:06d}.txt"] if self.single else []),
+            *([calib / f"{self.options.sequence}.txt"] if self.options.sequence else []),
+        )
         if path is not None:
+            log.info(f"kitti: calibration from {path}")
             return kitti_files.read_calibration_text(path)
         for day in (self.folder, self.folder.parent):
             if (day / "calib_cam_to_cam.txt").is_file():
+                log.info(f"kitti: calibration from {day}/calib_*.txt")
                 return kitti_files.read_calibration_day(day)
         expected = "calib.txt, or calib_cam_to_cam.txt and calib_velo_to_cam.txt here or one folder up"
         remedy = "download the day's calibration archive and unpack it beside the drive"
@@ -188,7 +219,7 @@ class _Recording:
             folder = next(iter(found.values())).parent
             paths[name] = common.first_file(folder.parent / "timestamps.txt", folder / "timestamps.txt", shared)
         files = [path for path in paths.values() if path is not None]
-        if len(files) < len(paths):
+        if self.single or len(files) < len(paths):
             return {}
         if self.scans:
             paths[SENSOR] = common.first_file(self.folder / "velodyne_points" / "timestamps.txt", shared, *files)
@@ -205,7 +236,8 @@ class _Recording:
         """The recording's clock: measured, or 10 Hz from the first frame on, which is noted."""
         self.start_s, self._measured = 0.0, bool(stamps)
         if not stamps:
-            self.notes.append("no timestamps in the source: 10 Hz assumed, image and scan of a frame at one moment")
+            if not self.single:
+                self.notes.append("no timestamps in the source: 10 Hz assumed, image and scan of a frame at one moment")
             self.scan_s = {n: (n - self.frames[0]) * FRAME_PERIOD_S for n in self.frames}
             self.image_s = dict.fromkeys(self.images, self.scan_s)
             return
@@ -220,20 +252,19 @@ class _Recording:
     # --- motion ---
 
     def _set_motion(self) -> None:
-        """The vehicle's motion from GPS/IMU packets (a folder, or the sequence's file), else from a pose file."""
+        """The vehicle's motion from GPS/IMU packets, else from a pose file."""
+        packets = self._find_packets()
         self.ego_from_velo, self.untwist = np.eye(4), self.options.untwist == "yes"
-        oxts, poses = self.folder / "oxts", self.options.poses
-        packets = poses or oxts / "data"
-        if poses is None and not packets.is_dir():
-            packets = oxts / f"{self.options.sequence}.txt"
-        if not (packets.is_dir() or (poses is None and packets.is_file())):
+        if packets is None:
             ego = self._ego_from_file()
         else:
             velo_from_imu, where = self.calibration.velo_from_imu, self.calibration.source
             if velo_from_imu is None:
                 what, expected = "calibration does not tell where the IMU is", "calib_imu_to_velo.txt or Tr_imu_to_velo"
-                remedy = "add it, or give a pose file with --poses"
-                raise InputError(what, where=where, expected=expected, remedy=remedy)
+                raise InputError(
+                    what, where=where, expected=expected, remedy="add it, or give a pose file with --poses"
+                )
+            log.info(f"kitti: poses from GPS/IMU packets in {packets}")
             self.notes.append("poses from GPS/IMU packets")
             ego = self._ego_from_packets(packets)
             raw_scans = any(path.parent.name == "data" for path in self.scans.values())
@@ -243,6 +274,14 @@ class _Recording:
         self.untwist &= len(self.frames) > 1
         if self.untwist:
             self.notes.append("scans untwisted: counter-clockwise turn of 0.1 s, forward at the scan's time")
+
+    def _find_packets(self) -> Path | None:
+        """GPS/IMU packets: a folder, or the sequence's file."""
+        oxts, sequence = self.folder / "oxts", self.options.sequence
+        folder = self.options.poses or oxts / "data"
+        if folder.is_dir():
+            return folder
+        return common.first_file(oxts / f"{sequence}.txt") if sequence and self.options.poses is None else None
 
     def _ego_from_file(self) -> EgoPath:
         """The velodyne's path at the scans; the world is the velodyne of the first frame."""
@@ -256,6 +295,7 @@ class _Recording:
             expected = "oxts/data, poses.txt, derived/poses_velo.txt or --poses FILE"
             remedy = "without poses the frames of a moving vehicle cannot be put into one world"
             raise InputError("no vehicle poses found", where=str(folder), expected=expected, remedy=remedy)
+        log.info(f"kitti: poses from {path}")
         self.notes.append(f"poses from {path.name}")
         poses, sensor = kitti_files.read_pose_file(path, frames)
         known = self._known(frames, poses, "pose file lacks frames", path)
@@ -285,9 +325,10 @@ class _Recording:
         """The frames that are ``there``; lost ones are refused unless frames may be left out."""
         missing = [n for n in frames if n not in there]
         if missing and (not self.options.skip_missing or len(missing) == len(frames)):
-            got = f"nothing for frames {common.number_ranges(missing)}"
-            remedy = "copy them, choose frames with --frames FIRST:END, or add --skip-missing"
-            raise InputError(what, where=str(path), got=got, remedy=remedy)
+            where, remedy = str(path), "copy them, choose frames with --frames FIRST:END, or add --skip-missing"
+            raise InputError(
+                what, where=where, got=f"nothing for frames {common.number_ranges(missing)}", remedy=remedy
+            )
         return [n for n in frames if n in there]
 
     def _leave_out_unplaced(self) -> None:
@@ -312,19 +353,28 @@ class _Recording:
 
     def read_tracks(self, world_from_velo: Mapping[int, Matrix]) -> list[Track]:
         """Tracks, told of in ``notes``; no box file is no tracks."""
-        folder, boxes_file = self.folder, self.options.boxes
+        derived, sequence, boxes_file = self.folder / "derived", self.options.sequence, self.options.boxes
         if boxes_file is not None and not boxes_file.is_file():
             raise InputError("box file does not exist", where=str(boxes_file))
-        names = ("tracklet_labels.xml", "label_02.txt", f"label_02/{self.options.sequence}.txt")
-        paths = [*(folder / name for name in names), *(folder / "derived" / name for name in names[:2])]
-        found = boxes_file or common.first_file(*paths)
+        object_label = self.folder / "label_2" / f"{self.frames[0]:06d}.txt"
+        found = boxes_file or common.first_file(
+            self.folder / "tracklet_labels.xml",
+            self.folder / "label_02.txt",
+            *([self.folder / "label_02" / f"{sequence}.txt"] if sequence else []),
+            derived / "tracklet_labels.xml",
+            derived / "label_02.txt",
+            *([object_label] if self.single else []),
+        )
         if found is None:
             self.notes.append("no boxes found: everything counts as static")
             return []
+        log.info(f"kitti: boxes from {found}")
         if found.suffix == ".xml":
             boxes = kitti_files.read_tracklets(found)
         else:
-            boxes = kitti_files.read_label_text(found, self.calibration.rect0_from_velo)
+            is_object = self.single and found in (boxes_file, object_label)
+            frame = self.frames[0] if is_object else None
+            boxes = kitti_files.read_label_text(found, self.calibration.rect0_from_velo, frame)
         velo_at = self.velo_at if self.untwist else None
         tracks, notes = kitti_files.build_tracks(boxes, world_from_velo, self.scan_s, str(found), velo_at)
         self.notes += [f"boxes from {found.name}", *notes]

@@ -166,7 +166,7 @@ def rotation_entry(table: Mapping[str, NDArray[np.float64]], keys: tuple[str, ..
 
 
 def read_calibration_text(path: Path) -> KittiCalibration:
-    """Tracking or odometry calibration: P0..P3, R0_rect (odometry: none), Tr_velo_to_cam, Tr_imu_to_velo."""
+    """Object, tracking or odometry calibration: P0..P3, R0_rect (odometry: none), Tr_velo_to_cam, Tr_imu_to_velo."""
     table = read_number_table(path)
     projections = {n: table_entry(table, (f"P{n}",), (3, 4), path) for n in range(4) if f"P{n}" in table}
     rectify, rectify_keys, imu_keys = np.eye(4), ("R0_rect", "R_rect"), ("Tr_imu_to_velo", "Tr_imu_velo")
@@ -229,7 +229,7 @@ def read_pose_file(path: Path, frame_numbers: Sequence[int]) -> tuple[dict[int, 
     """Poses f64[4, 4] by frame number, and which sensor they are of: ``cam0`` or ``velo``.
 
     Two forms are told apart by the numbers in a line: 12 = KITTI odometry, row-major 3x4 of rectified camera 0, line k
-    for frame number k; 13 = frame number, then
+    for frame number k (or, in a file that has just one line per frame, for the k-th frame); 13 = frame number, then
     row-major 3x4 of the velodyne in a z-up world. An empty line is a frame without a pose."""
     lines = read_lines(path)
     if not lines:
@@ -244,8 +244,13 @@ def read_pose_file(path: Path, frame_numbers: Sequence[int]) -> tuple[dict[int, 
             raise InputError("first column is not a list of distinct frame numbers", where=str(path))
     elif count > max(frame_numbers):
         poses = rows
+    elif len(rows) == count == len(frame_numbers):
+        poses = dict(zip(frame_numbers, rows.values(), strict=True))
+        if frame_numbers[-1] - frame_numbers[0] >= count:
+            lines = f"{path} has a line for each of the {count} frames"
+            log.warn(f"kitti: {lines}: line k is taken for the k-th of them, gaps or not")
     else:
-        expected = f"at least {max(frame_numbers) + 1} (one per frame number)"
+        expected = f"{len(frame_numbers)} (one per frame) or at least {max(frame_numbers) + 1} (one per frame number)"
         what = "pose file does not cover the frames"
         raise InputError(what, where=str(path), got=f"{count} lines", expected=expected)
     sensor = "velo" if widths == {13} else "cam0"
@@ -336,7 +341,7 @@ _TRACKLET_POSE = frozenset(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KittiBox:
-    """One annotated box. ``track``: its number. ``label``: lower-case class, e.g. ``car``.
+    """One annotated box. ``track``: its number; object labels count lines. ``label``: lower-case class, e.g. ``car``.
     ``size_m``: length, width, height. ``sensor_from_box``: box frame (x forward, y left, z up, origin in the centre) to
     the velodyne, f64[4, 4]."""
 
@@ -347,22 +352,24 @@ class KittiBox:
     sensor_from_box: Matrix
 
 
-def read_label_text(path: Path, rect0_from_velo: Matrix) -> list[KittiBox]:
-    """Boxes of a tracking label file (17 columns and optionally a score), which are given in rectified camera 0;
-    ``DontCare`` regions are left out. Raises InputError: another number of columns, values that are no finite numbers,
-    or a size that makes no sense."""
+def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = None) -> list[KittiBox]:
+    """Boxes of a tracking label file (17 columns and optionally a score), or, with the number of its ``frame``, of an
+    object label file (15). They are given in rectified camera 0; ``DontCare`` regions are left out. Raises InputError:
+    another number of columns, values that are no finite numbers, or a size that makes no sense."""
     velo_from_rect0 = invert(rect0_from_velo)
     boxes = []
+    skip = 2 if frame is None else 0
     for index, line in read_lines(path).items():
         columns, where = line.split(), f"{path}: line {index + 1}"
-        if len(columns) not in (17, 18):
-            what, expected = "label line has the wrong number of columns", "17 (or 18 with a score)"
-            remedy = "is this a tracking label file?"
+        if len(columns) - skip not in (15, 16):
+            what, expected = "label line has the wrong number of columns", f"{15 + skip} (or {16 + skip} with a score)"
+            remedy = "is this a tracking or an object label file?"
             raise InputError(what, where=where, got=str(len(columns)), expected=expected, remedy=remedy)
-        if columns[2] == "DontCare":
+        if columns[skip] == "DontCare":
             continue
         try:
-            number, track, values = int(columns[0]), int(columns[1]), [float(text) for text in columns[3:]]
+            number, track = (frame, index) if frame is not None else (int(columns[0]), int(columns[1]))
+            values = [float(text) for text in columns[skip + 1 :]]
         except ValueError as error:
             raise InputError("label value is not a number", where=where, got=str(error)) from error
         if not np.isfinite(values).all():
@@ -373,7 +380,7 @@ def read_label_text(path: Path, rect0_from_velo: Matrix) -> list[KittiBox]:
         c, s = np.cos(turn), np.sin(turn)
         rotation = np.array([(c, 0.0, -s), (s, 0.0, c), (0.0, -1.0, 0.0)]).T
         pose = velo_from_rect0 @ from_rotation_translation(rotation, np.array([x, y - height / 2, z]))
-        boxes.append(KittiBox(number, track, columns[2].lower(), size_m, pose))
+        boxes.append(KittiBox(number, track, columns[skip].lower(), size_m, pose))
     return boxes
 
 

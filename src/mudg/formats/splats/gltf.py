@@ -214,6 +214,7 @@ class _Node(ForeignRecord):
     rotation: Four = [0.0, 0.0, 0.0, 1.0]
     translation: Three = [0.0, 0.0, 0.0]
     scale: Three = [1.0, 1.0, 1.0]
+    extensions: dict[str, Any] = {}
 
 
 class _Primitive(ForeignRecord):
