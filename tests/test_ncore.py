@@ -311,7 +311,7 @@ def test_a_path_that_is_too_short_goes_on_and_then_stands() -> None:
 
 
 def test_the_package_is_asked_for_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ncore.data", None)
+    monkeypatch.setitem(sys.modules, "ncore.data.v4", None)
     (tmp_path / "a.ncore4.zarr.itar").write_bytes(b"")
     refused(r"mudg\[ncore\]", ingest, tmp_path, tmp_path / "out", raises=ResourceError)
     assert app.main(["export", "ncore", str(tmp_path), "--out", str(tmp_path / "out")]) != 0

@@ -422,7 +422,7 @@ def import_asset(
         label: Class of the object, e.g. car or pedestrian.
         length_m: Scale the object so that its box has this length (not given: the file is in metres).
         yaw_deg: Turn what the file holds by this angle about the vertical, counter-clockwise from above, so that an object looks, or a street leads, along x.
-        origin_m: With --kind scene: the place in the file that becomes the origin, after --axes and before --yaw-deg (not given: the file's own origin, or the middle of Gaussians that lie more than 16 km away). As a background of an edit script, a street begins there.
+        origin_m: With --kind scene: the place in the file that becomes the origin, after --axes and before --yaw-deg (not given: the file's own origin, or the middle of Gaussians that lie more than 16 km away).
         axes: Where x, y and z of the file point. file: as the file says, else as viewer. viewer: as programs expect of its format. world: x forward, y left, z up, as of export --axes world. Or three letters of L, R, U, D, F, B: RDF is x right, y down, z forward.
     """
     ...
