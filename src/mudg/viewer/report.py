@@ -1,8 +1,6 @@
-"""The report: one self-contained page of a finished run. Needs no network and works by double click.
-
-Each trajectory becomes one H.264 video that holds all panels (columns: truth and methods; rows: colour, depth, classes,
-colour error), so that the panels can never run apart; the page cuts them out of it.
-"""
+"""The report: one self-contained page of a finished run, without a network, by double click. Each trajectory becomes
+one H.264 video that holds all panels (columns: truth and methods; rows: colour, depth, classes, colour error), so that
+they never run apart; the page cuts them out of it."""
 
 from __future__ import annotations
 
