@@ -155,6 +155,20 @@ def test_what_stopped_a_run_is_recorded_and_the_repeat_continues(
     assert store.read_json(tmp_path / "out" / "run.json")["state"] == "complete"
 
 
+def test_a_run_says_which_step_it_is_at_and_what_is_left(
+    tmp_path: Path, verbs: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After the first fit the finished steps were 19 % of the work, so 38 minutes of them leave 162."""
+    steps = pipeline.steps_of(RunConfig(), tmp_path / "scene", tmp_path, overwrite=False)
+    assert list(pipeline.PERCENT_OF_A_RUN) == [*steps, "viewer", "report"]
+    said = list[str]()
+    monkeypatch.setattr(pipeline.log, "info", said.append)
+    monkeypatch.setattr(pipeline.Meter, "stop", lambda _: pipeline.Usage(19 * 60.0, 19 * 60.0))
+    chain(tmp_path)
+    assert "== fit without diffusion, step 2 of 9" in said
+    assert "== synthesize, step 3 of 9, about 162 min left" in said
+
+
 def test_other_settings_are_refused_at_once_and_named(tmp_path: Path, verbs: dict[str, Any]) -> None:
     chain(tmp_path)
     verbs["calls"].clear()
