@@ -258,13 +258,14 @@ def run_state(folder: Path) -> dict[str, Any]:
     what, empty = "the output folder holds files of something else", "choose an empty --out"
     refused = UsageError(what, where=str(folder), remedy=empty)
     if not folder.is_dir():
-        if os.path.lexists(folder):
-            remedy = "choose the name of a folder that does not exist yet"
-            got = "a file" if folder.is_file() else "a device, pipe or socket"
-            if folder.is_symlink() and not folder.exists():
-                got = f"a link that leads nowhere: {os.readlink(folder)}"
-            raise UsageError("the output is no folder", where=str(folder), got=got, remedy=remedy)
-        return {}
+        if not os.path.lexists(folder):
+            return {}
+        got, remedy = "a device, pipe or socket", "choose the name of a folder that does not exist yet"
+        if not folder.exists():
+            got = f"a link that leads nowhere: {os.readlink(folder)}"
+        elif folder.is_file():
+            got = "a file"
+        raise UsageError("the output is no folder", where=str(folder), got=got, remedy=remedy)
     if not (folder / _STATE).is_file():
         for entry in folder.iterdir():  # but for the lock of a run that was killed before it wrote anything else
             if not is_temporary(entry.name) and not (entry.name == _LOCK and _owner(entry) is not None):

@@ -16,7 +16,7 @@ from typing import Any, Literal, NoReturn, get_args, get_origin
 
 from mudg.base import config as configuration
 from mudg.base.errors import UsageError, nearest
-from mudg.steps.step import Option, Step, flag_name, flag_of, is_many, options, positions, present, usage
+from mudg.steps.step import Option, Step, flag_name, flag_of, is_many, options, present, usage
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ def parse(cls: type[Step], words: Sequence[str]) -> tuple[Step, Common]:
     for option in listed.values():
         _add(parser, option)
     parser.add_argument("words", nargs="*")
-    found, unknown = parser.parse_known_intermixed_args(_second_named(cls, _plain_flags(words)))
+    found, unknown = parser.parse_known_intermixed_args(_plain_flags(words))
     if unknown:
         _refuse_unknown(cls, unknown[0], listed)
     given: dict[str, Any] = {name: value for name, value in vars(found).items() if name in listed}
@@ -97,17 +97,6 @@ def _plain_flags(words: Iterable[str]) -> list[str]:
         head, equals, value = word.partition("=")
         plain.append(head.replace("_", "-") + equals + value if word.startswith("--") else word)
     return plain
-
-
-def _second_named(cls: type[Step], words: list[str]) -> list[str]:
-    """The second of two words before all flags as the input it stands for: ``render SCENE FIT`` as ``render SCENE
-    --model FIT``."""
-    second = next((name for name in positions(cls) if flag_of(cls, name).position == "second"), None)
-    if second is None or len(words) < 2 or any(word.startswith("-") for word in words[:2]):
-        return words
-    flag = flag_name(second)
-    given = any(word == flag or word.startswith(f"{flag}=") for word in words)
-    return words if given else [words[0], flag, *words[1:]]
 
 
 def _refuse_unknown(cls: type[Step], word: str, listed: dict[str, Option]) -> NoReturn:

@@ -199,8 +199,8 @@ def demo(
         out: Folder to write. Repeat the same command to resume an interrupted demo.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         preset: Settings to start from. fast: smaller images, fewer frames and iterations. default: minutes on two cores. quality: 30,000 iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type model (docs/presets.md).
-        fast: The same as --preset fast, 3 m to each side: one to two minutes on 2 cores.
-        seed: Seed of the city and of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config).
+        fast: The same as --preset fast: images of a log 480 pixels wide, 3 m to each side. One to two minutes on 2 cores for the city, or 16 frames of one camera.
+        seed: Seed of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config).
         shifts_m: Lateral shifts in metres, positive to the left (not given: 2, 3 and 4 m to both sides; --fast: 3 m). They apply to synthesize, render and score.
         config: YAML file of settings, read before those given here.
         device: Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N. A step whose own device is set, as by --fit.device, keeps that one.
@@ -337,7 +337,7 @@ def fit(
 
     Args:
         scene: Scene directory written by ingest or annotate, or folder of mudg run.
-        fused: Point clouds written by fuse; required by every method but emernerf. The folder may also stand after SCENE without the flag.
+        fused: Point clouds written by fuse; required by every method but emernerf.
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         tensorboard: Also write the numbers of log.jsonl to OUT/tensorboard, for TensorBoard (needs `pip install 'mudg[track]'`).
@@ -567,7 +567,7 @@ def render(
 
     Args:
         scene: Scene directory that the Gaussian scene was fitted to, or folder of mudg run.
-        model: Gaussian scene written by fit, or edit. It may also follow SCENE without the flag (not given: that of the run at SCENE).
+        model: Gaussian scene written by fit, or edit (not given: that of the run at SCENE).
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         edits: Edit script (docs/edit.md) to carry out before rendering.
@@ -632,7 +632,7 @@ def run(
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         preset: Settings to start from. fast: smaller images, fewer frames and iterations. default: minutes on two cores. quality: 30,000 iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type model (docs/presets.md).
-        fast: The same as --preset fast: images of a log 480 pixels wide, 3 m to each side. One to two minutes on 2 cores for 16 frames of one camera.
+        fast: The same as --preset fast: images of a log 480 pixels wide, 3 m to each side. One to two minutes on 2 cores for the city, or 16 frames of one camera.
         seed: Seed of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config).
         cameras: Cameras for which shifted trajectories are made (not given: the first camera).
         shifts_m: Lateral shifts in metres, positive to the left (not given: 2, 3 and 4 m to both sides; --fast: 3 m). They apply to synthesize, render and score.
@@ -677,7 +677,7 @@ def score(
 
     Args:
         scene: Scene directory that the views belong to, or folder of mudg run.
-        views: Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render. They may also stand after SCENE without the flag.
+        views: Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render.
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         fused: Point clouds written by fuse. They are needed for the baseline without learning (not given: no baseline).
@@ -733,7 +733,7 @@ def synthesize(
 
     Args:
         scene: Scene directory written by ingest or annotate, or folder of mudg run.
-        fused: Point clouds written by fuse. The folder may also follow SCENE without the flag (not given: those of the run at SCENE).
+        fused: Point clouds written by fuse (not given: those of the run at SCENE).
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         fitted: Gaussian scene written by fit, without virtual views. Its renders become part of the diffusion model's input. For models that were trained with renders.
