@@ -1,13 +1,5 @@
-"""Multi-resolution hash grids (Müller et al. 2022, "Instant neural graphics primitives"): learnt features of places in
-3 or 4 dimensions.
-
-A grid has levels of growing resolution. The features of a point are, level by level, those of the corners of its cell,
-blended linearly along every axis. A level that has room for all its corners stores them in order; a finer one shares
-its entries by a hash of the corner's integer coordinates.
-
-The native op runs on float32 tensors on the CPU; ``torch_encode`` is the specification and runs everywhere. Gradients
-reach the table and, where they are asked for, the points. They do not depend on the number of threads.
-"""
+"""Learnt features of places in 3 or 4 dimensions: hash grids, and planes of place and time. The native op runs on
+float32 tensors on the CPU, its twin in torch everywhere; gradients do not depend on the number of threads."""
 
 from __future__ import annotations
 
@@ -29,15 +21,10 @@ from mudg.base.types import check_shape
 from mudg.core.native_ops import address
 
 # hex planes ---------------------------------------------------------------------------------------
-# Six planes of several sizes (HexPlane, Cao and Johnson 2023; K-Planes, Fridovich-Keil et al. 2023): learnt features of
-# places and times.
-#
-# The planes lie along xy, xz, yz and xt, yt, zt. The features of a place and time at one size are the product of the
-# six bilinear values there; those of the sizes are joined. All numbers are one tensor: size by size, plane by plane,
-# ``[second axis, first axis, features]``.
-#
-# The native op runs on float32 tensors on the CPU; ``torch_look_up`` is the specification and runs everywhere.
-# Gradients reach the planes and, where they are asked for, the places. They do not depend on the number of threads.
+# HexPlane (Cao and Johnson 2023), K-Planes (Fridovich-Keil et al. 2023): planes along xy, xz, yz and xt, yt, zt, of
+# several sizes. The features of a place and time at one size are the product of the six bilinear values there; those of
+# the sizes are joined. All numbers are one tensor: size by size, plane by plane, ``[second axis, first axis,
+# features]``.
 
 
 PLANES: Final = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
@@ -163,6 +150,9 @@ class _Native(torch.autograd.Function):
 
 
 # hash grid ----------------------------------------------------------------------------------------
+# Müller et al. 2022, "Instant neural graphics primitives": the features of a point are, level by level, those of the
+# corners of its cell, blended linearly along every axis. A level that has room for all its corners stores them in
+# order; a finer one shares its entries by a hash of the corner's integer coordinates.
 
 
 _PRIMES = (1, 2654435761, 805459861, 3674653429)
@@ -200,14 +190,8 @@ class HashGrid:
             and 4 <= self.log2_entries <= 30
         )
         if not fits:
-            raise UsageError(
-                "hash grid: sizes out of range",
-                got=str(self),
-                expected=(
-                    "3 or 4 dimensions, 1..32 levels, 1, 2, 4 or 8 features, coarsest <= finest <= 65536, 2^4..2^30"
-                    " entries"
-                ),
-            )
+            expected = "3 or 4 dimensions, 1..32 levels, 1, 2, 4 or 8 features, coarsest <= finest <= 65536, 2^4..2^30"
+            raise UsageError("hash grid: sizes out of range", got=str(self), expected=f"{expected} entries")
 
     @cached_property
     def resolutions(self) -> tuple[int, ...]:

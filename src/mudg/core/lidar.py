@@ -1,9 +1,5 @@
-"""LiDAR points as sparse truth at any view: where they are at a moment, which a view shows, and which other images saw
-them.
-
-Points in the boxes of dynamic objects travel with their box; all others stand still. What hides a point is decided by
-``core/project.py``.
-"""
+"""What laser beams meet, and LiDAR points as sparse truth at any view. Points in the boxes of dynamic objects travel
+with their box; all others stand still."""
 
 from __future__ import annotations
 
@@ -23,7 +19,7 @@ from mudg.core.fusion import STATIC
 from mudg.core.project import RULES, DrawLimits, PointLayer, draw_points, hidden_pixels
 
 # beams --------------------------------------------------------------------------------------------
-# What laser beams meet: surfaces of points, boxes, the ground. All in the frame of the sensor, beams from its origin.
+# Surfaces of points, boxes, the ground, in the frame of the sensor, beams from its origin.
 
 
 Array = NDArray[np.float64]
@@ -209,8 +205,8 @@ def carried(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShownFrame:
-    """A shown frame: dense depth f32[H, W] metres (infinite where unknown), and its photograph u8[H, W, 3], a little
-    blurred."""
+    """A shown frame: dense depth f32[H, W] metres (infinite where unknown), and its photograph u8[H, W, 3],
+    ``blurred``."""
 
     view: View
     depth: NDArray[np.float32]

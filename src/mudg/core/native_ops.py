@@ -1,10 +1,5 @@
-"""Training steps that touch much memory, done in one native pass: losses with their gradients, pictures over the sky,
-means over boxes of pixels, and Adam.
-
-Each has a plain-torch twin (``core.losses.photometric``, ``core.losses.class_loss``, ``torch_over``,
-``torch_box_mean``, ``core.table.torch_adam_columns``), which is used, and named once, where the native library is
-missing or the tensors are not float32 on the CPU.
-"""
+"""Training steps that touch much memory, done in one native pass. Each has a plain-torch twin, which is used, and named
+once, where the native library is missing or the tensors are not float32 on the CPU."""
 
 from __future__ import annotations
 
@@ -174,42 +169,30 @@ def adam_columns(columns: Sequence[AdamColumn], step: int, chosen: Tensor | None
         raise UsageError("Adam steps count from 1", got=str(step))
     if not columns:
         return
+    rows = len(columns[0].parameter)
     for one in columns:
-        _check_column(one, columns[0].parameter, chosen)
-    tensors = tuple(t for one in columns for t in (one.parameter, one.gradient, one.moment1, one.moment2))
+        shape = tuple(one.parameter.shape)
+        check_shape(one.parameter, "adam: parameter", (rows, *shape[1:]))
+        for name in ("gradient", "moment1", "moment2"):
+            check_shape(getattr(one, name), f"adam: {name}", shape)
+    if chosen is not None and (chosen.shape != (rows,) or chosen.dtype != torch.bool):
+        got = f"{chosen.dtype} {tuple(chosen.shape)}"
+        raise InputError("adam: the chosen rows do not fit", expected=f"bool [{rows}]", got=got)
     in_place = tuple(t for one in columns for t in (one.parameter, one.moment1, one.moment2))
-    library = _library_for(tensors)
+    library = _library_for((*in_place, *(one.gradient for one in columns)))
     if library is None or not all(t.is_contiguous() for t in in_place):
         with torch.no_grad():
             torch_adam_columns(columns, step, chosen)
         return
-    rows = columns[0].parameter.shape[0]
     gradients = [one.gradient.detach().contiguous() for one in columns]
-    table = (_Column * len(columns))(
-        *(
-            _Column(
-                one.parameter.data_ptr(),
-                gradient.data_ptr(),
-                one.moment1.data_ptr(),
-                one.moment2.data_ptr(),
-                one.parameter.numel() // rows if rows else 0,
-                one.rate,
-            )
-            for one, gradient in zip(columns, gradients, strict=True)
-        )
-    )
+    table = (_Column * len(columns))()
+    for entry, one, gradient in zip(table, columns, gradients, strict=True):
+        entry.parameter, entry.gradient = one.parameter.data_ptr(), gradient.data_ptr()
+        entry.moment1, entry.moment2 = one.moment1.data_ptr(), one.moment2.data_ptr()
+        entry.width, entry.rate = one.parameter.numel() // rows if rows else 0, one.rate
     mask = None if chosen is None else chosen.contiguous()
-    real, integer = ctypes.c_double, ctypes.c_int64
-    library.mudg_adam(
-        table,
-        ctypes.c_int(len(columns)),
-        integer(rows),
-        address(mask),
-        real(BETA1),
-        real(BETA2),
-        real(EPSILON),
-        integer(step),
-    )
+    count, numbers = ctypes.c_int(len(columns)), map(ctypes.c_double, (BETA1, BETA2, EPSILON))
+    library.mudg_adam(table, count, ctypes.c_int64(rows), address(mask), *numbers, ctypes.c_int64(step))
     # The library wrote behind autograd's back: tell it, so that a graph that still needs the old values is refused.
     torch.autograd.graph.increment_version(in_place)
 
@@ -223,17 +206,6 @@ class _Column(ctypes.Structure):
         ("rate", ctypes.c_double),
         ("step_size", ctypes.c_float),
     ]
-
-
-def _check_column(column: AdamColumn, first: Tensor, chosen: Tensor | None) -> None:
-    shape = tuple(column.parameter.shape)
-    check_shape(column.parameter, "adam: parameter", (*first.shape[:1], *shape[1:]))
-    for name in ("gradient", "moment1", "moment2"):
-        check_shape(getattr(column, name), f"adam: {name}", shape)
-    if chosen is not None:
-        check_shape(chosen, "adam: chosen rows", shape[:1])
-        if chosen.dtype != torch.bool:
-            raise InputError("adam: the chosen rows must be bool", got=str(chosen.dtype))
 
 
 class _WithGradient(torch.autograd.Function):

@@ -1,14 +1,5 @@
-"""Pictures: every way in which images and label maps change size, and every colour map of the package.
-
-Images change size by one of four rules, because what was trained and stored with one must not be read with another:
-
-* ``resize_area``: Pillow's box filter; what fits, clips and labellers use on recorded images.
-* ``resize_bicubic``: Pillow's bicubic filter; what depth networks were trained with.
-* ``shrink_exact``: the exact mean over each new pixel's area in float32; what importers write into scenes.
-* ``resize_rgb``: torch, bilinear with antialiasing; how scores and pages bring views to one size.
-
-Depth, labels and masks take the nearest pixel (``resize_nearest``). Networks resize their own feature maps themselves.
-"""
+"""Pictures: every way in which images and label maps change size, and every colour map of the package. Sizes change by
+one of four rules, because what was trained and stored with one must not be read with another."""
 
 from __future__ import annotations
 

@@ -123,7 +123,7 @@ class EditPlan:
         sky: settings of the last `sky`, or None. background: another street, and its pose world_from_other f64[4, 4].
         match_objects: whether the objects that are kept take the light of that street. objects_gain: by which factor
             f64[3] of their linear light, or None.
-        conditions: records of weather, light and season.
+        conditions: records of weather and light.
         notes: what the reader should know, with numbers.
         views: recorded ones, which say what nobody saw of the street; none where there is no scene.
         closed: actors without whose traces the street is to be shown, if they were recorded (``editing/model.py``).

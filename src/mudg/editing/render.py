@@ -27,7 +27,7 @@ from mudg.baselines.emernerf import load_field, observe
 from mudg.core import trajectory
 from mudg.core.pictures import panels_of, side_by_side
 from mudg.core.raster.rasterize import drawing_device
-from mudg.core.shutter import readout_of
+from mudg.core.trajectory import readout_of
 from mudg.diffusion.synthesize import JobInputs
 from mudg.editing import harmonised
 from mudg.editing.apply import FACT, Drawer, EditedDrive, carry_out, in_weather, scene_seen_by, weather_of

@@ -30,7 +30,7 @@ from mudg.core.lidar import OwnedPoints, PointTruth, ShownFrame
 from mudg.core.pictures import resize_nearest, resize_rgb
 from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import visible_depth
-from mudg.core.shutter import points_as_read
+from mudg.core.trajectory import points_as_read
 from mudg.labels.annotate import nearest_sweeps
 from mudg.scene.labels import read_label
 from mudg.scene.observations import ObservationWriter, list_observation_sets, read_observations
