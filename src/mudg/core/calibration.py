@@ -205,12 +205,9 @@ def edge_map(rgb: NDArray[np.uint8], blur_px: float) -> Floats:
 
 
 def edge_alignment(shots: Iterable[tuple[View, NDArray[np.uint8], Floats, NDArray[np.floating]]]) -> EdgeAlignment:
-    """Compare the given pose of a camera with slightly turned ones.
-
-    Args:
-        shots: for some images of one camera: view, image u8[H, W, 3], world_from_lidar f64[4, 4] of the sweep of that
-            moment, and its points [N, 3] in the LiDAR frame.
-    """
+    """Compare the given pose of a camera with slightly turned ones. ``shots``: for some images of one camera: view,
+    image u8[H, W, 3], world_from_lidar f64[4, 4] of the sweep of that moment, and its points [N, 3] in the LiDAR
+    frame."""
     parts: list[Floats] = []
     jumps = 0
     for view, rgb, world_from_lidar, xyz_lidar in shots:

@@ -118,10 +118,7 @@ def fit_affine(values: Tensor, measured: Tensor, space: Space, rounds: int = 12)
     Errors count relative to the measured depth. The start is the line through two of the points that has the least
     median error (Rousseeuw, "Least median of squares regression", 1984; pairs half the range of values apart, chosen
     without chance), so up to nearly half of the points may be wrong; then least squares reweighted with Tukey's
-    function, as in `fit_depth`.
-
-    Raises:
-        InputError: shapes differ, or there is no such space.
+    function, as in `fit_depth`. InputError: shapes differ, or there is no such space.
     """
     check_shape(values, "fit_affine: values", (None,))
     check_shape(measured, "fit_affine: measured depth", tuple(values.shape))
@@ -252,16 +249,13 @@ def complete_depth(
     sky: NDArray[np.bool_] | None = None,
     beyond: NDArray[np.bool_] | None = None,
 ) -> DenseDepth:
-    """Fill a sparse depth map, guided by its image.
+    """Fill a sparse depth map, guided by its image. InputError: shapes differ, or a measurement is not positive.
 
     Args:
         rgb: u8[H, W, 3].
         measured: f32[H, W] metres, NaN where nothing was measured.
         sky: bool[H, W]; None = no sky.
         beyond: bool[H, W], where the scanner looked and nothing came back, see ``beyond_reach``; None = nowhere.
-
-    Raises:
-        InputError: shapes differ, or a measurement is not positive.
     """
     shape = measured.shape
     sky = np.zeros(shape, bool) if sky is None else sky

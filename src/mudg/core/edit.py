@@ -88,14 +88,8 @@ class HeightMap:
 
     @classmethod
     def from_points(cls, xyz: NDArray[np.floating], cell_m: float = CELL_M) -> HeightMap:
-        """Median height per cell, gaps filled from the nearest cell, smoothed.
-
-        Args:
-            xyz: [N, 3] world points of the ground, metres.
-
-        Raises:
-            InputError: no points, or points that are too far apart for a map.
-        """
+        """Median height per cell, gaps filled from the nearest cell, smoothed. ``xyz``: [N, 3] world points of the
+        ground, metres. InputError: no points, or points that are too far apart for a map."""
         points = np.asarray(xyz, np.float64)
         points = points[np.isfinite(points).all(1)]
         if not len(points):
@@ -251,11 +245,8 @@ def lane_changed(
     motion: Motion, left_m: float, start_s: float, duration_s: float, ground: HeightMap | None = None
 ) -> Motion:
     """A path that changes lanes, heading along the new one: offset ``d (10 s^3 - 15 s^4 + 6 s^5)`` to the left of the
-    recorded path, ``s = (t - start_s) / duration_s``, with no lateral speed and acceleration at its ends.
-
-    Raises:
-        InputError: it begins outside the path, or the road user stands then.
-    """
+    recorded path, ``s = (t - start_s) / duration_s``, with no lateral speed and acceleration at its ends. InputError:
+    it begins outside the path, or the road user stands then."""
     first, last = float(motion.times_s[0]), float(motion.times_s[-1])
     if not first <= start_s < last:
         what = "the lane change begins outside the path"
@@ -334,11 +325,7 @@ def along_points(points: Array, height_m: float, ground: HeightMap | None, floor
 
 def stopped(motion: Motion, at_s: float, brake_m_s2: float) -> Motion:
     """A path that brakes evenly from ``at_s`` on until it stands; it never goes farther than the recorded one has by
-    then.
-
-    Raises:
-        InputError: ``at_s`` lies outside the path.
-    """
+    then. InputError: ``at_s`` lies outside the path."""
     first, last = float(motion.times_s[0]), float(motion.times_s[-1])
     if not first <= at_s <= last:
         expected = f"{first:.2f}..{last:.2f} s"
@@ -359,11 +346,7 @@ def stopped(motion: Motion, at_s: float, brake_m_s2: float) -> Motion:
 
 def sped(motion: Motion, factor: float, from_s: float | None = None) -> Motion:
     """A path driven at another speed from a moment on. Where it gets ahead of the recording, it goes on straight as at
-    its end.
-
-    Args:
-        factor: > 0; 0.5 is half as fast.
-    """
+    its end. ``factor``: > 0; 0.5 is half as fast."""
     first, last = float(motion.times_s[0]), float(motion.times_s[-1])
     begin = first if from_s is None else min(max(from_s, first), last)
     keyed = motion.with_keys_between(begin, last)

@@ -428,11 +428,8 @@ class CloudAccumulator:
 
 
 def voxel_keys(xyz: NDArray[np.floating], voxel_m: float) -> NDArray[np.int64]:
-    """One integer per voxel of side ``voxel_m`` for points ``[N, 3]``; 21 bits per axis.
-
-    Raises:
-        InputError: a coordinate is more than a million voxels from the origin.
-    """
+    """One integer per voxel of side ``voxel_m`` for points ``[N, 3]``; 21 bits per axis. InputError: a coordinate is
+    more than a million voxels from the origin."""
     cells = np.floor(np.asarray(xyz, np.float64) / voxel_m).astype(np.int64)
     limit = 1 << 20
     if len(cells) and (np.abs(cells) >= limit).any():

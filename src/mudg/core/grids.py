@@ -73,13 +73,11 @@ def look_up(places: Tensor, numbers: Tensor, sizes: PlaneSizes) -> Tensor:
     """Features ``[N, features * levels]`` of places ``[N, 4]``, -1 to 1 along x, y, z, t.
 
     Places outside get the features of the nearest place on the border. Differentiable once, in planes and places.
+    InputError: shapes do not fit.
 
     Args:
         places: ``[N, 4]``.
         numbers: ``[sizes.numbers]``.
-
-    Raises:
-        InputError: shapes do not fit.
     """
     check_shape(places, "planes of place and time: places", (None, 4))
     check_shape(numbers, "planes of place and time: numbers", (sizes.numbers,))
@@ -161,7 +159,7 @@ _MASK32 = (1 << 32) - 1
 
 @dataclass(frozen=True)
 class HashGrid:
-    """The shape of a grid.
+    """The shape of a grid. UsageError: a value outside these ranges.
 
     Args:
         dimensions: 3 or 4.
@@ -169,9 +167,6 @@ class HashGrid:
         features: per level: 1, 2, 4 or 8.
         coarsest, finest: cells along an axis of the first and the last level; those between grow geometrically.
         log2_entries: a level has at most 2 to this power entries.
-
-    Raises:
-        UsageError: a value outside these ranges.
     """
 
     dimensions: int
@@ -228,13 +223,11 @@ def encode(points: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
     """Features ``[N, levels * features]`` of points ``[N, D]`` in the unit cube.
 
     Points outside get the features of the nearest place on the border. Differentiable once, in table and points.
+    InputError: shapes do not fit the grid.
 
     Args:
         points: ``[N, D]`` in [0, 1].
         table: ``grid.table_shape``.
-
-    Raises:
-        InputError: shapes do not fit the grid.
     """
     check_shape(points, "hash grid: points", (None, grid.dimensions))
     check_shape(table, "hash grid: table", grid.table_shape)

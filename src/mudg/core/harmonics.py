@@ -95,11 +95,8 @@ def basis(directions: Array, degree: int) -> Array:
 
 
 def rotated(coefficients: NDArray[np.float32], rotation: Array) -> NDArray[np.float32]:
-    """Coefficients that look from ``rotation @ d`` as the given ones look from ``d``.
-
-    Args:
-        coefficients: f32[N, (degree + 1)^2, 3]. rotation: f64[3, 3].
-    """
+    """Coefficients that look from ``rotation @ d`` as the given ones look from ``d``. ``coefficients``: f32[N, (degree
+    + 1)^2, 3]. rotation: f64[3, 3]."""
     degree = degree_of(coefficients.shape[1])
     turned = np.array(coefficients, np.float32)
     for band in range(1, degree + 1):

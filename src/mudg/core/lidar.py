@@ -80,11 +80,8 @@ def met_box(beams: Array, sensor_from_box: Array, size_m: ArrayLike) -> Array:
 
 
 def met_ground(beams: Array, world_from_sensor: Array, ground: HeightMap, from_m: Array, within_m: float) -> Array:
-    """Range f64[B] at which beams meet known ground, metres; infinite where they do not.
-
-    Args:
-        from_m: range f64[B] behind which the ground is looked for, ``within_m`` far.
-    """
+    """Range f64[B] at which beams meet known ground, metres; infinite where they do not. ``from_m``: range f64[B]
+    behind which the ground is looked for, ``within_m`` far."""
     if not len(beams):
         return np.zeros(0)
     steps = np.arange(0.0, within_m + GROUND_STEP_M, GROUND_STEP_M)

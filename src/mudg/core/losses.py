@@ -49,6 +49,7 @@ def lpips_distance(
 
     Per stage: every place's feature vector is brought to length 1, the squared difference is summed over channels and
     averaged over places; the stages are averaged (without ``channel_weights``) or summed (with them, as LPIPS does).
+    InputError: the two have other shapes.
 
     Args:
         prediction: features of one image, per stage ``[C_l, h_l, w_l]``.
@@ -60,9 +61,6 @@ def lpips_distance(
 
     Returns:
         Scalar: 0 for equal images, NaN when nothing counts.
-
-    Raises:
-        InputError: the two have other shapes.
     """
     total = prediction[0].new_zeros(())
     for stage, (features, target) in enumerate(zip(prediction, target_units, strict=True)):

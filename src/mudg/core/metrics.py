@@ -182,11 +182,7 @@ of."""
 
 def pieces_of(values: Tensor, channels: int = 1) -> Iterator[Tensor]:
     """All values of a tensor, flat: whole for images of up to 2.5 million pixels, else in pieces. What is worked out in
-    double precision would fill the memory at large sizes.
-
-    Args:
-        channels: values per pixel.
-    """
+    double precision would fill the memory at large sizes. ``channels``: values per pixel."""
     if values.numel() <= PIECE_VALUES * channels:
         yield values.reshape(-1)
         return
@@ -249,13 +245,11 @@ class DepthErrors:
 
 
 def depth_errors(prediction_m: Tensor, truth_m: Tensor, mask: Tensor) -> DepthErrors:
-    """Compare depth maps (camera z, metres) where ``mask`` is set and the truth is positive and finite.
+    """Compare depth maps (camera z, metres) where ``mask`` is set and the truth is positive and finite. InputError: a
+    counted prediction is not finite.
 
     Args:
         prediction_m, truth_m: ``[1, H, W]``. mask: bool ``[1, H, W]``.
-
-    Raises:
-        InputError: a counted prediction is not finite.
     """
     counted = mask & torch.isfinite(truth_m) & (truth_m > 0)
     predicted_m, true_m = prediction_m[counted], truth_m[counted]
@@ -444,11 +438,8 @@ class Segmentation:
 
 class ExactMotion:
     """Where surfaces of one view are in the next: by true depth and poses, vehicles by their boxes. The last answer is
-    kept: method after method is held against the same two views.
-
-    Args:
-        tracks: number in the instance map and track of every vehicle that is followed; others do not count.
-    """
+    kept: method after method is held against the same two views. ``tracks``: number in the instance map and track of
+    every vehicle that is followed; others do not count."""
 
     def __init__(self, tracks: Sequence[tuple[int, Track]] = ()) -> None:
         self._tracks = tracks

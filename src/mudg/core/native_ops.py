@@ -25,11 +25,8 @@ def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, we
     for every pixel the mean over all of them of weight times ``(1 - w) |p - t| + w (1 - SSIM)``.
 
     Differentiable in the prediction (once); target and weight are data. The value does not depend on the number of
-    threads. SSIM: 11x11 Gaussian window, sigma 1.5 px, zero padding.
-
-    Raises:
-        InputError: shapes differ or are not [C, H, W].
-        UsageError: the weight is outside [0, 1].
+    threads. SSIM: 11x11 Gaussian window, sigma 1.5 px, zero padding. InputError: shapes differ or are not [C, H, W].
+    UsageError: the weight is outside [0, 1].
     """
     check_shape(prediction, "photometric: prediction", (None, None, None))
     check_shape(target, "photometric: target", tuple(prediction.shape))
@@ -62,6 +59,7 @@ def class_loss(
     """Scalar: cross entropy of every pixel, times its weight, summed and divided by ``total``.
 
     Differentiable in the logits (once); everything else is data. The value does not depend on the number of threads.
+    InputError: sizes differ, or there is no channel.
 
     Args:
         logits: ``[C, H, W]``.
@@ -69,9 +67,6 @@ def class_loss(
         weight: ``[H, W]``.
         total: positive; a scalar tensor is read where the library computes, and stays on the device elsewhere.
         lift: a channel, and ``[H, W]`` to add to its logits.
-
-    Raises:
-        InputError: sizes differ, or there is no channel.
     """
     check_shape(logits, "class loss: logits", (None, None, None))
     planes = {"target": target, "weight": weight, "lift": weight if lift is None else lift[1]}
@@ -104,13 +99,10 @@ def over(rgb: Tensor, alpha: Tensor, coarse: Tensor) -> Tensor:
     """``rgb + (1 - alpha) * coarse``, with the coarse picture enlarged to the size of the other (bilinear between pixel
     centres).
 
-    Differentiable (once) in all three.
+    Differentiable (once) in all three. InputError: shapes do not fit.
 
     Args:
         rgb: ``[C, H, W]``. alpha: ``[1, H, W]``. coarse: ``[C, h, w]``.
-
-    Raises:
-        InputError: shapes do not fit.
     """
     check_shape(rgb, "over: rgb", (None, None, None))
     check_shape(coarse, "over: coarse", (len(rgb), None, None))
@@ -131,10 +123,7 @@ def box_mean(values: Tensor, size: int) -> Tensor:
     """Means over ``size`` x ``size`` pixels (odd), of the same shape ``[..., H, W]``; at the borders, over what is
     there.
 
-    Differentiable (once).
-
-    Raises:
-        UsageError: an even size.
+    Differentiable (once). UsageError: an even size.
     """
     if size < 1 or size % 2 == 0:
         raise UsageError("the side of a box of pixels must be odd", got=str(size))
@@ -155,15 +144,12 @@ def torch_box_mean(values: Tensor, size: int) -> Tensor:
 def adam_columns(columns: Sequence[AdamColumn], step: int, chosen: Tensor | None = None) -> None:
     """One Adam step in place on several columns with the same rows (the kernel of ``Table.adam_step``).
 
-    Betas 0.9 and 0.999, epsilon 1e-15, bias-corrected for ``step`` (from 1).
+    Betas 0.9 and 0.999, epsilon 1e-15, bias-corrected for ``step`` (from 1). InputError: shapes differ, or ``chosen``
+    is not bool[N]. UsageError: ``step`` below 1.
 
     Args:
         columns: any number, N rows each; contiguous for the native path.
         chosen: bool[N]: only these rows move, parameters and moments; None = all.
-
-    Raises:
-        InputError: shapes differ, or ``chosen`` is not bool[N].
-        UsageError: ``step`` below 1.
     """
     if step < 1:
         raise UsageError("Adam steps count from 1", got=str(step))

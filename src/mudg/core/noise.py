@@ -186,11 +186,8 @@ def ddim(
                  alpha_bar[0], which the published sampler does
 
     With a dynamic rescale the estimate of x0 is multiplied by scale_previous / scale_t at each step, and the final
-    result keeps the factor of the last step visited, as the published sampler does.
-    Returns [B,...].
-
-    Raises:
-        UsageError: eta > 0 without `draw`.
+    result keeps the factor of the last step visited, as the published sampler does. Returns [B,...]. UsageError: eta >
+    0 without `draw`.
     """
     if eta > 0 and draw is None:
         raise UsageError("stochastic sampling needs a source of noise", where="noise.ddim", got=f"eta = {eta}")

@@ -205,14 +205,12 @@ def visible_depth(
     near_m: float = 0.5,
     far_m: float = 200.0,
 ) -> NDArray[np.float32]:
-    """The nearest point of every pixel, without the hidden ones; f32[H, W] metres, NaN = none.
+    """The nearest point of every pixel, without the hidden ones; f32[H, W] metres, NaN = none. InputError: points have
+    the wrong shape.
 
     Args:
         xyz_world: [N, 3] metres; points that are not finite are left out.
         gap_deg: largest angle between neighbouring beams, for rules whose reach follows from it.
-
-    Raises:
-        InputError: points have the wrong shape.
     """
     check_shape(xyz_world, "visible_depth: points", (None, 3))
     layer = PointLayer(np.ascontiguousarray(xyz_world, np.float32), np.eye(4))
@@ -410,11 +408,8 @@ class ProjectedPoints:
 def project_sparse(
     cloud: FusedCloud, tracks: Sequence[Track], view: View, config: ProjectConfig, *, hide: bool
 ) -> ProjectedPoints:
-    """Project a fused cloud into a view, its objects where they are at that time.
-
-    Args:
-        hide: leave points out that shine through gaps between nearer ones (`core.visible`, rule `condition`).
-    """
+    """Project a fused cloud into a view, its objects where they are at that time. ``hide``: leave points out that shine
+    through gaps between nearer ones (rule `condition`)."""
     poses = {track.id: track.pose_at(view.time_s) for track in tracks if track.id in cloud.objects}
     placed = {name: pose for name, pose in poses.items() if pose is not None}
     seen = project_cloud(cloud, placed, view, config)

@@ -254,11 +254,8 @@ class Rows:
 
     @classmethod
     def of(cls, xyz: Floats, like: Rows | None = None) -> Rows:
-        """The rows of returns f64[N, 3] in the sensor's frame; none where elevations have no peaks.
-
-        Args:
-            like: of another sweep of the sensor; axis and heights are taken from it.
-        """
+        """The rows of returns f64[N, 3] in the sensor's frame; none where elevations have no peaks. ``like``: of
+        another sweep of the sensor; axis and heights are taken from it."""
         if like is not None:
             known = len(like.elevations_deg) > 0
             return cls._with_peaks(xyz, like.turn, like.heights_m, like.split_deg)[0] if known else like

@@ -52,10 +52,8 @@ def lane_truth(view: View, lines: Sequence[NDArray[np.float64]]) -> Mask:
     """Lane lines of a map as the published score draws them, bool[360, 640].
 
     Points of a line within 75 m and at most 10 m beside the camera are kept, lines are cut where points are not; what
-    is left is drawn 20 pixels thick at 1920 x 1280 and reduced bilinearly; every touched pixel counts.
-
-    Args:
-        lines: places f64[N, 3] in the world, metres, of each line.
+    is left is drawn 20 pixels thick at 1920 x 1280 and reduced bilinearly; every touched pixel counts. ``lines``:
+    places f64[N, 3] in the world, metres, of each line.
     """
     (width, height), half = NTL_DRAWN, NTL_LINE_PX / 2
     large = view.resized(width, height)
@@ -381,10 +379,8 @@ def agent_ious(agents: Sequence[VisibleAgent], classes: NDArray[np.integer]) -> 
     """For each vehicle the IoU of its visible box with that of the largest connected region of vehicle pixels near it;
     0 if there is none or its centre is off by more than 10 pixels in an image 480 pixels wide.
 
-    Near means: inside the outline of the true 3-D box, made 1.2 times as large.
-
-    Args:
-        classes: train ids ``[H, W]`` of the image that is judged.
+    Near means: inside the outline of the true 3-D box, made 1.2 times as large. ``classes``: train ids ``[H, W]`` of
+    the image that is judged.
     """
     vehicle = np.isin(classes, VEHICLE_IDS)
     height, width = vehicle.shape

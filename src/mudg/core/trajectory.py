@@ -30,11 +30,8 @@ def trajectory_name(camera: str, shift_m: float | None = None) -> str:
 
 
 def ego_left_world(world_from_ego: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Horizontal unit vector to the left of the vehicle, ``f64[3]`` in world axes.
-
-    Raises:
-        InputError: when the vehicle lies on its side, so that its left axis is vertical.
-    """
+    """Horizontal unit vector to the left of the vehicle, ``f64[3]`` in world axes. InputError: when the vehicle lies on
+    its side, so that its left axis is vertical."""
     left = world_from_ego[:3, 1].copy()
     left[2] = 0.0
     length = float(np.linalg.norm(left))
@@ -46,17 +43,14 @@ def ego_left_world(world_from_ego: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def recorded(scene: Scene, camera: str) -> Trajectory:
-    """The recorded views of one camera in time order.
-
-    Raises:
-        UsageError: unknown camera name, or a camera without frames.
-    """
+    """The recorded views of one camera in time order. UsageError: unknown camera name, or a camera without frames."""
     views = sorted((frame.view for frame in _frames(scene, camera)), key=lambda view: view.time_s)
     return Trajectory(trajectory_name(camera), tuple(views), "recorded")
 
 
 def shifted(scene: Scene, camera: str, shift_m: float) -> Trajectory:
-    """The drive of one camera with the vehicle moved sideways; camera orientation kept.
+    """The drive of one camera with the vehicle moved sideways; camera orientation kept. UsageError: unknown camera or a
+    number that is not finite. InputError: no ego pose at a frame's time.
 
     Args:
         scene: the log; its ego path gives the left direction at each frame's time.
@@ -66,9 +60,6 @@ def shifted(scene: Scene, camera: str, shift_m: float) -> Trajectory:
     Returns:
         Trajectory of origin "shifted" with one view per recorded frame. Each camera centre moves by exactly
         ``shift_m``.
-
-    Raises:
-        UsageError: unknown camera or a number that is not finite. InputError: no ego pose at a frame's time.
     """
     if not np.isfinite(shift_m):
         raise UsageError("shift_m must be a finite number", got=str(shift_m))
@@ -91,16 +82,14 @@ def named(scene: Scene, camera: str, name: str) -> Trajectory:
 
     ``up+1``: the drive raised by 1 m. ``lane+0.1``: a lane change, with every frame 0.1 m further to the left of where
     the recorded vehicle is, along the left axis of the first frame. ``speed+0.1``: a faster drive, with every frame 0.1
-    m further ahead, along the forward axis of the first frame. A minus means down, right, slower.
+    m further ahead, along the forward axis of the first frame. A minus means down, right, slower. UsageError: a
+    malformed name, or an unknown camera. InputError: no ego pose at the first frame's time.
 
     Args:
         scene: the log. camera: camera name. name: kind, sign and metres.
 
     Returns:
         Trajectory ``<camera>_<name>`` with one view per recorded frame, at its time and with its orientation.
-
-    Raises:
-        UsageError: a malformed name, or an unknown camera. InputError: no ego pose at the first frame's time.
     """
     found = _NAMED.fullmatch(name)
     if found is None:
@@ -132,10 +121,8 @@ def readout_poses(path: EgoPath, view: View) -> NDArray[np.float64]:
     """Poses of a rolling shutter: world_from_cam f64[2, 4, 4] when the first and when the last row (or column) is read.
 
     The middle one is read at the view's time; ``camera.readout_s`` lies between first and last. The camera moves as the
-    vehicle does; before the first and after the last recorded pose the motion next to it goes on.
-
-    Raises:
-        InputError: the view's time is more than 0.2 s outside the vehicle's path.
+    vehicle does; before the first and after the last recorded pose the motion next to it goes on. InputError: the
+    view's time is more than 0.2 s outside the vehicle's path.
     """
     _ego_pose(path, view)
     times, poses = path.times_s, path.world_from_ego
