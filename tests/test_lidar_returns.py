@@ -19,8 +19,7 @@ from mudg.city.config import CityConfig
 from mudg.city.logs import write_city
 from mudg.city.sensors import lidar_elevations
 from mudg.city.world import CityWorld
-from mudg.core.returns import Met, first_surface
-from mudg.core.rows import peaks
+from mudg.core.returns import Met, first_surface, peaks
 from mudg.core.table import Table
 from mudg.editing.settings import RenderConfig
 from mudg.gaussians.model import SceneModel

@@ -330,9 +330,9 @@ def carry_out(
     its objects are those that a script can name where there is no scene; its ground where there is no cloud. None: only
     scene and cloud are wanted. InputError: something in the script that cannot be done here."""
     if model is not None and conditions_of(script.canonical()) is not None and not model.classes:
-        what = "weather, light and season need the classes of surfaces, and this scene was fitted without"
+        what = "weather and light need the classes of surfaces, and this scene was fitted without"
         remedy = "fit a scene with labels (`mudg annotate` makes them), or take them out of the script"
-        raise InputError(what, where="weather, light, season", remedy=remedy)
+        raise InputError(what, where="weather, light", remedy=remedy)
     ground = ground_of(cloud, model)
     world = EditWorld.of_model(model, ground) if scene is None else EditWorld.of_scene(scene, ground)
     closes = scene is not None and scene.source.recipe is None  # a city has exact pictures of what an object hid

@@ -28,7 +28,7 @@ from mudg.core.fusion import largest_beam_gap
 from mudg.core.pictures import resize_area, resize_nearest
 from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import ProjectConfig, project_sparse, visible_depth
-from mudg.core.shutter import Readout, points_as_read, readout_of
+from mudg.core.trajectory import Readout, points_as_read, readout_of
 from mudg.networks.featnets import WHOLE_PIXELS
 from mudg.scene.labels import read_label
 from mudg.scene.observations import ObservationSet, list_observation_sets, read_observations

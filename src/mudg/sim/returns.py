@@ -14,8 +14,7 @@ from scipy.spatial import KDTree
 from mudg.base import geometry, log
 from mudg.base.errors import UsageError
 from mudg.base.types import Scene, Sweep
-from mudg.core.returns import Met, Returns, first_surface
-from mudg.core.rows import Rows
+from mudg.core.returns import Met, Returns, Rows, first_surface
 from mudg.editing.apply import spread
 from mudg.scene.beams import WORLD, Beams, beams_of, moving_tracks, placed, returns_of, training_sweeps, with_silent
 
