@@ -13,7 +13,7 @@ from pathlib import PurePath
 
 import numpy as np
 
-from mudg.formats.importers.waymo.logs import masked_crc32c
+from mudg.formats.importers.waymo_logs import masked_crc32c
 from mudg.formats.splats import binary
 
 Damage = Callable[[bytes, np.random.Generator], bytes]
@@ -86,7 +86,7 @@ def _within(suffix: str) -> Damage | None:
 
 def _in_gzip(content: bytes, rng: np.random.Generator) -> bytes:
     return (
-        binary.gzip_bytes(damaged(gzip.decompress(content), rng))
+        gzip.compress(damaged(gzip.decompress(content), rng), mtime=0)
         if content[:2] == b"\x1f\x8b"
         else damaged(content, rng)
     )

@@ -24,8 +24,8 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Source, View
 from mudg.core.edit import HeightMap
 from mudg.exporting.settings import ExportConfig
-from mudg.formats.exporters.opendrive import LANE_M, lanes_beside, opendrive
-from mudg.formats.splats import usd
+from mudg.formats.exporters import alpasim
+from mudg.formats.exporters.alpasim import LANE_M, lanes_beside, opendrive, to_alpasim
 from mudg.formats.splats.cloud import SplatScene
 from mudg.gaussians.storage import save_model
 from mudg.scene.road import Road
@@ -85,7 +85,7 @@ class Package:
 
 @pytest.fixture(scope="module")
 def package() -> Package:
-    return Package(usd.to_alpasim(toy_splats.scene(1), drive(), ground()))
+    return Package(to_alpasim(toy_splats.scene(1), drive(), ground()))
 
 
 def test_the_package_is_a_usd_package_with_files_by_name(package: Package) -> None:
@@ -160,7 +160,7 @@ def test_unknown_ground_is_a_hole_and_the_mesh_turns_with_the_file() -> None:
     heights = np.zeros((3, 4))
     heights[1, 1] = np.nan
     turn = geometry.yaw_matrix(np.pi / 2, (10.0, 0.0, 1.0))
-    mesh = usd.ground_mesh(HeightMap(np.array([1.0, 2.0]), 0.5, heights), turn)
+    mesh = alpasim.ground_mesh(HeightMap(np.array([1.0, 2.0]), 0.5, heights), turn)
     package = object.__new__(Package)
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w") as written:
@@ -172,35 +172,35 @@ def test_unknown_ground_is_a_hole_and_the_mesh_turns_with_the_file() -> None:
 
 
 def test_shutters_and_the_same_bytes(package: Package) -> None:
-    rolling = Package(usd.to_alpasim(toy_splats.scene(1), drive(0.02), ground()))
+    rolling = Package(to_alpasim(toy_splats.scene(1), drive(0.02), ground()))
     front, _ = rolling.trajectory["cameras_frame_timestamps_us"].values()
     assert [end - begin for begin, end in front] == [20_000, 20_000]
     told = next(iter(rolling.rig["camera_calibrations"].values()))["camera_model"]["parameters"]
     assert told["shutter_type"] == "ROLLING_TOP_TO_BOTTOM"
     camera = Camera("a", 64, 48, 50.0, 51.0, 31.0, 25.0, (), 0.02, "left_to_right")
-    assert usd.intrinsics(camera)["shutter_type"] == "ROLLING_LEFT_TO_RIGHT"
-    assert usd.to_alpasim(toy_splats.scene(1), drive(), ground()) == package.content
+    assert alpasim.intrinsics(camera)["shutter_type"] == "ROLLING_LEFT_TO_RIGHT"
+    assert to_alpasim(toy_splats.scene(1), drive(), ground()) == package.content
     other = toy_splats.scene(1)
     moved = replace(other, nodes=(replace(other.nodes[0], cloud=toy_splats.cloud(4)), *other.nodes[1:]))
-    assert Package(usd.to_alpasim(moved, drive(), ground())).metadata["uuid"] != package.metadata["uuid"]
+    assert Package(to_alpasim(moved, drive(), ground())).metadata["uuid"] != package.metadata["uuid"]
 
 
 def test_intrinsics_are_those_of_the_vendors_package() -> None:
     data = pytest.importorskip("ncore.data")
     camera = Camera("a", 64, 48, 50.0, 51.0, 31.0, 25.0, readout_s=0.01)
-    found = data.OpenCVPinholeCameraModelParameters.from_dict(usd.intrinsics(camera))
-    assert found.to_dict() == usd.intrinsics(camera)
+    found = data.OpenCVPinholeCameraModelParameters.from_dict(alpasim.intrinsics(camera))
+    assert found.to_dict() == alpasim.intrinsics(camera)
 
 
 def test_the_command_needs_a_drive(tmp_path: Path) -> None:
     scene = SplatScene("toy", toy_splats.scene().nodes)
     with pytest.raises(InputError, match="none is known"):
-        usd.to_alpasim(scene, None, ground())
+        to_alpasim(scene, None, ground())
     parked = EgoPath(np.zeros(0), np.zeros((0, 4, 4)))
     with pytest.raises(InputError, match="none is known"):
-        usd.to_alpasim(scene, replace(drive(), ego=parked), ground())
+        to_alpasim(scene, replace(drive(), ego=parked), ground())
     with pytest.raises(InputError, match="ground"):
-        usd.to_alpasim(scene, drive(), None)
+        to_alpasim(scene, drive(), None)
     save_model(toy_fitted(0), tmp_path / "fit")
     with pytest.raises(InputError, match="--scene"):
         Export(format="alpasim", source=tmp_path / "fit", out=tmp_path / "a.usdz", settings=ExportConfig()).run()
@@ -272,4 +272,4 @@ def test_the_package_holds_the_map_of_a_drive(package: Package) -> None:
     points = np.array(list(evaluated(xml)))
     assert np.linalg.norm(points[-1, 1:3] - drive().ego.world_from_ego[-1, :2, 3]) < 0.01
     standing = replace(drive(), ego=EgoPath(TIMES, np.stack([np.eye(4)] * 3)))
-    assert "map.xodr" not in Package(usd.to_alpasim(toy_splats.scene(1), standing, ground())).archive.namelist()
+    assert "map.xodr" not in Package(to_alpasim(toy_splats.scene(1), standing, ground())).archive.namelist()

@@ -1,4 +1,4 @@
-"""Logs as messages of ROS 2 and recordings of rerun: read by other readers, and put back together."""
+"""Logs as messages of ROS 2: read by other readers, and put back together."""
 
 from __future__ import annotations
 
@@ -162,23 +162,18 @@ def test_the_same_log_gives_the_same_bag_in_bounded_memory(exported: tuple[Scene
     assert (folder / "out" / "log_0.mcap").read_bytes() == first
 
 
-@pytest.mark.parametrize(
-    "name, out, package, extra",
-    [("mcap", "a.mcap", "mcap", "ros"), ("ros2", "bag", "rosbags", "ros"), ("rerun", "a.rrd", "rerun", "rerun")],
-)
+@pytest.mark.parametrize(("name", "out", "package"), [("mcap", "a.mcap", "mcap"), ("ros2", "bag", "rosbags")])
 def test_a_missing_package_is_named_with_its_extra(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, out: str, package: str, extra: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, out: str, package: str
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     for module in [key for key in sys.modules if key.startswith(f"{package}.")]:
         monkeypatch.delitem(sys.modules, module)
     street(tmp_path / "scene")
-    save_model(toy(), tmp_path / "fit")
-    source = tmp_path / ("fit" if name == "rerun" else "scene")
-    with pytest.raises(ResourceError, match=rf"mudg\[{extra}\]"):
-        Export(format=name, source=source, out=tmp_path / out, settings=ExportConfig()).run()
+    with pytest.raises(ResourceError, match=r"mudg\[ros\]"):
+        Export(format=name, source=tmp_path / "scene", out=tmp_path / out, settings=ExportConfig()).run()
     assert not (tmp_path / out).exists()
-    assert app.main(["export", name, str(source), "--out", str(tmp_path / "a.txt")]) != 0
+    assert app.main(["export", name, str(tmp_path / "scene"), "--out", str(tmp_path / "a.txt")]) != 0
 
 
 def test_what_has_no_log_or_is_damaged_is_refused(tmp_path: Path) -> None:
@@ -192,31 +187,3 @@ def test_what_has_no_log_or_is_damaged_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MudgError):
         Export(format="ros2", source=tmp_path / "scene", out=tmp_path / "bag", settings=ExportConfig()).run()
     assert not (tmp_path / "bag" / "metadata.yaml").exists() and not (tmp_path / "bag" / "log_0.mcap").exists()
-
-
-# -- rerun -----------------------------------------------------------------------------------------
-
-
-def test_a_recording_of_rerun_holds_log_and_gaussians(tmp_path: Path) -> None:
-    pytest.importorskip("rerun")
-    from rerun.chunk import RrdReader
-
-    scene, out = street(tmp_path / "scene"), tmp_path / "a.rrd"
-    save_model(toy(), tmp_path / "fit")
-    Export(format="rerun", source=tmp_path / "fit", scene=tmp_path / "scene", out=out, settings=ExportConfig()).run()
-    columns: dict[tuple[str, str], list[Any]] = {}
-    for chunk in RrdReader(tmp_path / "a.rrd").stream().to_chunks():
-        batch = chunk.to_record_batch()
-        for name in batch.schema.names:
-            columns.setdefault((chunk.entity_path, name), []).extend(batch.column(name).to_pylist())
-    pictures = columns["/world/camera/front", "EncodedImage:blob"]
-    assert [bytes(p[0]) for p in pictures] == [(tmp_path / "scene" / f.image.path).read_bytes() for f in scene.frames]
-    assert columns["/world/camera/front", "Pinhole:resolution"] == [[[24.0, 12.0]]]
-    mounted = columns["/world/camera/front", "Transform3D:translation"]
-    assert np.allclose(np.squeeze(mounted), [f.view.center_world for f in scene.frames])
-    assert len(columns["/world/gaussians/background", "Points3D:positions"][0]) == 640
-    assert len(columns["/world/gaussians/background", "Points3D:radii"][0]) == 640
-    points = {path.replace("\\", ""): rows for (path, name), rows in columns.items() if name == "Points3D:positions"}
-    assert len(points["/world/gaussians/car-1"][0]) == 50
-    assert len(columns["/world/objects/car-1", "Boxes3D:half_sizes"]) == 1
-    assert len(columns["/world/lidar/lidar", "Points3D:positions"]) == 3

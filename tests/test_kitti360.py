@@ -20,7 +20,7 @@ from mudg.base.errors import UsageError
 from mudg.base.geometry import invert, transform_points, yaw_matrix
 from mudg.base.types import Scene
 from mudg.formats.importers import RECOGNISERS
-from mudg.formats.importers.kitti360 import read_boxes, read_calibration
+from mudg.formats.importers.kitti360 import read_boxes
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points
 
@@ -98,23 +98,6 @@ def test_a_gap_in_which_the_vehicle_moved_is_not_filled(source: Path, tmp_path: 
     assert any("without a pose or time stamp were left out: 3" in note for note in scene.source.notes)
 
 
-def test_rectified_camera_poses_serve_where_vehicle_poses_are_missing(
-    source: Path, pristine: Path, tmp_path: Path
-) -> None:
-    path = parts(source)["poses"] / "poses.txt"
-    calibration = read_calibration(source / "calibration")
-    lines = []
-    for line in path.read_text().splitlines():
-        row = np.array(line.split(), float)
-        pose = np.vstack([row[1:].reshape(3, 4), [0, 0, 0, 1]]) @ calibration.imu_from_rect0
-        lines.append(f"{int(row[0])} {made.numbers(pose)}")
-    path.unlink()
-    (path.parent / "cam0_to_world.txt").write_text("\n".join(lines) + "\n")
-    one, other = ingest(source, tmp_path / "one"), ingest(pristine, tmp_path / "other")
-    for a, b in zip(one.frames, other.frames, strict=True):
-        assert np.abs(a.view.world_from_cam - b.view.world_from_cam).max() < 1e-9
-
-
 def test_time_stamps_of_recorded_scans_only_and_empty_lines(source: Path, pristine: Path, tmp_path: Path) -> None:
     """A drive whose first scans are missing has a line per scan; an empty line is a frame without a time."""
     whole = ingest(pristine, tmp_path / "whole", frames=(3, 6))
@@ -166,53 +149,6 @@ def test_scans_are_untwisted_clockwise(truth: Scene, source: Path, tmp_path: Pat
             assert np.abs(got.dt_s - late)[ahead].max() < 1e-3
     assert errors["auto"].max() < 0.02
     assert errors["no"].max() > 0.2
-
-
-def write_fisheye(source: Path) -> None:
-    """Two lenses whose pixels show the direction of their ray: red = x, green = y, blue = z, -1..1 as 0..254."""
-    side, xi, gamma, k1, k2 = 140, 2.2, 133.6, 0.016, 1.65
-    v, u = np.mgrid[:side, :side]
-    x, y = (u - 71.6) / gamma, (v - 70.5) / gamma
-    a, b = x.copy(), y.copy()
-    for _ in range(60):  # undo the distortion: the fixed point of division by the radial factor
-        r2 = a * a + b * b
-        a, b = x / (1 + k1 * r2 + k2 * r2 * r2), y / (1 + k1 * r2 + k2 * r2 * r2)
-    r2 = a * a + b * b
-    factor = (xi + np.sqrt(np.maximum(1 + (1 - xi * xi) * r2, 0))) / (r2 + 1)  # back onto the sphere, Mei 2007
-    ray = np.stack([factor * a, factor * b, factor - xi], -1)
-    image = np.round((ray + 1) * 127).clip(0, 254).astype(np.uint8)
-    for name in ("image_02", "image_03"):
-        text = f"%YAML:1.0\n---\nmodel_type: MEI\ncamera_name: {name}\nimage_width: {side}\nimage_height: {side}\n"
-        text += f"mirror_parameters:\n   xi: {xi:.16e}\ndistortion_parameters:\n   k1: {k1}\n   k2: {k2}\n   p1: 0.0\n"
-        text += f"   p2: 0.0\nprojection_parameters:\n   gamma1: {gamma}\n   gamma2: {gamma}\n"
-        text += "   u0: 71.6\n   v0: 70.5\n"
-        (source / "calibration" / f"{name}.yaml").write_text(text)
-        folder = source / "data_2d_raw" / made.DRIVE / name / "data_rgb"
-        folder.mkdir(parents=True)
-        for n in range(made.FIRST, made.FIRST + 5):
-            Image.fromarray(image).save(folder / f"{n:010d}.png")
-
-
-def test_fisheyes_become_pinhole_images_of_the_same_rays_or_are_refused(source: Path, tmp_path: Path) -> None:
-    write_fisheye(source)
-    assert set(ingest(source, tmp_path / "usual").cameras) == {"front", "front_stereo"}
-    scene = ingest(source, tmp_path / "out", cameras=("side_left", "image_03"), frames=(1, 3))
-    camera = scene.cameras["side_left"]
-    assert camera.width == camera.height == round(2 * 133.6 / 3.2)
-    assert 2 * np.rad2deg(np.arctan(camera.width / 2 / camera.fx)) == pytest.approx(90, abs=0.5)
-    assert camera.distortion[0] == 2.2
-    image = read_image(scene, scene.frames_of("side_left")[0]).astype(float) / 127 - 1
-    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-    ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    assert np.abs(image - ray).max() < 0.012  # 8 bits and bilinear mixing
-    left = scene.frames_of("side_left")[0].view.world_from_cam[:3, 2]
-    assert left @ scene.ego.world_from_ego[0][:3, 1] == pytest.approx(1.0, abs=1e-6)  # the lens looks to the left
-    path = source / "calibration" / "image_02.yaml"
-    text = path.read_text()
-    for old, new, words in (("MEI", "KANNALA_BRANDT", "another camera model"), ("gamma2", "gamma3", "incomplete")):
-        path.write_text(text.replace(old, new))
-        refused(words, ingest, source, tmp_path / "refused", cameras=("image_02",))
 
 
 def test_semantics_are_taken_where_there_are_some(source: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import json
 import struct
@@ -40,11 +41,7 @@ def read(content: bytes, name: str) -> SplatCloud:
     return cloud
 
 
-every_nth = pytest.mark.parametrize("nth", [13, pytest.param(1, marks=pytest.mark.slow)])
-"""All damages of a sweep are tried by ``pytest -m slow``."""
-
-
-@every_nth
+@pytest.mark.parametrize("nth", [13, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", READ)
 def test_every_length_short_of_the_whole_is_refused(name: str, nth: int) -> None:
     content = content_of(name)
@@ -55,23 +52,6 @@ def test_every_length_short_of_the_whole_is_refused(name: str, nth: int) -> None
         with pytest.raises(MudgError) as caught:
             read(content[:length], name)
         assert "bad.file" in str(caught.value), str(caught.value)
-
-
-@every_nth
-@pytest.mark.parametrize("name", READ)
-def test_every_flipped_byte_is_read_or_refused_in_words(name: str, nth: int) -> None:
-    content = content_of(name, 0)
-    places = range(0, min(len(content), 700), 3 if name in ("sog", "glb") else 1)[::nth]
-    refused = 0
-    for place in places:
-        for flip in (0x01, 0x80, 0xFF):
-            bad = bytearray(content)
-            bad[place] ^= flip
-            try:
-                read(bytes(bad), name)
-            except MudgError as error:
-                refused += "bad.file" in str(error)
-    assert refused or name == "splat"
 
 
 @pytest.mark.parametrize("name", READ)
@@ -112,13 +92,13 @@ def test_headers_of_spz_that_cannot_be_are_refused(place: int, value: int) -> No
     raw = bytearray(zlib.decompress(spz.to_bytes(toy_splats.cloud(3)), 31))
     raw[place : place + (4 if place < 12 else 1)] = value.to_bytes(4 if place < 12 else 1, "little")
     with within(1 << 21), pytest.raises(InputError, match="bad.file"):
-        read(binary.gzip_bytes(bytes(raw)), "spz")
+        read(gzip.compress(bytes(raw)), "spz")
 
 
 def test_spz_that_goes_on_and_other_damage_is_refused() -> None:
     content = spz.to_bytes(toy_splats.cloud(3))
     raw = zlib.decompress(content, 31)
-    refused("goes on", read, binary.gzip_bytes(raw + b"x"), "spz")
+    refused("goes on", read, gzip.compress(raw + b"x"), "spz")
     refused("damaged", read, content[:-8] + bytes(4) + content[-4:], "spz")
     head = struct.pack("<IIIBBBBI12x", spz.MAGIC, 4, 3, 0, 12, 0, 9, 32)
     refused("does not fit", read, head + bytes(200), "spz")
@@ -163,7 +143,7 @@ class within:
 
 def test_bombs_are_refused_before_they_are_unpacked() -> None:
     head = struct.pack(spz.HEADER, spz.MAGIC, 3, 10, 0, 12, 0, 0)
-    bomb = binary.gzip_bytes(head + bytes(12 << 20))
+    bomb = gzip.compress(head + bytes(12 << 20))
     with within(4 << 20), pytest.raises(InputError, match="goes on"):
         read(bomb, "spz")
     target = io.BytesIO()
@@ -182,7 +162,7 @@ def test_bombs_are_refused_before_they_are_unpacked() -> None:
 def test_more_gaussians_than_a_file_can_hold_are_refused_before_anything_is_inflated(name: str) -> None:
     raw = struct.pack(spz.HEADER, spz.MAGIC, 3, 200_000, 0, 12, 0, 0) + bytes(19 * 200_000)
     with within(3 << 20), pytest.raises(InputError, match="than a file of this size"):
-        read(binary.gzip_bytes(raw) if name == "spz" else altered_sog(lambda meta: meta.update(count=20_000_000)), name)
+        read(gzip.compress(raw) if name == "spz" else altered_sog(lambda meta: meta.update(count=20_000_000)), name)
 
 
 # -- headers of SOG and glTF -----------------------------------------------------------------------
@@ -214,22 +194,22 @@ def rotation(document: dict[str, Any], **values: Any) -> None:
         ("sog", lambda meta: meta["shN"].update(count=65536), "impossible size"),
         ("sog", lambda meta: meta["shN"].update(bands=3), "impossible size"),
         ("sog", lambda meta: meta["quats"].update(files=["sh0.webp"]), "names no component"),
-        ("glb", lambda d: d.update(meshes=3), "no list"),
+        ("glb", lambda d: d.update(meshes=3), "not a list"),
         ("glb", lambda d: d["nodes"][0].update(mesh=7), "names nothing"),
-        ("glb", lambda d: d["nodes"][0].update(mesh=-1), "names nothing"),
+        ("glb", lambda d: d["nodes"][0].update(mesh=-1), r"nodes\[0\].mesh"),
         ("glb", lambda d: d["nodes"][0].update(children=[0]), "no tree"),
         ("glb", lambda d: d["nodes"][0].update(rotation=[0, 0, 0, 0]), "no quaternion"),
         ("glb", lambda d: d["nodes"][0].update(scale=[1, 2, 1]), "unevenly"),
         ("glb", lambda d: d["nodes"][0].update(scale=[-1, 1, 1]), "unevenly"),
-        ("glb", lambda d: d["nodes"][0].update(translation=["a", 0, 0]), "no list of 3"),
+        ("glb", lambda d: d["nodes"][0].update(translation=["a", 0, 0]), r"nodes\[0\].translation\[0\]"),
         ("glb", lambda d: d["nodes"][0].update(translation=[10**400, 0, 0]), "beyond what a number can be"),
         ("glb", lambda d: d["scenes"][0].update(nodes=[0] * 100), "no tree"),
         ("glb", lambda d: rotation(d, count=10**9), "not possible"),
         ("glb", lambda d: rotation(d, count=4), "beyond|differ"),
         ("glb", lambda d: rotation(d, count=2), "differ"),
         ("glb", lambda d: rotation(d, type="VEC3"), "wrong type"),
-        ("glb", lambda d: rotation(d, componentType=5125), "wrong type"),
-        ("glb", lambda d: rotation(d, byteOffset=-4), "no size"),
+        ("glb", lambda d: rotation(d, componentType=5125), "componentType"),
+        ("glb", lambda d: rotation(d, byteOffset=-4), "byteOffset"),
         ("glb", lambda d: rotation(d, byteOffset=10**9), "beyond"),
         ("glb", lambda d: d["bufferViews"][0].update(byteOffset=10**9), "beyond"),
         ("glb", lambda d: d["bufferViews"][0].update(byteStride=4), "beyond"),

@@ -214,13 +214,6 @@ def test_other_elements_of_a_ply_are_passed_over(around: dict[str, Any], order: 
     assert np.array_equal(read(ply(order=order, **around), axes="world").means, PLACES)
 
 
-def test_lists_before_the_gaussians_are_walked_over() -> None:
-    lines = "element face 3\nproperty uchar flag\nproperty list ushort double weights\nproperty list uchar uchar more"
-    body = b"\1" + struct.pack("<Hd", 1, 2.5) + b"\0" + b"\2" + struct.pack("<H", 0) + b"\3abc"
-    body += b"\3" + struct.pack("<H2d", 2, 1, 1) + b"\0"
-    assert np.array_equal(read(ply(before=(lines, body)), axes="world").means, PLACES)
-
-
 def test_fields_of_others_are_passed_over_and_listed_once(capsys: pytest.CaptureFixture[str]) -> None:
     cloud = read(sog(extras={"a": 1}, lod=3, **{"means.order": "morton", "sh0.gamma": 2}), "a.sog")
     said = capsys.readouterr().err.replace("\n", " ")
@@ -309,8 +302,8 @@ def far_ply(offset: np.ndarray, kind: str = "double") -> bytes:
 
 FOURTH = rows(**{f"f_rest_{n}": float(n) for n in range(72)})
 LINEAR = {"opacity": [0.9, 0.2, 0.7], "scale_0": [0.1, 0.3, 0.2], "scale_1": [0.2, 0.1, 0.3]}
-LINEAR["scale_2"] = [0.01, 0.05, 0.2]
 HIDDEN = {"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": False}}}
+LINEAR["scale_2"] = [0.01, 0.05, 0.2]
 
 
 @pytest.mark.parametrize(
@@ -376,10 +369,13 @@ def test_what_a_file_means_besides_is_said(
         ("a.ply", ply(rows(scale_1=[0.0, 0.0, math.nan])), r"Gaussian 2[\s\S]*1 of 3[\s\S]*take them out"),
         ("a.ply", ply(rows(x=[math.inf, 0.0, 0.0])), r"Gaussian 0[\s\S]*take them out"),
         # lists
-        ("a.ply", ply(before=("element face 9000000\nproperty list uchar int vertex_indices", b"")), "too many lists"),
-        ("a.ply", ply(before=("element face 9\nproperty list uchar int vertex_indices", b"\xff" * 3)), "a.ply"),
-        ("a.ply", ply(before=("element face 1\nproperty list float int vertex_indices", b"")), "not understood"),
+        (
+            "a.ply",
+            ply(before=("element face 1\nproperty list uchar int vertex_indices", b"\0")),
+            "write vertices first",
+        ),
         ("a.ply", ply(before=("element vertex 1\nproperty list uchar float features", b"\0")), "lists"),
+        ("a.ply", ply(before=("element face 1\nproperty list uchar number a", b"")), "not understood"),
         # columns of other names
         *(
             ("a.ply", ply(rows(**changes)), rf"missing[\s\S]*'{next(iter(changes))}'[\s\S]*name the columns")
@@ -396,11 +392,10 @@ def test_what_a_file_means_besides_is_said(
         ("a.spz", spz(3, 2, more=struct.pack("<II", 0xADBE0003, 400)), "a.spz"),
         # glTF
         ("a.glb", glb(plain=False), r"opacity[\s\S]*between 0 and 1[\s\S]*logits"),
-        ("a.glb", glb(rows(opacity=-9.0), plain=False, document=by("splat-transform 3.7.0")), "logits"),
         ("a.glb", glb(rows(opacity=0.5), plain=False), r"size[\s\S]*negative[\s\S]*exp\(scale\)"),
-        ("a.glb", glb(kind={"colorSpace": "ACEScg"}), r"colour space[\s\S]*srgb_rec709_display[\s\S]*ACEScg"),
-        ("a.glb", glb(kind={"colorSpace": 3}), "colour space"),
-        ("a.glb", glb(kind={"kernel": "gabor"}), "ellipsoids"),
+        ("a.glb", glb(rows(opacity=-9.0), plain=False, document=by("splat-transform 3.7.0")), "logits"),
+        ("a.glb", glb(kind={"colorSpace": "ACEScg"}), r"colorSpace[\s\S]*srgb_rec709_display[\s\S]*ACEScg"),
+        ("a.glb", glb(kind={"kernel": "gabor"}), r"kernel[\s\S]*ellipse"),
         (
             "a.glb",
             glb(kind={"extensions": {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}}),
@@ -411,9 +406,9 @@ def test_what_a_file_means_besides_is_said(
             glb(document={"extensionsRequired": ["KHR_gaussian_splatting", "KHR_draco_mesh_compression"]}),
             "KHR_draco",
         ),
-        ("a.glb", glb(document={"extensionsRequired": "all"}), "no list"),
+        ("a.glb", glb(document={"extensionsRequired": "all"}), "not a list"),
         ("a.glb", glb(view={"extensions": {"EXT_meshopt_compression": {}}}), "EXT_meshopt_compression"),
-        ("a.glb", glb(view={"buffer": 1}), "outside the file"),
+        ("a.glb", glb(view={"buffer": 1}), r"bufferViews\[0\].buffer"),
         ("a.glb", glb(document={"buffers": [{"byteLength": 9, "uri": "a.bin"}]}), "outside the file"),
         # other files
         ("a.ksplat", b"\0\1" * 99, r"what to do: [\s\S]*splat-transform"),
@@ -521,28 +516,6 @@ def test_letters_that_are_no_axes_are_refused(flag: str, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("generator", "plain", "axes"),
-    [
-        ("splat-transform 1.10.1", False, "RDF"),
-        ("splat-transform 2.3.1", False, "FUR"),
-        ("splat-transform 2.7.1", True, "FUR"),
-        ("splat-transform 3.7.0", True, "FUR"),
-        ("another 1.0", True, "FUR"),
-    ],
-)
-def test_a_program_that_disagrees_with_gltf_is_named_and_read_as_it_writes(
-    generator: str, plain: bool, axes: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    content = glb(plain=plain, document=by(generator))
-    cloud = read(content, "a.glb")
-    assert np.allclose(cloud.means, world(PLACES, axes))
-    assert np.allclose(cloud.log_scales, [[row[f"scale_{c}"] for c in range(3)] for row in ROWS], atol=1e-5)
-    assert np.allclose(cloud.logits, [row["opacity"] for row in ROWS], atol=1e-5)
-    assert (generator in capsys.readouterr().err) is not plain
-    assert np.allclose(read(content, "a.glb", "viewer").means, world(PLACES, "FUR"))  # what is asked for wins
-
-
-@pytest.mark.parametrize(
     ("space", "linear"),
     [
         ("srgb_rec709_display", False),
@@ -624,3 +597,25 @@ def test_gaussians_far_out_in_a_scene_that_is_near_move_nothing(
     assert command(tmp_path, ply(table), ".ply", "--axes", "world") == 0
     means = load_model(tmp_path / "out").table["means"].detach().numpy()
     assert np.array_equal(means[:3], PLACES.astype(np.float32)) and "warning" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("generator", "plain", "axes"),
+    [
+        ("splat-transform 1.10.1", False, "RDF"),
+        ("splat-transform 2.3.1", False, "FUR"),
+        ("splat-transform 2.7.1", True, "FUR"),
+        ("splat-transform 3.7.0", True, "FUR"),
+        ("another 1.0", True, "FUR"),
+    ],
+)
+def test_a_program_that_disagrees_with_gltf_is_named_and_read_as_it_writes(
+    generator: str, plain: bool, axes: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = glb(plain=plain, document=by(generator))
+    cloud = read(content, "a.glb")
+    assert np.allclose(cloud.means, world(PLACES, axes))
+    assert np.allclose(cloud.log_scales, [[row[f"scale_{c}"] for c in range(3)] for row in ROWS], atol=1e-5)
+    assert np.allclose(cloud.logits, [row["opacity"] for row in ROWS], atol=1e-5)
+    assert (generator in capsys.readouterr().err) is not plain
+    assert np.allclose(read(content, "a.glb", "viewer").means, world(PLACES, "FUR"))  # what is asked for wins

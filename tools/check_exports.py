@@ -7,7 +7,7 @@ found:
 
     npm install @playcanvas/splat-transform@2.7.1 gltf-validator@2.0.0-dev.3.10    reads and writes SPZ, SOG, ...; rules
                                                                                    of glTF
-    pip install usd-core mcap rosbags rerun-sdk         rules of USD; messages, bags, recordings
+    pip install usd-core mcap rosbags                   rules of USD; messages, bags
     pip install pycolmap nvidia-ncore zstandard         cameras; recordings of NCore; SPZ of version 4
 
 The log's formats are checked where RUN is the folder of a run.
@@ -76,7 +76,6 @@ def main() -> int:
     for name, (module, check) in OF_LOGS.items():
         there = scene is not None and name in files and installed(module)
         failures += report(f"{name} by {module}", check(files[name], scene) if there and scene is not None else None)
-    failures += report("rerun by rerun-sdk", of_recording(files["rerun"]) if "rerun" in files else None)
     return failures
 
 
@@ -97,13 +96,10 @@ def written(run: Path, out: Path) -> dict[str, Path]:
     for name in (*SINGLE, "glb", "usda", "usdz", "alpasim", *CAMERAS, *SUFFIXES):
         suffix = FORMATS[name].suffixes[0] if name in FORMATS else SUFFIXES.get(name, "")
         of_log = name in ("alpasim", "mcap", "ros2", "ncore", *CAMERAS)
-        if (of_log and not (run / "scene").is_dir()) or (name in ("rerun", "ncore") and not installed(name)):
+        if (of_log and not (run / "scene").is_dir()) or (name == "ncore" and not installed(name)):
             continue
         found[name] = out / f"{name}{suffix}"
         Export(format=name, source=run, out=found[name], overwrite=True, settings=ExportConfig()).run()
-    if installed("zstandard"):
-        found["spz 4"] = out / "version4.spz"
-        Export(format="spz", source=run, out=found["spz 4"], overwrite=True, settings=ExportConfig(spz_version=4)).run()
     return found
 
 
@@ -280,14 +276,6 @@ OF_LOGS = {
     "ncore": ("ncore", of_ncore),
 }
 """Formats of a log: the package that reads them, and how."""
-
-
-def of_recording(file: Path) -> str:
-    """Whether the recording is read, and what a viewer needs is in it."""
-    from rerun.chunk import RrdReader
-
-    paths = {chunk.entity_path for chunk in RrdReader(file).stream().to_chunks()}
-    return "" if any(path.startswith("/world/gaussians/") for path in paths) else f"no Gaussians in {sorted(paths)[:5]}"
 
 
 if __name__ == "__main__":

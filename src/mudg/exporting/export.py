@@ -2,7 +2,7 @@
 
 Gaussians:  OUT and OUT.json (format, moment, axes, what the file does not hold, sha256)
 cameras:    OUT/transforms.json ... (nerfstudio), OUT/sparse/0 (COLMAP), OUT/images
-messages:   OUT.mcap (ROS 2, Foxglove), OUT.rrd (rerun), OUT/metadata.yaml and OUT/log_0.mcap (a bag of ROS 2),
+messages:   OUT.mcap (ROS 2, Foxglove), OUT/metadata.yaml and OUT/log_0.mcap (a bag of ROS 2),
             OUT/NAME.ncore4.zarr.itar (NCore)
 """
 
@@ -30,7 +30,7 @@ from mudg.core import harmonics
 from mudg.core.edit import HeightMap
 from mudg.core.harmonics import C0
 from mudg.core.table import Table
-from mudg.editing.apply import IMPORTED, carry_out, ground_of, write_asset
+from mudg.editing.apply import carry_out, ground_of, write_asset
 from mudg.editing.model import Asset, classes_of_rows, lowest_points
 from mudg.editing.runs import RunParts, find_run
 from mudg.editing.script import EditScript
@@ -38,7 +38,6 @@ from mudg.exporting.settings import ExportConfig, ImportConfig
 from mudg.formats import ncore as ncore_package
 from mudg.formats.exporters import messages, ncore
 from mudg.formats.exporters.cameras import colmap_files, nerfstudio_files, picture_names, pictures
-from mudg.formats.exporters.rerun_file import package, write_rerun
 from mudg.formats.splats.binary import MAX_BYTES
 from mudg.formats.splats.cloud import SplatCloud, SplatNode, SplatScene, logit, spacing_m, turned, unit
 from mudg.formats.splats.cloud import known as known_axes
@@ -50,9 +49,9 @@ from mudg.gaussians.storage import load_model, model_of_scene, save_model
 from mudg.scene.clouds import read_fused
 from mudg.scene.read import open_files, read_points, read_scene
 
-# a log over time: messages and bags of ROS 2, files of rerun, recordings of NCore ----------------
+# a log over time: messages and bags of ROS 2, recordings of NCore --------------------------------
 
-SUFFIXES: Final = {"mcap": ".mcap", "rerun": ".rrd", "ros2": "", "ncore": ""}
+SUFFIXES: Final = {"mcap": ".mcap", "ros2": "", "ncore": ""}
 """Formats, and the suffix of their file; none: a folder."""
 LOG_FOLDERS: Final = {"ros2": (1, (messages.BAG_METADATA, messages.BAG_FILE)), "ncore": (1, ncore.FILES)}
 """Formats that are folders: version and files of each."""
@@ -67,9 +66,7 @@ def records_of(scene: Scene, fused: Any = None) -> messages.LogRecords:
 
 def refuse_missing(name: str) -> None:
     """ResourceError if the package of a format is not installed."""
-    if name == "rerun":
-        package()
-    elif name == "ncore":
+    if name == "ncore":
         ncore_package.package()
     elif name in ("mcap", "ros2"):
         messages.mcap_writer()
@@ -208,7 +205,7 @@ def model_of_cloud(cloud: SplatCloud, name: str) -> SceneModel:
     tensors = {key: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for key, value in columns.items()}
     table = Table(tensors, {"node": torch.zeros(len(cloud), dtype=torch.int32)})
     drawing = {DRAWING: {"antialias": True}} if cloud.antialias else {}
-    facts = {"method": IMPORTED, "source": name, **drawing}
+    facts = {"method": "imported", "source": name, **drawing}
     return SceneModel(table, (StaticNode(),), None, known, cloud.degree, facts)
 
 
@@ -292,7 +289,7 @@ def write_folder(name: str, exported: Exported, recorded: Scene, work: RunDir) -
 @one_torch_thread()
 def write_file(config: ExportConfig, name: str, exported: Exported, file: ResultFile) -> dict[str, Any]:
     """Write Gaussians, or a log over time, as one file; returns what the file is."""
-    about = _log(name, exported, file.path) if name in SUFFIXES else _gaussians(config, name, exported, file.path)
+    about = _log(exported, file.path) if name in SUFFIXES else _gaussians(config, name, exported, file.path)
     return {"format": name, "mudg": version(), **about}
 
 
@@ -376,22 +373,12 @@ def _count(scene: SplatScene) -> int:
 # -- cameras and messages --------------------------------------------------------------------------
 
 
-def _log(name: str, exported: Exported, out: Path) -> dict[str, Any]:
-    """Write the log as one file: ``mcap`` its records, ``rerun`` records and Gaussians; returns its size."""
-    splats, records, contents = None, None, list[str]()
-    if name == "rerun" and exported.model is not None:
-        splats = splat_scene(exported.model, middle_s(exported.model, exported.log))
-    if name != "rerun" or exported.log is not None:
-        records = records_of(recorded_scene(exported), _points(exported) if splats is None else None)
-        contents.append(_counts(records))
-    if splats is not None:
-        contents.append(f"{_count(splats)} Gaussians")
-    if name == "rerun":
-        write_rerun(out, records, splats, records.scene.id if records is not None else "scene")
-    elif records is not None:
-        messages.write_mcap(out, messages.Ros2Messages(records))
+def _log(exported: Exported, out: Path) -> dict[str, Any]:
+    """Write the log as one MCAP file; returns its size."""
+    records = records_of(recorded_scene(exported), _points(exported))
+    messages.write_mcap(out, messages.Ros2Messages(records))
     size = out.stat().st_size
-    log.info(f"export: {', '.join(contents)}, {size / 1e6:.2f} MB")
+    log.info(f"export: {_counts(records)}, {size / 1e6:.2f} MB")
     return {"bytes": size}
 
 

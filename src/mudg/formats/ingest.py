@@ -121,7 +121,6 @@ def import_options(config: IngestConfig) -> ImportOptions:
         poses=Path(config.poses) if config.poses else None,
         boxes=Path(config.boxes) if config.boxes else None,
         skip_missing=config.skip_missing,
-        bridge_gaps=config.bridge_gaps,
         untwist=config.untwist,
         test_every=config.test_every,
         resolution=parse_resolution(config.resolution),

@@ -38,8 +38,6 @@ class IngestConfig:
     """File with tracked boxes (empty = search in the log)."""
     skip_missing: bool = False
     """Skip frames with a missing image, scan or vehicle pose instead of refusing the log."""
-    bridge_gaps: bool = False
-    """Bridge gaps between vehicle poses with curves instead of refusing the frames in them."""
     untwist: Literal["auto", "yes", "no"] = "auto"
     """Compensate LiDAR scans for the vehicle's motion during a sweep (auto = if the dataset's scans need it)."""
     city: CitySettings = setting(default_factory=CitySettings)

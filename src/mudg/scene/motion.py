@@ -30,7 +30,6 @@ OFF_M: Final = 0.25
 LONG_GAP_S: Final = 1.0
 NEAR_KEY_S: Final = 0.15
 """In a gap above ``LONG_GAP_S`` nothing is known of what lies farther than this from both of its keys."""
-BRIDGE_STEP_S: Final = 0.1
 FLIP_DEG: Final = 150.0
 MOST_TURN_RAD_S: Final = 2.0
 """Vehicles turn slower than this."""
@@ -97,34 +96,14 @@ def gap_at(path: EgoPath, time_s: float) -> Gap | None:
     return gap if lost or _off_m(path.times_s, path.world_from_ego, gap.key, share) > OFF_M else None
 
 
-def bridged(path: EgoPath) -> EgoPath:
-    """The path with keys every 0.1 s in its gaps, on cubic curves with the velocities on either side; turns as between
-    keys."""
-    times, poses = [path.times_s], [path.world_from_ego]
-    for gap in gaps(path.times_s, path.world_from_ego):
-        inner = np.linspace(gap.start_s, gap.end_s, int((gap.end_s - gap.start_s) / BRIDGE_STEP_S) + 2)[1:-1]
-        made = np.stack([path.pose_at(float(time_s)) for time_s in inner])
-        for pose, time_s in zip(made, inner, strict=True):
-            share = float(time_s - gap.start_s) / (gap.end_s - gap.start_s)
-            pose[:3, 3] += _bulge(path.times_s, path.world_from_ego, gap.key, share)
-        times.append(inner)
-        poses.append(made)
-    order = np.argsort(np.concatenate(times), kind="stable")
-    return EgoPath(np.concatenate(times)[order], np.concatenate(poses)[order])
-
-
 def _off_m(times_s: Times, poses: Matrix, key: int, share: float) -> float:
-    return float(np.linalg.norm(_bulge(times_s, poses, key, share)))
-
-
-def _bulge(times_s: Times, poses: Matrix, key: int, share: float) -> Matrix:
-    """Cubic curve less straight line f64[3] at a part (0..1) of the way from a key to the next."""
+    """Metres between a cubic curve and a straight line at a part (0..1) of the way from a key to the next."""
     span = float(times_s[key + 1] - times_s[key])
     chord = (poses[key + 1, :3, 3] - poses[key, :3, 3]) / span
     before, after = _velocity(times_s, poses, key, -1), _velocity(times_s, poses, key + 1, 1)
     lead = np.zeros(3) if before is None else before - chord
     trail = np.zeros(3) if after is None else after - chord
-    return span * (share * (1 - share) ** 2 * lead - share**2 * (1 - share) * trail)
+    return float(np.linalg.norm(span * (share * (1 - share) ** 2 * lead - share**2 * (1 - share) * trail)))
 
 
 def _velocity(times_s: Times, poses: Matrix, key: int, way: int) -> Matrix | None:

@@ -42,7 +42,6 @@ _OPTIONAL: Mapping[str, tuple[str, str]] = {
     "grpcio": ("simulators of mudg serve", "pip install 'mudg[sim]'"),
     "zstandard": ("SPZ files of version 4", "pip install zstandard"),
     "nvidia-ncore": ("recordings of NCore, both ways", "pip install 'mudg[ncore]'"),
-    "rerun-sdk": ("recordings of export rerun", "pip install 'mudg[rerun]'"),
     "tensorboard": ("curves of fit and learn --tensorboard", "pip install 'mudg[track]'"),
 }
 

@@ -32,7 +32,7 @@ class Export(Result):
     result = "exported"
     format: Annotated[str, Flag("FORMAT", "first")]
     """Gaussians: ply, alpasim, spz, glb, usda, usdz, compressed-ply, sog, splat. Cameras: nerfstudio, colmap. The
-    log over time: mcap, ros2, rerun, ncore."""
+    log over time: mcap, ros2, ncore."""
     source: Annotated[Path, RUN]
     """Gaussian scene written by fit, or folder of a finished mudg run; for cameras also a scene directory."""
     out: Annotated[Path, Flag("OUT")]

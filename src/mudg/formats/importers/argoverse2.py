@@ -129,7 +129,7 @@ def read_log(folder: Path, options: ImportOptions) -> DriveLog:
 
     ego_file, mount_file = folder / "city_SE3_egovehicle.feather", folder / "calibration/egovehicle_SE3_sensor.feather"
     notes: list[str] = []
-    mounts, ego = read_mounts(mount_file), common.mended_path(read_ego(ego_file, zero_ns), options, notes)
+    mounts, ego = read_mounts(mount_file), common.mended_path(read_ego(ego_file, zero_ns), notes)
     if options.skip_missing:
         for name, found in {**files, SENSOR: scans}.items():
             lost = [t for t in found if not common.has_pose(ego, seconds(t), _POSE_SLACK_S)]

@@ -7,21 +7,20 @@ executed: NPZ is read without pickles.
 from __future__ import annotations
 
 import io
-import math
 import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import store
 from mudg.base.errors import InputError
-from mudg.formats.importers.common import name_table
+from mudg.formats.splats import binary, ply
 from mudg.formats.unknown_fields import note_unknown
 from mudg.scene.clouds import is_return
 
@@ -78,48 +77,34 @@ def read_cloud(path: Path, known: Collection[str] = ()) -> Cloud:
 
 # --- PCD ------------------------------------------------------------------------------------------
 _PCD_TYPES: Final = {(name[0].upper(), int(name[1])): f"<{name}" for name in "f4 f8 i1 i2 i4 i8 u1 u2 u4 u8".split()}
-_PCD_KEYS: Final = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
-
-
-@dataclass(frozen=True, slots=True)
-class _PcdField:
-    """One field of one number a point: its type, and where it stands in a row (byte and number)."""
-
-    name: str
-    kind: str
-    byte: int
-    column: int
+_PCD_KEYS: Final = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "POINTS", "DATA")
 
 
 def read_pcd(content: bytes, where: str) -> dict[str, NDArray]:
     """Point Cloud Data file of version 0.6 or 0.7: fields of one number a point, by name."""
     header, start = _pcd_header(content, where)
     fields, size, columns = _pcd_fields(header, where)
-    points = _count(header["POINTS"][0], f"{where}: POINTS")
-    width, height = (_count(header[key][0], f"{where}: {key}") for key in ("WIDTH", "HEIGHT"))
+    points, width, height = (_count(header[key][0], f"{where}: {key}") for key in ("POINTS", "WIDTH", "HEIGHT"))
     if width * height != points:
         expected = f"WIDTH x HEIGHT = {width * height} points"
         raise InputError("cloud contradicts itself", where=where, expected=expected, got=f"POINTS {points}")
-    body = content[start:]
     kind = header["DATA"][0].lower()
     if kind == "ascii":
-        table = _number_table(body, columns, points, where)
-        return {field.name: table[:, field.column] for field in fields}
+        table = binary.text_table(content[start:], columns, points, where)
+        return {name: table[:, column] for name, (_, _, column) in fields.items()}
     if kind == "binary":
-        _enough(body, points * size, where)
-        names, kinds, offsets = ([getattr(f, part) for f in fields] for part in ("name", "kind", "byte"))
-        layout = np.dtype({"names": names, "formats": kinds, "offsets": offsets, "itemsize": size})
-        rows = np.frombuffer(body, layout, points)
-        return {name: rows[name].copy() for name in names}
+        kinds, offsets, _ = ([field[part] for field in fields.values()] for part in range(3))
+        layout = np.dtype({"names": list(fields), "formats": kinds, "offsets": offsets, "itemsize": size})
+        rows = np.frombuffer(binary.part(content, start, points * size, "its points", where), layout, points)
+        return {name: rows[name].copy() for name in fields}
     if kind == "binary_compressed":  # field after field, all points of one together
-        _enough(body, 8, where)
-        packed, unpacked = (int(n) for n in np.frombuffer(body, "<u4", 2))
-        _enough(body, 8 + packed, where)
+        packed, unpacked = binary.unpacked("<II", content, start, "its points", where)
+        body = bytes(binary.part(content, start + 8, packed, "its points", where))
         if unpacked != points * size or unpacked > packed * _LZF_MAX_GROWTH + 1:
             what, expected = "compressed cloud contradicts itself", f"{points} points of {size} bytes"
             raise InputError(what, where=where, expected=expected, got=f"{packed} bytes said to unpack to {unpacked}")
-        flat = lzf_decompress(body[8 : 8 + packed], unpacked, where)
-        return {field.name: np.frombuffer(flat, field.kind, points, field.byte * points).copy() for field in fields}
+        flat = lzf_decompress(body, unpacked, where)
+        return {n: np.frombuffer(flat, kind, points, byte * points).copy() for n, (kind, byte, _) in fields.items()}
     what = "cloud's DATA is of no known kind"
     raise InputError(what, where=where, expected="ascii, binary or binary_compressed", got=kind[:40])
 
@@ -138,21 +123,21 @@ def _pcd_header(content: bytes, where: str) -> tuple[dict[str, list[str]], int]:
             header[words[0].upper()] = words[1:]
     header.setdefault("COUNT", ["1"] * len(header.get("FIELDS", [])))
     header.setdefault("HEIGHT", ["1"])
-    absent = [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "POINTS", "DATA") if not header.get(key)]
+    absent = [key for key in _PCD_KEYS if not header.get(key)]
     if absent:
         got = ", ".join(f"{key} {' '.join(values)}" for key, values in header.items())[:200]
         raise InputError("PCD header is incomplete", where=where, expected=", ".join(absent), got=got)
     return header, start
 
 
-def _pcd_fields(header: dict[str, list[str]], where: str) -> tuple[list[_PcdField], int, int]:
-    """Fields of one number a point, each name once (padding, called ``_``, and descriptors are passed over); bytes and
-    numbers a row."""
+def _pcd_fields(header: dict[str, list[str]], where: str) -> tuple[dict[str, tuple[str, int, int]], int, int]:
+    """Fields of one number a point: name -> type, and where it stands in a row (byte and number); then bytes and
+    numbers a row. Padding (``_``) and fields of many numbers are passed over."""
     names, sizes, types, counts = (header[key] for key in ("FIELDS", "SIZE", "TYPE", "COUNT"))
     if not len(names) == len(sizes) == len(types) == len(counts):
         what, got = "PCD header contradicts itself", f"{len(names)}, {len(sizes)}, {len(types)}, {len(counts)}"
         raise InputError(what, where=where, expected="as many SIZE, TYPE and COUNT as FIELDS", got=got)
-    fields: dict[str, _PcdField] = {}
+    fields: dict[str, tuple[str, int, int]] = {}
     byte = column = 0
     for name, size, kind, count in zip(names, sizes, types, counts, strict=True):
         key = (kind.upper(), _count(size, f"{where}: SIZE"))
@@ -160,22 +145,9 @@ def _pcd_fields(header: dict[str, list[str]], where: str) -> tuple[list[_PcdFiel
             raise InputError("PCD field has an unknown type", where=f"{where}: {name}", got=f"{kind}{size}")
         numbers = _count(count, f"{where}: COUNT", 65536)
         if numbers == 1 and name != "_":
-            fields.setdefault(name, _PcdField(name, _PCD_TYPES[key], byte, column))
+            fields.setdefault(name, (_PCD_TYPES[key], byte, column))
         byte, column = byte + key[1] * numbers, column + numbers
-    return list(fields.values()), byte, column
-
-
-def _number_table(body: bytes, columns: int, rows: int, where: str) -> NDArray[np.float64]:
-    if rows * columns * 2 > len(body) + 1:  # a digit and a separator each
-        raise InputError("cloud is cut off", where=where, expected=f"{rows} points", got=f"{len(body)} bytes")
-    try:
-        table = np.array(body.split(), np.float64)
-    except ValueError as error:
-        raise InputError("cloud holds a value that is no number", where=where, got=str(error)[:120]) from error
-    if len(table) != rows * columns:
-        what = "cloud is cut off or has rows of another length"
-        raise InputError(what, where=where, got=f"{len(table)} numbers", expected=f"{rows} rows of {columns}")
-    return table.reshape(rows, columns)
+    return fields, byte, column
 
 
 def lzf_decompress(packed: bytes, length: int, where: str) -> bytes:
@@ -218,76 +190,36 @@ def lzf_decompress(packed: bytes, length: int, where: str) -> bytes:
     return bytes(out)
 
 
-def _enough(body: bytes, needed: int, where: str) -> None:
-    if len(body) < needed:
-        what, expected = "cloud is cut off", f"at least {needed} bytes after the header"
-        raise InputError(what, where=where, expected=expected, got=str(len(body)), remedy="copy the file again")
-
-
 def _count(word: str, where: str, largest: int = MAX_POINTS) -> int:
     if not word.isascii() or not word.isdigit() or int(word[:20]) > largest:
         raise InputError("count makes no sense", where=where, expected=f"0 to {largest}", got=word[:40])
     return int(word)
 
 
-# --- PLY ------------------------------------------------------------------------------------------
-_PLY_TYPES: Final = name_table(
-    """i1: char, int8; u1: uchar, uint8; i2: short, int16; u2: ushort, uint16; i4: int, int32;
-    u4: uint, uint32; f4: float, float32; f8: double, float64"""
-)
-_PLY_ORDER: Final = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+# --- PLY, BIN and NPZ -----------------------------------------------------------------------------
 
 
 def read_ply(content: bytes, where: str) -> dict[str, NDArray]:
-    """Vertices of a polygon file; they must come first and have plain properties. What follows (faces) is passed
-    over."""
-    end = content.find(b"end_header", 0, _MAX_HEADER_BYTES)
-    start = content.find(b"\n", end) + 1
-    if not content.startswith(b"ply") or end < 0 or start == 0:
-        what = "not a PLY file"
-        raise InputError(what, where=where, expected="a header from 'ply' to 'end_header'", got=f"{len(content)} bytes")
-    order, points, properties, element = "?", -1, [], ""
-    for line in content[:end].decode("ascii", "replace").splitlines():
-        words = line.split()
-        if words[:1] == ["format"]:
-            order = words[1] if len(words) > 1 else "?"
-        elif words[:1] == ["element"] and len(words) == 3:
-            element = words[1]
-            if element == "vertex":
-                points = _count(words[2], f"{where}: element vertex")
-            elif points < 0:
-                raise InputError("vertices do not come first", where=where, got=f"element {element}")
-        elif words[:1] == ["property"] and element == "vertex":
-            if len(words) != 3 or words[1] not in _PLY_TYPES:
-                raise InputError("vertex property is of no known type", where=where, got=line.strip()[:80])
-            properties.append((words[2], _PLY_TYPES[words[1]]))
-    if order not in _PLY_ORDER or points < 0 or not properties or len({n for n, _ in properties}) != len(properties):
-        what = "PLY header is incomplete"
-        raise InputError(what, where=where, expected="format, element vertex, properties", got=order)
-    body = content[start:]
-    if order == "ascii":
-        lines = body.split(b"\n", points)  # faces may follow
-        table = _number_table(b"\n".join(lines[:points]), len(properties), points, where)
-        return {name: table[:, index] for index, (name, _) in enumerate(properties)}
-    layout = np.dtype([(name, _PLY_ORDER[order] + kind) for name, kind in properties])
-    _enough(body, points * layout.itemsize, where)
-    rows = np.frombuffer(body, layout, points)
-    return {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name, _ in properties}
+    """Vertices of a polygon file, text or binary; what follows (faces) is passed over."""
+    table = ply.read_elements(content, where, ("vertex",)).tables.get("vertex")
+    if table is None:
+        raise InputError("the PLY file has no vertices", where=where)
+    return {name: table[name].astype(table.dtype[name].newbyteorder("=")) for name in table.dtype.names or ()}
 
 
-# --- BIN and NPZ ----------------------------------------------------------------------------------
+def _float_rows(content: bytes, columns: int, what: str, where: str) -> NDArray[np.float32]:
+    if len(content) % (4 * columns):
+        what, got = f"{what} is cut off, or is not of this form", f"{len(content)} bytes"
+        expected = f"a multiple of {4 * columns} bytes ({columns} float32 a row)"
+        raise InputError(what, where=where, got=got, expected=expected, remedy="copy the file again")
+    return np.frombuffer(content, "<f4").reshape(-1, columns).astype(np.float32)
 
 
 def read_float_rows(path: Path, columns: int, what: str = "scan") -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Rows of little-endian float32 without a header, as raw scans are kept: f32[N, columns], of which the first three
     are coordinates in the sensor's frame, and which of them are returns bool[N]. ``what``: what one file holds, for
     messages. Raises InputError: missing, cut off, or values of a return that are not finite."""
-    content = store.read_bytes(path)
-    if len(content) % (4 * columns):
-        what, got = f"{what} is cut off", f"{len(content)} bytes"
-        expected = f"a multiple of {4 * columns} bytes ({columns} float32 a row)"
-        raise InputError(what, where=str(path), got=got, expected=expected, remedy="copy the file again")
-    rows = np.frombuffer(content, "<f4").reshape(-1, columns).astype(np.float32)
+    rows = _float_rows(store.read_bytes(path), columns, what, str(path))
     returns = is_return(rows[:, :3])
     bad = ~np.isfinite(rows[returns]).all(1)
     if bad.any():
@@ -298,32 +230,30 @@ def read_float_rows(path: Path, columns: int, what: str = "scan") -> tuple[NDArr
 
 def read_bin(content: bytes, where: str) -> dict[str, NDArray]:
     """KITTI's form: little-endian float32 rows x, y, z, intensity, nothing else."""
-    if len(content) % 16:
-        got, expected = f"{len(content)} bytes", "a multiple of 16 bytes: float32 x, y, z, intensity a point"
-        raise InputError("cloud is cut off, or is not of this form", where=where, got=got, expected=expected)
-    rows = np.frombuffer(content, "<f4").reshape(-1, 4)
+    rows = _float_rows(content, 4, "cloud", where)
     return {name: rows[:, index].copy() for index, name in enumerate(("x", "y", "z", "intensity"))}
 
 
-def npz_arrays(content: bytes, where: str) -> dict[str, NDArray]:
-    """All arrays of a numpy archive by name. Raises InputError: damaged, cut off, or not plain numbers of the declared
-    size."""
-    arrays = {}
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            for entry in archive.infolist():
-                with archive.open(entry) as handle:
-                    member = f"{where}: {entry.filename}"
-                    arrays[entry.filename.removesuffix(".npy")] = read_npy(handle, entry.file_size, member)
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, NotImplementedError, RuntimeError, zlib.error) as error:
-        what = "not a readable NPZ file, or cut off"
-        raise InputError(what, where=where, got=str(error)[:120], remedy="copy the file again") from error
-    return arrays
+_DAMAGE: Final = (ValueError, OSError, EOFError, zipfile.BadZipFile, NotImplementedError, RuntimeError, zlib.error)
+_DAMAGE_OF_HEADERS: Final = (SyntaxError, TypeError, tokenize.TokenError, OverflowError, MemoryError)
+"""What zipfile, and numpy's parser of headers, raise for damaged archives."""
 
 
 def read_npz(content: bytes, where: str) -> dict[str, NDArray]:
     """numpy archive: ``xyz`` [N, 3] and any number of arrays [N]."""
-    columns = npz_arrays(content, where)
+    columns: dict[str, NDArray] = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            for entry in archive.infolist():
+                if entry.file_size > 24 * MAX_POINTS + _MAX_HEADER_BYTES:
+                    raise ValueError(f"{entry.filename}: {entry.file_size} bytes are too many")
+                with archive.open(entry) as handle:
+                    columns[entry.filename.removesuffix(".npy")] = np.lib.format.read_array(handle, allow_pickle=False)
+                    if handle.read(1):  # at its end the checksum is compared
+                        raise ValueError(f"{entry.filename} goes on after its array")
+    except (*_DAMAGE, *_DAMAGE_OF_HEADERS) as error:
+        what = "not a readable NPZ file of plain numbers, or cut off"
+        raise InputError(what, where=where, got=str(error)[:120], remedy="write it again with numpy.savez") from error
     xyz = columns.pop("xyz", None)
     if xyz is None or xyz.ndim != 2 or xyz.shape[1] != 3 or xyz.dtype.kind not in "fiu":
         what = "NPZ cloud has no coordinates"
@@ -334,31 +264,6 @@ def read_npz(content: bytes, where: str) -> dict[str, NDArray]:
             what, where = "NPZ array does not fit the points", f"{where}: {name}"
             raise InputError(what, where=where, expected=f"numbers [{len(xyz)}]", got=f"{values.dtype} {values.shape}")
     return {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2], **columns}
-
-
-def read_npy(handle: IO[bytes], size: int, where: str) -> NDArray:
-    """One array of an archive, from its member of ``size`` bytes.
-
-    Its header is compared with this size before anything is allocated; arrays of objects (pickles) are refused. Raises
-    InputError: not numbers, or of another size than declared. ValueError, zipfile.BadZipFile, zlib.error: no array, or
-    damaged."""
-    version = np.lib.format.read_magic(handle)
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    if version not in readers:
-        raise InputError("array is of a version that is not read", where=where, got=str(version))
-    try:
-        shape, fortran, dtype = readers[version](handle)
-    except (tokenize.TokenError, SyntaxError, RecursionError, MemoryError) as error:  # of numpy's parser
-        what = "array's header makes no sense"
-        raise InputError(what, where=where, got=str(error)[:120], remedy="copy the file again") from error
-    length = math.prod(shape) * dtype.itemsize
-    plain = not dtype.hasobject and dtype.kind in "fiub"
-    if not plain or length > min(size, MAX_POINTS * 24) or handle.tell() + length != size:
-        what, got = "array is not plain numbers of the declared size", f"{dtype} {shape} in {size} bytes"
-        raise InputError(what, where=where, got=got, remedy="save it with numpy.savez from an array of numbers")
-    content = handle.read(length)
-    handle.read(1)  # at its end an archive's member compares its checksum
-    return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran else "C")
 
 
 READERS: Final[dict[str, Callable[[bytes, str], dict[str, NDArray]]]]

@@ -128,7 +128,6 @@ class ImportOptions:
         sequence: which sequence or frame of a folder that holds many.
         poses, boxes: files to use instead of those found by looking.
         skip_missing: leave out frames of which an image, scan or vehicle pose is missing, instead of refusing.
-        bridge_gaps: lay curves through gaps between vehicle poses, instead of refusing the frames in them.
         untwist: undo the distortion of scans by the vehicle's motion; auto decides by what the dataset documents.
         test_every: hold out every n-th frame of all cameras (n, 2n, ...); 0 holds out none.
         resolution: size of the scene's images; None keeps the recorded one. See ``images.ImageFit``.
@@ -141,7 +140,6 @@ class ImportOptions:
     poses: Path | None = None
     boxes: Path | None = None
     skip_missing: bool = False
-    bridge_gaps: bool = False
     untwist: Literal["auto", "yes", "no"] = "auto"
     test_every: int = 4
     resolution: Resolution | None = None
@@ -407,7 +405,7 @@ def pose_near(
 def gap_problem(gap: motion.Gap, time_s: float, where: str) -> InputError:
     """The error about an image or scan in a gap of the vehicle's path."""
     what, got = "vehicle poses have a gap here", f"at {time_s:.3f} s: {gap}"
-    remedy = "leave such frames out with --skip-missing, or lay a curve through the gap with --bridge-gaps"
+    remedy = "leave such frames out with --skip-missing"
     return InputError(what, where=where, got=got, expected="poses around every image and scan", remedy=remedy)
 
 
@@ -420,17 +418,12 @@ def has_pose(ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATIO
     return True
 
 
-def mended_path(ego: EgoPath, options: ImportOptions, notes: list[str]) -> EgoPath:
-    """The vehicle's path with headings that flip by 180 degrees turned back and, with ``options.bridge_gaps``, its gaps
-    bridged; what was done is added to ``notes``."""
+def mended_path(ego: EgoPath, notes: list[str]) -> EgoPath:
+    """The vehicle's path with headings that flip by 180 degrees turned back, which is added to ``notes``."""
     poses, turned = motion.unflipped(ego.times_s, ego.world_from_ego, motion.MOST_TURN_RAD_S)
     if len(turned):
         ego, count = EgoPath(ego.times_s, poses), f"{len(turned)} of {len(poses)} poses were turned back"
         notes.append(f"the vehicle's heading flips by 180 degrees at {ego.times_s[turned[0]]:.3f} s: {count}")
-    if gaps := motion.gaps(ego.times_s, ego.world_from_ego) if options.bridge_gaps else []:
-        longest = max(gaps, key=lambda gap: gap.moved_m)
-        notes.append(f"{len(gaps)} gaps of the vehicle's path are bridged by curves, the longest: {longest}")
-        ego = motion.bridged(ego)
     return ego
 
 

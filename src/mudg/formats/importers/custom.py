@@ -3,7 +3,6 @@ reads."""
 
 from __future__ import annotations
 
-import io
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +12,6 @@ from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 from pydantic import Field, WrapValidator
 
 from mudg.base import log, store
@@ -343,8 +341,6 @@ def _parse_lidar(name: str, value: object, where: str) -> LogLidar:
 
 
 # --- importer -------------------------------------------------------------------------------------
-MAX_ALIKE: Final = 5
-"""Findings with the same text that are listed one by one."""
 MAX_DELAY_S: Final = 1.0
 Numbered = tuple[int, LogItem]
 """A record and its number, counted per sensor in time order."""
@@ -365,7 +361,7 @@ def import_custom(source: Path, out: Path, options: ImportOptions) -> Scene:
     contradictory; nothing is left at ``out``."""
     common.refuse_options(options, "neutral-layout", "sequence", "poses", "boxes")
     log_read, notes = read_log(source), []
-    content = _chosen(replace(log_read, ego=common.mended_path(log_read.ego, options, notes)), options)
+    content = _chosen(replace(log_read, ego=common.mended_path(log_read.ego, notes)), options)
     fits = {name: fit_images(c.camera, options, c.lens) for name, c in content.cameras.items()}
     moments = _moments(content.images)
     as_scene(content, schema.raise_first)  # records without a pose are refused before anything is read
@@ -373,9 +369,7 @@ def import_custom(source: Path, out: Path, options: ImportOptions) -> Scene:
     def convert(item: Numbered) -> Iterator[SceneImage | SceneSweep]:
         number, record = item
         if record.kind == "image":
-            path = _file(content, record)
-            refuse_grey(path)
-            pose = pose_of(content.ego, record)
+            path, pose = _file(content, record), pose_of(content.ego, record)
             yield SceneImage(record.sensor, number, record.time_s, pose, path, moment=moments[record])
         else:
             points = read_sweep(content, record, options)
@@ -461,18 +455,6 @@ def pose_of(ego: EgoPath, record: LogItem) -> NDArray[np.float64]:
     return common.pose_near(ego, record.time_s) @ record.ego_from_sensor
 
 
-def refuse_grey(path: Path) -> None:
-    """Refuse grey images, which ``decode_image`` would take: in a log of colour cameras they are a mistake."""
-    try:
-        with Image.open(io.BytesIO(store.read_bytes(path)), formats=("PNG", "JPEG")) as image:
-            mode = image.mode
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
-        return  # decode_image says better what is wrong
-    if mode in ("1", "L", "LA"):
-        got, remedy = f"mode {mode}", "repeat the channel three times, if grey is meant"
-        raise InputError("image is grey", where=str(path), expected="8-bit RGB", got=got, remedy=remedy)
-
-
 def read_sweep(content: CustomLog, sweep: LogItem, options: ImportOptions) -> SweepPoints:
     """The points of a sweep, motion-compensated to its time. Raises InputError: no points, or they contradict what the
     log declares of their fields."""
@@ -538,8 +520,7 @@ def _delays(cloud: Cloud, sweep: LogItem, content: CustomLog, path: Path) -> NDA
 
 
 def check_log(source: Path) -> list[Finding]:
-    """Everything that is wrong or odd about a log in the neutral layout, worst first; every file is read. Problems with
-    the same text are listed five times, the rest counted."""
+    """Everything that is wrong or odd about a log in the neutral layout, worst first; every file is read."""
     findings: list[Finding] = []
 
     def complain(problem: MudgError) -> None:
@@ -555,7 +536,6 @@ def check_log(source: Path) -> list[Finding]:
 
     def check_image(frame: Frame, image: LogItem) -> Iterator[Finding]:
         path = _file(content, image)
-        refuse_grey(path)
         pixels = decode_image(store.read_bytes(path), str(path), frame.view.camera)
         yield from scene_check.check_image(frame, pixels)
 
@@ -570,16 +550,7 @@ def check_log(source: Path) -> list[Finding]:
         for check in (*map(check_image, scene.frames, images), *map(check_sweep, scene.sweeps, sweeps)):
             findings.extend(scene_check.collected(check, str(source)))
             bar.advance()
-    counts: Counter[tuple[scene_check.Level, str]] = Counter()
-    kept = []
-    for finding in findings:
-        kind = finding.level, finding.message.split(";")[0]
-        counts[kind] += 1
-        kept += [finding] if counts[kind] <= MAX_ALIKE else []
-    for (level, message), count in counts.items():
-        if count > MAX_ALIKE:
-            kept.append(Finding(level, "and others", f"{message}: {count - MAX_ALIKE} more"))
-    return scene_check.worst_first(kept)
+    return scene_check.worst_first(findings)
 
 
 def as_scene(content: CustomLog, complain: schema.Complain) -> tuple[Scene, list[LogItem], list[LogItem]]:

@@ -6,8 +6,7 @@ A scene's cameras are pinhole cameras: projection, fusion and rasteriser know no
 * Distorted images are rectified here. The pinhole camera keeps the optical centre and has the lens' focal length, made
   longer just as far as needed for every pixel to show something: a scene holds no black borders and needs no mask of
   them. What falls outside is lost; the coefficients stay in ``Camera.distortion`` for the record.
-* A lens for which this costs more than ``MAX_FOCAL_GAIN``, or whose polynomial turns back inside the image, is refused
-  with the way out: name a narrower pinhole camera (``target``).
+* A lens for which this costs more than ``MAX_FOCAL_GAIN``, or whose polynomial turns back inside the image, is refused.
 * ``resolution`` shrinks by averaging over the exact area of each new pixel; images are never enlarged.
 """
 
@@ -134,9 +133,7 @@ class ImageFit:
         return resize_nearest(ids, self.camera.height, self.camera.width)
 
 
-def fit_images(
-    camera: Camera, options: ImportOptions, lens: Lens | None = None, target: Camera | None = None
-) -> ImageFit:
+def fit_images(camera: Camera, options: ImportOptions, lens: Lens | None = None) -> ImageFit:
     """Plan what happens to the images of a camera. Raises InputError: the lens cannot be rectified like this.
     UsageError: ``resolution`` is larger than the images.
 
@@ -144,13 +141,12 @@ def fit_images(
         camera: as recorded: size and intrinsics of the files; with a lens, its coefficients in ``distortion``.
         options: ``resolution`` is used.
         lens: the lens' distortion; None = images are rectified.
-        target: pinhole camera to rectify to (size free, same name), for lenses that do not fit one by themselves.
     """
     changes = []
     table = None
     out = camera
     if lens is not None:
-        out = target or covering_camera(camera, lens)
+        out = covering_camera(camera, lens)
         table = _Table.of(out, camera, lens)
         changes.append(f"rectified, focal length times {out.fx / camera.fx:.3f}")
     size = resized(out.width, out.height, options.resolution, f"camera {camera.name}")

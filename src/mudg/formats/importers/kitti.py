@@ -270,7 +270,7 @@ class _Recording:
             raw_scans = any(path.parent.name == "data" for path in self.scans.values())
             self.ego_from_velo = invert(velo_from_imu)
             self.untwist |= self.options.untwist == "auto" and raw_scans
-        self.ego = common.mended_path(ego, self.options, self.notes)
+        self.ego = common.mended_path(ego, self.notes)
         self.untwist &= len(self.frames) > 1
         if self.untwist:
             self.notes.append("scans untwisted: counter-clockwise turn of 0.1 s, forward at the scan's time")

@@ -2,9 +2,9 @@
 
 ========================== =========================================================================================
 ``calibration/``           cameras, velodyne (``calib``)
-``data_2d_raw/<drive>/``   ``image_00|01/data_rect`` (rectified stereo), ``image_02|03/data_rgb`` (fisheyes)
+``data_2d_raw/<drive>/``   ``image_00|01/data_rect`` (rectified stereo)
 ``data_3d_raw/<drive>/``   ``velodyne_points/data`` with ``timestamps.txt``
-``data_poses/<drive>/``    ``poses.txt`` (vehicle) or ``cam0_to_world.txt`` (rectified camera 0), for part of the frames
+``data_poses/<drive>/``    ``poses.txt`` (vehicle), for part of the frames
 ``data_3d_bboxes/``        ``train_full/<drive>.xml``, else ``train/<drive>.xml`` (``boxes``)
 ``data_2d_semantics/``     ``train/<drive>/image_00|01/semantic`` and ``confidence``, where there are any
 ========================== =========================================================================================
@@ -18,9 +18,6 @@ left out.
 
 Scans are distorted by the vehicle's motion; they are untwisted here. The sensor turns clockwise seen from above in 0.1
 s and looks forward at the frame's moment (as the data set's tools have it).
-
-Fisheye cameras are taken when they are asked for (``--cameras side_left side_right``): rectified to a pinhole camera
-that looks along the lens' axis and is 90 degrees wide and high, with the lens' own resolution in its centre.
 """
 
 from __future__ import annotations
@@ -42,11 +39,11 @@ from mudg.base import log, store
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert
 from mudg.base.palette import UNLABELLED
-from mudg.base.types import Camera, EgoPath, Scene, Source, Track
+from mudg.base.types import EgoPath, Scene, Source, Track
 from mudg.formats.importers import common
 from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
 from mudg.formats.importers.drive_log import BoxTracks, SceneContent, SceneImage, SceneSweep, write_scene
-from mudg.formats.importers.images import ImageFit, brown_conrady, fit_images, image_notes, image_size
+from mudg.formats.importers.images import ImageFit, fit_images, image_notes, image_size
 from mudg.formats.importers.kitti_files import (
     SENSOR,
     line_numbers,
@@ -58,6 +55,7 @@ from mudg.formats.importers.kitti_files import (
     read_timestamps,
     rotation_entry,
     table_entry,
+    xml_elements,
 )
 from mudg.formats.unknown_fields import note_unknown
 from mudg.scene.motion import GAP_M
@@ -84,8 +82,6 @@ _OFFICIAL: Final = frozenset(
 )
 """Fields of the data set's objects, read or not."""
 VEHICLES: Final = frozenset(("car", "truck", "bus", "caravan", "trailer", "train", "motorcycle", "bicycle"))
-MAX_FILE_BYTES: Final = 8 * 1024**3
-_CHUNK: Final = 1 << 20
 _MAX_VALUES: Final = 100_000
 _MAX_SHEAR: Final = 0.05
 
@@ -111,7 +107,7 @@ def read_boxes(path: Path, left_out: Counter[str]) -> Iterator[Kitti360Box]:
     """Boxes of the classes in ``LABEL_OF`` in an XML file, one by one; ``left_out`` is filled with what is not read
     (``that are not cuboids``) and how often. Raises InputError: missing, cut off, malformed, or it declares XML
     entities."""
-    for number, item in enumerate(_objects(path)):
+    for number, item in enumerate(xml_elements(path, 1)):
         where = f"{path}: object {number} ({item.tag})"
         if item.find("transform") is None:
             continue
@@ -140,44 +136,6 @@ def read_boxes(path: Path, left_out: Counter[str]) -> Iterator[Kitti360Box]:
         else:
             name = f"i-{_integer(item, 'index', where)}"
         yield Kitti360Box(name, label, frame, window, size_m, pose)
-
-
-def _objects(path: Path) -> Iterator[ElementTree.Element]:
-    """The children of the top element, each freed after use."""
-    parser = ElementTree.XMLPullParser(("start", "end"))
-    open_elements: list[ElementTree.Element] = []
-    tail = b""
-    try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise InputError("box file is too large", where=str(path), expected=f"<= {MAX_FILE_BYTES} bytes")
-        with store.open_file(path) as handle:
-            while chunk := handle.read(_CHUNK):
-                # entities can blow a small file up; other encodings could hide them from this look
-                content, head = tail + chunk, b"" if tail else chunk[:200].lower()
-                other = b"encoding" in head and b"utf-8" not in head and b"ascii" not in head
-                if other or any(word in content for word in (b"<!ENTITY", b"<!DOCTYPE", b"\0")):
-                    what = "box file declares a document type, entities or another encoding"
-                    what, remedy = f"{what}, which the data set's files do not", "use the file from the data set"
-                    raise InputError(what, where=str(path), remedy=remedy)
-                tail = chunk[-16:]
-                parser.feed(chunk)
-                events: Iterator[Any] = parser.read_events()
-                for event, element in events:
-                    if event == "start":
-                        open_elements.append(element)
-                        continue
-                    open_elements.pop()
-                    if len(open_elements) == 1:
-                        yield element
-                        element.clear()
-                        open_elements[0].clear()
-        parser.close()
-    except FileNotFoundError as error:
-        raise InputError("box file does not exist", where=str(path)) from error
-    except OSError as error:
-        raise InputError("box file cannot be read", where=str(path), got=str(error)) from error
-    except ElementTree.ParseError as error:
-        raise InputError("box file is not valid XML (is it cut off?)", where=str(path), got=str(error)) from error
 
 
 def _integer(item: ElementTree.Element, key: str, where: str) -> int:
@@ -237,116 +195,43 @@ def _shape(
 
 # calib --------------------------------------------------------------------------------------------
 #
-# Rectified cameras, fisheyes (model of Mei) and LiDARs, all on the vehicle. The data set's vehicle frame is that
-# of the GPS/IMU: x forward, y right, z down. The ego frame here is the same point, y to the left and z up.
+# Rectified cameras and the LiDAR, all on the vehicle. The data set's vehicle frame is that of the GPS/IMU: x forward, y
+# right, z down. The ego frame here is the same point, y to the left and z up.
 IMU_FROM_EGO: Final = np.diag([1.0, -1.0, -1.0, 1.0])
-FISHEYES: Final = ("image_02", "image_03")
-FISHEYE_VIEW_DEG: Final = 90.0
-_FISHEYE_VALUES: Final = ("image_width", "image_height", "xi", "k1", "k2", "p1", "p2", "gamma1", "gamma2", "u0", "v0")
-_FISHEYE: Final = frozenset(_FISHEYE_VALUES).union(
-    "model_type camera_name mirror_parameters distortion_parameters projection_parameters".split()
-)
-"""Entries of the data set's fisheye calibrations."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Kitti360Calibration:
-    """What is fixed on the vehicle; poses are f64[4, 4]. ``ego_from_camera``: by ``image_00`` .. ``image_03``,
-    perspective cameras as rectified. ``imu_from_rect0``: the data set's vehicle frame from rectified camera 0."""
-
-    folder: Path
-    ego_from_camera: dict[str, Matrix]
-    ego_from_velo: Matrix
-    imu_from_rect0: Matrix
-
-    def fit(self, camera: str, name: str, size: tuple[int, int], options: ImportOptions) -> ImageFit:
-        """How images of ``camera`` (``image_02``), of ``size`` (width, height), become those of the scene's."""
-        if camera in FISHEYES:
-            return self._fit_fisheye(camera, name, size, options)
-        path = self.folder / "perspective.txt"
-        table = read_number_table(path)
-        projection = table_entry(table, (f"P_rect_{camera[-2:]}",), (3, 4), path)
-        declared = table_entry(table, (f"S_rect_{camera[-2:]}",), (2,), path)
-        _check_size(size, (int(declared[0]), int(declared[1])), f"{path}: S_rect_{camera[-2:]}")
-        return fit_images(pinhole_camera(projection, name, size, f"{path}: P_rect_{camera[-2:]}"), options)
-
-    def _fit_fisheye(self, camera: str, name: str, size: tuple[int, int], options: ImportOptions) -> ImageFit:
-        path = self.folder / f"{camera}.yaml"
-        values = _read_fisheye(path)
-        _check_size(size, (int(values["image_width"]), int(values["image_height"])), f"{path}: image_width")
-        xi, bend = values["xi"], tuple(values[key] for key in ("k1", "k2", "p1", "p2"))
-        distort = brown_conrady(*bend)
-
-        def lens(xy: Matrix) -> Matrix:
-            """Unit sphere, seen from ``xi`` behind its centre, then radial and tangential distortion."""
-            length = np.sqrt(1 + (xy**2).sum(1))
-            return distort(xy / (1 + xi * length)[:, None])
-
-        fx, fy, cx, cy = values["gamma1"], values["gamma2"], values["u0"] + 0.5, values["v0"] + 0.5
-        recorded = Camera(name, *size, fx, fy, cx, cy, (xi, *bend))
-        # the focal length at the lens' centre, so that nothing is lost or made up there
-        focal = fx / (1 + xi)
-        side = max(16, round(2 * focal * np.tan(np.deg2rad(FISHEYE_VIEW_DEG / 2))))
-        target = replace(recorded, width=side, height=side, fx=focal, fy=focal, cx=side / 2, cy=side / 2)
-        return fit_images(recorded, options, lens, target)
-
-
-def read_calibration(folder: Path) -> Kitti360Calibration:
-    """Read ``calibration/``. Raises InputError: a file or entry is missing, or a matrix is not a rigid motion."""
+def read_calibration(folder: Path) -> tuple[dict[str, Matrix], Matrix]:
+    """Poses f64[4, 4] on the vehicle of the rectified cameras ``image_00``, ``image_01`` and of the velodyne. Raises
+    InputError: a file or entry is missing, or a matrix is not a rigid motion."""
     path, perspective = folder / "calib_cam_to_pose.txt", folder / "perspective.txt"
-    table = read_number_table(path)
+    table, rectified = read_number_table(path), read_number_table(perspective)
     imu_from_camera = {n: pose_entry(table, (n,), path) for n in CAMERAS if n == "image_00" or n in table}
-    imu_from_velo = imu_from_camera["image_00"] @ invert(_rigid_file(folder / "calib_cam_to_velo.txt"))
-    numbers = read_number_table(perspective)
-    for name in (name for name in USUAL if name in imu_from_camera):
-        imu_from_camera[name] @= invert(rotation_entry(numbers, (f"R_rect_{name[-2:]}",), perspective))
-    ego_from_imu = invert(IMU_FROM_EGO)
-    ego_from_camera = {name: ego_from_imu @ pose for name, pose in imu_from_camera.items()}
-    return Kitti360Calibration(folder, ego_from_camera, ego_from_imu @ imu_from_velo, imu_from_camera["image_00"])
-
-
-def _rigid_file(path: Path) -> Matrix:
+    path = folder / "calib_cam_to_velo.txt"
     numbers = line_numbers(store.read_text(path).replace("\n", " "), (12,), str(path), "calibration")
-    return common.rigid_pose(numbers.reshape(3, 4), str(path))
+    velo_from_camera = common.rigid_pose(numbers.reshape(3, 4), str(path))
+    ego_from_camera = {
+        name: invert(IMU_FROM_EGO) @ pose @ invert(rotation_entry(rectified, (f"R_rect_{name[-2:]}",), perspective))
+        for name, pose in imu_from_camera.items()
+    }
+    return ego_from_camera, invert(IMU_FROM_EGO) @ imu_from_camera["image_00"] @ invert(velo_from_camera)
 
 
-def _check_size(size: tuple[int, int], declared: tuple[int, int], where: str) -> None:
+def _fit(path: Path, camera: str, size: tuple[int, int], options: ImportOptions) -> ImageFit:
+    """How images of ``camera`` (``image_00``), of ``size`` (width, height), become those of the scene's."""
+    table, entry = read_number_table(path), f"S_rect_{camera[-2:]}"
+    projection = table_entry(table, (f"P_rect_{camera[-2:]}",), (3, 4), path)
+    declared = tuple(int(side) for side in table_entry(table, (entry,), (2,), path))
     if size != declared:
         what, expected = "images do not have the size that the calibration is for", f"{declared[0]}x{declared[1]}"
-        remedy = "use the images as the data set ships them"
-        raise InputError(what, where=where, expected=expected, got=f"{size[0]}x{size[1]}", remedy=remedy)
-
-
-def _read_fisheye(path: Path) -> dict[str, float]:
-    """The numbers of an OpenCV-style YAML file by their keys; nesting does not matter, keys are distinct."""
-    text = store.read_bytes(path).decode("utf-8", "replace")
-    model = re.search(r"^\s*model_type\s*:\s*\"?(\w+)", text, re.MULTILINE)
-    if model is None or model[1] != "MEI":
-        what = "fisheye calibration is of another camera model"
-        raise InputError(what, where=str(path), expected="model_type: MEI", got=model[1] if model else "no model_type")
-    note_unknown(path.name, re.findall(r"^\s*(\w+)\s*:", text, re.MULTILINE), _FISHEYE)
-    found: dict[str, float] = {}
-    for key, value in re.findall(r"^\s*(\w+)\s*:\s*([-+.\deE]+)\s*$", text, re.MULTILINE):
-        try:
-            found[key] = float(value)
-        except ValueError as error:
-            raise InputError("fisheye calibration holds no number", where=f"{path}: {key}", got=value[:40]) from error
-    missing = [key for key in _FISHEYE_VALUES if key not in found]
-    if missing:
-        what, where, got = "fisheye calibration is incomplete", str(path), f"no {', '.join(missing)}"
-        raise InputError(what, where=where, expected=", ".join(_FISHEYE_VALUES), got=got, remedy="is the file cut off?")
-    if found["xi"] < 0 or found["gamma1"] <= 0 or found["gamma2"] <= 0:
-        what = "fisheye calibration makes no sense"
-        got = f"xi={found['xi']:g}, gamma1={found['gamma1']:g}, gamma2={found['gamma2']:g}"
-        raise InputError(what, where=str(path), expected="xi >= 0, gamma1 and gamma2 > 0", got=got)
-    return found
+        got, remedy = f"{size[0]}x{size[1]}", "use the images as the data set ships them"
+        raise InputError(what, where=f"{path}: {entry}", expected=expected, got=got, remedy=remedy)
+    return fit_images(pinhole_camera(projection, CAMERAS[camera], size, f"{path}: P_rect_{camera[-2:]}"), options)
 
 
 # importer -----------------------------------------------------------------------------------------
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY-NC-SA 3.0 (KITTI-360: Liao, Xie, Geiger; attribution, non-commercial, share-alike)"
-CAMERAS: Final = {"image_00": "front", "image_01": "front_stereo", "image_02": "side_left", "image_03": "side_right"}
-USUAL: Final = ("image_00", "image_01")
+CAMERAS: Final = {"image_00": "front", "image_01": "front_stereo"}
 FRAME_PERIOD_S: Final = 0.1
 _TRAIN_IDS: Final = dict(zip((7, 8, 11, 12, 13, 17, *range(19, 29), 31, 32, 33), range(19), strict=True))
 _TRAIN_IDS.update({34: 2, 35: 4, 37: 5})
@@ -389,28 +274,22 @@ def _box_files(root: Path, drive: str) -> list[Path]:
 
 def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
     """Import one drive of the data set's folder, or ``data_2d_raw/<drive>`` in it. ``options.sequence``: the drive
-    (``2013_05_28_drive_0000_sync``, or ``0000``); ``cameras`` default to the stereo pair."""
+    (``2013_05_28_drive_0000_sync``, or ``0000``)."""
     root, drive = _find(source, options)
     images_folder, raw_folder = root / "data_2d_raw" / drive, root / "data_3d_raw" / drive
-    calibration = read_calibration(root / "calibration")
-    images: dict[str, dict[int, Path]] = {}
-    for name in CAMERAS:
-        folder = images_folder / name / ("data_rect" if name in USUAL else "data_rgb")
-        images[name] = common.numbered_files(folder, (".png", ".jpg"))
-    available = {name: ours for name, ours in CAMERAS.items() if images[name] and name in calibration.ego_from_camera}
-    chosen = common.chosen_cameras(available, options, str(images_folder), USUAL)
+    ego_from_camera, ego_from_velo = read_calibration(root / "calibration")
+    images = {n: common.numbered_files(images_folder / n / "data_rect", (".png", ".jpg")) for n in CAMERAS}
+    available = {name: ours for name, ours in CAMERAS.items() if images[name] and name in ego_from_camera}
+    chosen = common.chosen_cameras(available, options, str(images_folder), tuple(CAMERAS))
     scans = common.numbered_files(raw_folder / "velodyne_points" / "data", (".bin",))
     streams = {**{name: images[name] for name in chosen}, **({SENSOR: scans} if scans else {})}
     notes: list[str] = []
     clock = _clock(raw_folder / "velodyne_points", images_folder / "image_00", streams, notes)
-    here = root / "data_poses" / drive
-    poses = common.first_file(*([options.poses] if options.poses else [here / "poses.txt", here / "cam0_to_world.txt"]))
-    if poses is None:
-        where, expected = str(options.poses or here), "poses.txt or cam0_to_world.txt"
+    poses = options.poses or root / "data_poses" / drive / "poses.txt"
+    if not poses.is_file():
         remedy = "download the data set's vehicle poses"
-        raise InputError("no vehicle poses found", where=where, expected=expected, remedy=remedy)
-    notes.append(f"poses from {poses.name}")
-    ego = common.mended_path(_read_motion(poses, calibration, clock), options, notes)
+        raise InputError("no vehicle poses found", where=str(poses), expected="poses.txt", remedy=remedy)
+    ego = common.mended_path(_read_motion(poses, clock), notes)
     placed = {name: [n for n in found if _has_pose(ego, clock[n])] for name, found in streams.items()}
     frames = common.complete_frames(placed, options, str(root), "kitti360")
     begin, end = options.frames or (0, 2**63)
@@ -423,7 +302,8 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
     notes.append(common.origin_note(first))
     scene_s = common.seconds(clock[frames], "s", f"{root}: timestamps of {drive}", start_s)
     ego = EgoPath(ego.times_s - start_s, world_from_source @ ego.world_from_ego)
-    fits = {CAMERAS[n]: calibration.fit(n, CAMERAS[n], image_size(images[n][frames[0]]), options) for n in chosen}
+    calibration = root / "calibration" / "perspective.txt"
+    fits = {CAMERAS[n]: _fit(calibration, n, image_size(images[n][frames[0]]), options) for n in chosen}
     untwist = bool(scans) and options.untwist != "no"
     if not scans:
         log.warn("kitti360: no scans found: the scene has images only, and there is nothing to fuse")
@@ -435,12 +315,12 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
     tracks = _read_tracks(boxes, dict(zip(frames, scene_s, strict=True)), world_from_source, notes)
 
     def world_from_velo(time_s: float) -> Matrix:
-        return common.pose_near(ego, time_s) @ calibration.ego_from_velo
+        return common.pose_near(ego, time_s) @ ego_from_velo
 
     def convert(index: int) -> Iterable[SceneImage | SceneSweep]:
         number, time_s = frames[index], float(scene_s[index])
         for name in chosen:
-            world_from_cam = common.pose_near(ego, time_s) @ calibration.ego_from_camera[name]
+            world_from_cam = common.pose_near(ego, time_s) @ ego_from_camera[name]
             path, semantics = images[name][number], root / "data_2d_semantics" / "train" / drive / name
             labels = _labels(semantics, f"{number:010d}.png", fits[CAMERAS[name]])
             yield SceneImage(CAMERAS[name], index, time_s, world_from_cam, path, str(path), labels)
@@ -471,34 +351,28 @@ def _clock(
     last = max(max(found) for found in streams.values())
     for folder, files in ((velodyne, streams.get(SENSOR, {})), (camera, streams.get("image_00", {}))):
         if (folder / "timestamps.txt").is_file():
-            return _stamps(folder / "timestamps.txt", files, last)
+            stamps = read_timestamps(folder / "timestamps.txt", list(files), last)
+            times = np.full(max(last, *stamps, 0) + 1, np.nan)
+            times[list(stamps)] = list(stamps.values())
+            return times
     notes.append("no timestamps in the source: 10 Hz assumed")
     return np.arange(last + 1, dtype=np.float64) * FRAME_PERIOD_S
 
 
-def _stamps(path: Path, files: Mapping[int, Path], last: int) -> NDArray[np.float64]:
-    """Seconds by number, f64[last + 1] or more; NaN where there is no stamp."""
-    stamps = read_timestamps(path, list(files), last)
-    times = np.full(max(last, *stamps, 0) + 1, np.nan)
-    times[list(stamps)] = list(stamps.values())
-    return times
-
-
-def _read_motion(path: Path, calibration: Kitti360Calibration, clock: NDArray[np.float64]) -> EgoPath:
+def _read_motion(path: Path, clock: NDArray[np.float64]) -> EgoPath:
     """The vehicle at the frames that have a pose, in the data set's world and clock."""
     numbers, poses, before = [], [], -1
     for index, line in read_lines(path).items():
         where = f"{path}: line {index + 1}"
-        row = line_numbers(line, (13, 17), where, "pose")
+        row = line_numbers(line, (13,), where, "pose")
         number = int(row[0])
         if number != row[0] or number <= before:
             what = "first column is not a list of growing frame numbers"
             raise InputError(what, where=where, got=f"{row[0]:g}", remedy="is the file of another kind?")
         before = number
         if number < len(clock) and np.isfinite(clock[number]):
-            pose = common.rigid_pose(row[1:].reshape(-1, 4), where)
             numbers.append(number)
-            poses.append(pose @ (invert(calibration.imu_from_rect0) if len(row) == 17 else np.eye(4)))
+            poses.append(common.rigid_pose(row[1:].reshape(3, 4), where))
     if not poses:
         what = "no pose belongs to a frame"
         raise InputError(what, where=str(path), expected=f"frame numbers up to {len(clock) - 1}")

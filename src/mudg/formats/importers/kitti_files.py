@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import datetime
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 from xml.etree import ElementTree
 
 import numpy as np
@@ -326,7 +326,7 @@ def _stamp(line: str, where: str) -> float:
 
 
 # boxes --------------------------------------------------------------------------------------------
-MAX_TRACKLET_BYTES: Final = 256 * 1024 * 1024
+_CHUNK: Final = 1 << 20
 LABELS: Final = frozenset(
     ("car", "van", "truck", "pedestrian", "person_sitting", "person (sitting)", "person", "cyclist", "tram", "misc")
 )
@@ -341,19 +341,15 @@ _TRACKLET_POSE = frozenset(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KittiBox:
-    """One annotated box.
-
-    ``track``: its number; object labels count lines. ``label``: lower-case class, e.g. ``car``. ``size_m``: length,
-    width, height. ``sensor_from_box``: box frame (x forward, y left, z up, origin in the centre) to the velodyne,
-    f64[4, 4]. ``box2d_px``: annotated rectangle (left, top, right, bottom) in KITTI's pixels.
-    """
+    """One annotated box. ``track``: its number; object labels count lines. ``label``: lower-case class, e.g. ``car``.
+    ``size_m``: length, width, height. ``sensor_from_box``: box frame (x forward, y left, z up, origin in the centre) to
+    the velodyne, f64[4, 4]."""
 
     frame: int
     track: int
     label: str
     size_m: tuple[float, float, float]
     sensor_from_box: Matrix
-    box2d_px: tuple[float, float, float, float] | None = None
 
 
 def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = None) -> list[KittiBox]:
@@ -378,30 +374,51 @@ def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = Non
             raise InputError("label value is not a number", where=where, got=str(error)) from error
         if not np.isfinite(values).all():
             raise InputError("label value is not finite", where=where, got=line.strip()[:100])
-        left, top, right, bottom, height, width, length, x, y, z, turn = values[3:14]
+        height, width, length, x, y, z, turn = values[7:14]
         size_m = box_size(length, width, height, where)
         # bottom centre (y down), and the turn about the camera's y axis
         c, s = np.cos(turn), np.sin(turn)
         rotation = np.array([(c, 0.0, -s), (s, 0.0, c), (0.0, -1.0, 0.0)]).T
         pose = velo_from_rect0 @ from_rotation_translation(rotation, np.array([x, y - height / 2, z]))
-        boxes.append(KittiBox(number, track, columns[skip].lower(), size_m, pose, (left, top, right, bottom)))
+        boxes.append(KittiBox(number, track, columns[skip].lower(), size_m, pose))
     return boxes
+
+
+def xml_elements(path: Path, depth: int) -> Iterator[ElementTree.Element]:
+    """The elements of an XML file that lie ``depth`` below the top one, each freed after use. Raises InputError:
+    missing, cut off, malformed, or it declares entities or another encoding."""
+    parser = ElementTree.XMLPullParser(("start", "end"))
+    open_elements: list[ElementTree.Element] = []
+    tail = b""
+    try:
+        with store.open_file(path) as handle:
+            while chunk := handle.read(_CHUNK):
+                # entities can blow a small file up; other encodings could hide them from this look
+                content, head = tail + chunk, b"" if tail else chunk[:200].lower()
+                other = b"encoding" in head and b"utf-8" not in head and b"ascii" not in head
+                if other or b"<!ENTITY" in content or b"\0" in content:
+                    what = "box file declares entities or another encoding, which the data set's files do not"
+                    raise InputError(what, where=str(path), remedy="use the file from the data set")
+                tail = chunk[-16:]
+                parser.feed(chunk)
+                events: Iterator[Any] = parser.read_events()
+                for event, element in events:
+                    if event == "start":
+                        open_elements.append(element)
+                        continue
+                    open_elements.pop()
+                    if len(open_elements) == depth:
+                        yield element
+                        open_elements[-1].clear()
+        parser.close()
+    except ElementTree.ParseError as error:
+        raise InputError("box file is not valid XML (is it cut off?)", where=str(path), got=str(error)) from error
 
 
 def read_tracklets(path: Path) -> list[KittiBox]:
     """Boxes of a raw-data ``tracklet_labels.xml``: velodyne frame, bottom centre, turn about z."""
-    content = store.read_bytes(path)
-    if len(content) > MAX_TRACKLET_BYTES:
-        raise InputError("tracklet file is too large", where=str(path), got=f"{len(content)} bytes")
-    if b"<!ENTITY" in content:
-        what = "tracklet file declares XML entities, which no KITTI file does"
-        raise InputError(what, where=str(path), remedy="use the file from the data set")
-    try:
-        root = ElementTree.fromstring(content)  # noqa: S314 - entities are refused above, the size is bounded
-    except ElementTree.ParseError as error:
-        raise InputError("tracklet file is not valid XML (is it cut off?)", where=str(path), got=str(error)) from error
     boxes = []
-    for track, item in enumerate(root.findall("./tracklets/item")):
+    for track, item in enumerate(item for item in xml_elements(path, 2) if item.tag == "item"):
         where = f"{path}: tracklet {track}"
         note_unknown(path.name, [field.tag for field in item], _TRACKLET)
         length, width, height = (_xml_number(item, key, where) for key in ("l", "w", "h"))
@@ -452,12 +469,8 @@ def build_tracks(
             x, y = box.sensor_from_box[:2, 3]
             late_s = float(np.arctan2(y, x)) / (2 * np.pi) * TURN_PERIOD_S
             pose = velo_at(time_s + late_s)
-        label, pose, record = (
-            collected.label_of(box.label),
-            pose @ box.sensor_from_box,
-            f"track {name}, frame {box.frame}",
-        )
-        collected.add(name, label, time_s, box.size_m, pose, late_s=late_s, where=f"{where}: {record}")
+        label, here = collected.label_of(box.label), f"{where}: track {name}, frame {box.frame}"
+        collected.add(name, label, time_s, box.size_m, pose @ box.sensor_from_box, late_s=late_s, where=here)
     found, notes = collected.tracks(_speeds)
     if outside:
         notes.insert(0, f"{outside} boxes lie in frames that were not imported and were left out")

@@ -1,5 +1,4 @@
-"""Reading and writing bytes that nobody vouches for: parts within bounds, inflating within bounds, zips without
-surprises."""
+"""Reading and writing bytes that nobody vouches for: parts within bounds, inflating within bounds, zips."""
 
 from __future__ import annotations
 
@@ -18,6 +17,8 @@ from mudg.formats.splats.cloud import MAX_GAUSSIANS, Floats
 
 MAX_BYTES: Final = 8 << 30
 """No file, and nothing that a file inflates to, may be larger."""
+MOST_FILES: Final = 100_000
+"""Files of a zip."""
 
 
 def part(content: bytes, start: int, size: int, what: str, where: str) -> memoryview:
@@ -29,21 +30,15 @@ def part(content: bytes, start: int, size: int, what: str, where: str) -> memory
     return memoryview(content)[start : start + size]
 
 
-def numbers(content: bytes, start: int, kind: str, count: int, what: str, where: str) -> NDArray[Any]:
-    """``count`` numbers of a numpy type such as ``<f4``, as a view; InputError if the content ends before."""
-    dtype = np.dtype(kind)
-    return np.frombuffer(part(content, start, count * dtype.itemsize, what, where), dtype)
-
-
 def unpacked(layout: str, content: bytes, start: int, what: str, where: str) -> tuple[Any, ...]:
     """``struct.unpack`` within bounds."""
     return struct.unpack(layout, part(content, start, struct.calcsize(layout), what, where))
 
 
 def refuse_count(count: int, where: str) -> None:
-    """InputError for a number of Gaussians that no file holds."""
+    """InputError for a number of Gaussians or points that no file holds."""
     if not 0 < count <= MAX_GAUSSIANS:
-        what = "the number of Gaussians in the header is not possible"
+        what = "the number of rows in the header is not possible"
         raise InputError(what, where=where, expected=f"1 to {MAX_GAUSSIANS}", got=str(count))
 
 
@@ -55,61 +50,36 @@ def refuse_bomb(count: int, content: bytes, where: str) -> None:
         raise InputError(what, where=where, expected=f"at most {20 * len(content) + 65536}", got=str(count))
 
 
+def text_table(body: bytes, columns: int, rows: int, where: str) -> NDArray[np.float64]:
+    """Numbers between spaces as f64[rows, columns]; InputError: others, or more or fewer."""
+    if rows * columns * 2 > len(body) + 1:  # a digit and a separator each
+        raise InputError("the file is cut off", where=where, expected=f"{rows} rows", got=f"{len(body)} bytes")
+    try:
+        table = np.array(body.split(), np.float64)
+    except ValueError as error:
+        raise InputError("a value is no number", where=where, got=str(error)[:120]) from error
+    if len(table) != rows * columns:
+        what = "the file is cut off, or has rows of another length"
+        raise InputError(what, where=where, got=f"{len(table)} numbers", expected=f"{rows} rows of {columns}")
+    return table.reshape(rows, columns)
+
+
 # -- compressed streams ----------------------------------------------------------------------------
 
 
-def gzip_bytes(content: bytes) -> bytes:
-    """One gzip member without a name or a time: the same bytes for the same content."""
-    packer = zlib.compressobj(9, zlib.DEFLATED, 31)
-    return packer.compress(content) + packer.flush()
-
-
-class GzipStream:
-    """The content of a gzip file, inflated as far as it is asked for and no further."""
-
-    def __init__(self, content: bytes, where: str) -> None:
-        self._rest, self._where = content, where
-        self._inflater = zlib.decompressobj(31)
-
-    def read(self, size: int, what: str) -> bytes:
-        """The next ``size`` bytes; InputError if there are fewer or they are damaged."""
-        found = self.rest(size)
-        if len(found) < size:
-            what, where = f"the file ends within {what}", self._where
-            remedy = "it was cut off, or its header is damaged: get the file again"
-            raise InputError(what, where=where, expected=f"{size} bytes", got=f"{len(found)} bytes", remedy=remedy)
-        return found
-
-    def rest(self, most: int) -> bytes:
-        """What is left, up to ``most`` bytes."""
-        found = bytearray()
-        while len(found) < most:
-            more = self._inflate(min(most - len(found), 1 << 24))
-            if not more and (self._inflater.eof or not self._rest):
-                break
-            found += more
-        return bytes(found)
-
-    def close(self) -> None:
-        """InputError unless the content ends here, with the right checksum."""
-        more = self._inflate(1)
-        if more or not self._inflater.eof:
-            what = "goes on after its last value" if more else "ends before its checksum"
-            what = f"the compressed content {what}"
-            raise InputError(what, where=self._where, remedy="the header does not fit the content")
-
-    def _inflate(self, most: int) -> bytes:
-        try:
-            more = self._inflater.decompress(self._rest, most)
-        except zlib.error as error:
-            raise InputError("the compressed content is damaged", where=self._where, got=str(error)) from error
-        self._rest = self._inflater.unconsumed_tail
-        return more
+def inflated(packer: Any, content: bytes, size: int, where: str) -> bytes:
+    """Up to ``size`` bytes from a ``zlib.decompressobj`` that was fed ``content``; InputError: it is damaged."""
+    try:
+        return packer.decompress(content, size) if size else b""
+    except zlib.error as error:
+        raise InputError("the compressed content is damaged", where=where, got=str(error)) from error
 
 
 # -- zips ------------------------------------------------------------------------------------------
 
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
+_DAMAGE: Final = (zipfile.BadZipFile, ValueError, EOFError, struct.error, NotImplementedError, OSError)
+"""What zipfile raises for damaged archives."""
 
 
 def stored_zip(files: Mapping[str, bytes], align: int = 1) -> bytes:
@@ -131,54 +101,31 @@ def stored_zip(files: Mapping[str, bytes], align: int = 1) -> bytes:
     return target.getvalue()
 
 
-class BoundedZip:
-    """Files of a zip by name, each no larger than asked for; nothing is unpacked to the disk."""
+def opened_zip(content: bytes, where: str) -> zipfile.ZipFile:
+    """An archive; InputError if it is damaged, or lists too many files."""
+    try:
+        archive = zipfile.ZipFile(io.BytesIO(content))
+    except _DAMAGE as error:
+        raise InputError("not a readable zip file", where=where, got=str(error)) from error
+    if len(archive.namelist()) > MOST_FILES:
+        what, got = "the zip lists too many files", str(len(archive.namelist()))
+        raise InputError(what, where=where, expected=f"at most {MOST_FILES}", got=got)
+    return archive
 
-    def __init__(self, content: bytes, where: str) -> None:
-        self._where = where
-        try:
-            self._archive = zipfile.ZipFile(io.BytesIO(content))
-            infos = self._archive.infolist()
-        except (zipfile.BadZipFile, ValueError, EOFError, struct.error, NotImplementedError, OSError) as error:
-            raise InputError("not a readable zip file", where=where, got=str(error)) from error
-        if len(infos) > 100_000:
-            what = "the zip lists too many files"
-            raise InputError(what, where=where, expected="at most 100000", got=str(len(infos)))
-        self._infos = {info.filename: info for info in infos}
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of its files."""
-        return tuple(self._infos)
-
-    def read(self, name: str, most: int) -> bytes:
-        """The content of a file; InputError if there is none, it is damaged, or larger than ``most`` bytes."""
-        where = f"{self._where}: {name}"
-        info = self._infos.get(name)
-        if info is None:
-            raise InputError("a file is missing in the zip", where=where, got=", ".join(sorted(self._infos)[:8]))
-        if info.file_size > most:
-            what = "a file in the zip is too large"
-            raise InputError(what, where=where, expected=f"at most {most} bytes", got=f"{info.file_size}")
-        try:
-            with self._archive.open(info) as handle:
-                content = handle.read(most + 1)
-                rest = b"" if len(content) <= most else content[most:]
-        except (
-            zipfile.BadZipFile,
-            zlib.error,
-            EOFError,
-            ValueError,
-            NotImplementedError,
-            RuntimeError,
-            OSError,
-            struct.error,
-        ) as error:
-            raise InputError("a file in the zip is damaged", where=where, got=str(error)) from error
-        if rest or len(content) != info.file_size:
-            what = "a file in the zip has another size than listed"
-            raise InputError(what, where=where, expected=str(info.file_size), got=str(len(content)))
-        return content
+def zip_member(archive: zipfile.ZipFile, name: str, most: int, where: str) -> bytes:
+    """The content of a file; InputError if there is none, it is damaged, or larger than ``most`` bytes."""
+    where = f"{where}: {name}"
+    try:
+        with archive.open(name) as handle:
+            content = handle.read(most + 1)  # no more than the archive lists; at its end the checksum is compared
+    except KeyError as error:
+        raise InputError("a file is missing in the zip", where=where, got=", ".join(archive.namelist()[:8])) from error
+    except (*_DAMAGE, RuntimeError, zlib.error) as error:
+        raise InputError("a file in the zip is damaged", where=where, got=str(error)) from error
+    if len(content) > most:
+        raise InputError("a file in the zip is too large", where=where, expected=f"at most {most} bytes")
+    return content
 
 
 # -- order and packing -----------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from mudg.base.errors import InputError
 from mudg.base.types import Scene
 from mudg.core.edit import HeightMap
 from mudg.core.harmonics import C0
+from mudg.formats.exporters.alpasim import to_alpasim
 from mudg.formats.splats import binary, gltf, ply, sog, spz, usd
 from mudg.formats.splats import cloud as axes
 from mudg.formats.splats.cloud import (
@@ -112,8 +113,9 @@ class WriteRequest:
 
     @property
     def marks(self) -> list[str]:
-        """Comments of a PLY file."""
-        return ply.marks_of(self.antialias, z_up=np.array_equal(self.scene.file_from_world, np.eye(4)))
+        """Comments of a PLY file on what differs from the usual one: drawing, and the axes of this program."""
+        z_up = np.array_equal(self.scene.file_from_world, np.eye(4))
+        return ["SplatRenderMode: mip"] * self.antialias + ["Vertical Axis: z"] * z_up
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,7 +124,7 @@ class SplatFormat:
 
     Args:
         suffixes: of its files, the usual one first. axes: of ``cloud.py``, what its readers expect. write: bytes of a
-            request, or None: written elsewhere. read: Gaussians of bytes, or None: not read.
+            request. read: Gaussians of bytes, or None: not read.
         carries: of ``motion``, ``deformation``, ``classes``, ``sky``, ``harmonics``, ``antialias``.
     """
 
@@ -133,56 +135,47 @@ class SplatFormat:
     carries: frozenset[str]
 
 
-def _format(
-    suffixes: str,
-    letters: str,
-    carries: str,
-    write: Callable[[WriteRequest], bytes],
-    read: Callable[[bytes, str], SplatFile] | None = None,
-) -> SplatFormat:
-    return SplatFormat(tuple(suffixes.split()), letters, write, read, frozenset(carries.split()))
-
-
-_MOVING: Final = "harmonics motion deformation classes"
+_STILL: Final = frozenset(("harmonics", "antialias"))
+_MOVING: Final = frozenset(("harmonics", "motion", "deformation", "classes"))
 
 FORMATS: Final[Mapping[str, SplatFormat]] = {
-    "ply": _format(
-        ".ply", "RDF", "harmonics classes antialias", lambda r: ply.to_bytes(r.cloud, True, r.marks), ply.from_bytes
+    "ply": SplatFormat(
+        (".ply",), "RDF", lambda r: ply.to_bytes(r.cloud, True, r.marks), ply.from_bytes, _STILL | {"classes"}
     ),
-    "spz": _format(".spz", "RUB", "harmonics antialias", lambda r: spz.to_bytes(r.cloud, r.antialias), spz.from_bytes),
-    "glb": _format(
-        ".glb", "FUR", "harmonics motion antialias", lambda r: gltf.to_bytes(r.scene, r.time_s), gltf.from_bytes
+    "spz": SplatFormat((".spz",), "RUB", lambda r: spz.to_bytes(r.cloud, r.antialias), spz.from_bytes, _STILL),
+    "glb": SplatFormat(
+        (".glb",), "FUR", lambda r: gltf.to_bytes(r.scene, r.time_s), gltf.from_bytes, _STILL | {"motion"}
     ),
-    "usda": _format(".usda .usd", axes.WORLD, _MOVING, lambda r: usd.to_text(r.scene, r.time_s, log=r.log)),
-    "usdz": _format(".usdz", axes.WORLD, f"{_MOVING} sky", lambda r: usd.to_package(r.scene, r.time_s, r.log)),
-    "alpasim": _format(
-        ".usdz", axes.WORLD, f"{_MOVING} sky", lambda r: usd.to_alpasim(r.scene, r.log, r.ground, r.road)
+    "usda": SplatFormat(
+        (".usda", ".usd"), axes.WORLD, lambda r: usd.to_text(r.scene, r.time_s, log=r.log), None, _MOVING
     ),
-    "compressed-ply": _format(
-        ".compressed.ply .ply",
+    "usdz": SplatFormat(
+        (".usdz",), axes.WORLD, lambda r: usd.to_package(r.scene, r.time_s, r.log), None, _MOVING | {"sky"}
+    ),
+    "alpasim": SplatFormat(
+        (".usdz",), axes.WORLD, lambda r: to_alpasim(r.scene, r.log, r.ground, r.road), None, _MOVING | {"sky"}
+    ),
+    "compressed-ply": SplatFormat(
+        (".compressed.ply", ".ply"),
         "RDF",
-        "harmonics antialias",
         lambda r: ply.compressed_to_bytes(r.cloud, r.marks),
         ply.compressed_from_bytes,
+        _STILL,
     ),
-    "sog": _format(".sog", "RDF", "harmonics antialias", lambda r: sog.to_bytes(r.cloud, r.antialias), sog.from_bytes),
-    "splat": _format(".splat", "RDF", "", lambda r: splat_bytes(r.cloud), splat_from_bytes),
+    "sog": SplatFormat((".sog",), "RDF", lambda r: sog.to_bytes(r.cloud, r.antialias), sog.from_bytes, _STILL),
+    "splat": SplatFormat((".splat",), "RDF", lambda r: splat_bytes(r.cloud), splat_from_bytes, frozenset()),
 }
 
 
+_READERS: Final = {name: one.read for name, one in FORMATS.items() if one.read}
 COARSE_M: Final = 1e-3
 """Steps between places beyond this are worth a word."""
-_OF_TRAINING: Final = "export PLY from the program that trained the Gaussians"
 _UNREAD: Final[Mapping[str, str]] = {
-    ".ksplat": "convert it, for example with splat-transform in.ksplat out.ply",
-    ".lcc": "convert it, for example with splat-transform",
     ".json": "give the .sog file that holds meta.json and its pictures (splat-transform meta.json out.sog)",
     ".gltf": "pack it with its buffers into a .glb file",
+    **dict.fromkeys((".ksplat", ".lcc"), "convert it, for example with splat-transform in.ksplat out.ply"),
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "export it again as ply, spz or glb"),
-    ".ckpt": _OF_TRAINING,
-    ".pt": _OF_TRAINING,
-    ".pth": _OF_TRAINING,
-    ".npz": _OF_TRAINING,
+    **dict.fromkeys((".ckpt", ".pt", ".pth", ".npz"), "export PLY from the program that trained the Gaussians"),
 }
 """What to do with files of Gaussians, or that come with them, that are not read."""
 
@@ -200,13 +193,11 @@ def format_of(content: bytes, name: str) -> str:
     if content[:3] == b"ply":
         return "compressed-ply" if ply.is_compressed(content) else "ply"
     for mark, found in ((b"\x1f\x8b", "spz"), (b"NGSP", "spz"), (b"glTF", "glb"), (b"PK\x03\x04", "sog")):
-        if content.startswith(mark):
-            if suffix == ".usdz":
-                break
+        if content.startswith(mark) and suffix != ".usdz":
             return found
     if suffix == ".splat":
         return "splat"
-    known = ", ".join(sorted({suffix for format_ in FORMATS.values() if format_.read for suffix in format_.suffixes}))
+    known = ", ".join(sorted({suffix for one in _READERS for suffix in FORMATS[one].suffixes}))
     what, got = "this is no file of Gaussians that can be read", f"it begins with {content[:8]!r}"
     raise InputError(what, where=name, expected=known, got=got, remedy=_UNREAD.get(suffix, ""))
 
@@ -225,11 +216,8 @@ def read_cloud(content: bytes, name: str, choice: str = "file") -> tuple[SplatCl
         InputError: another or a damaged file. ResourceError: a package that this file needs is not installed.
     """
     found = format_of(content, name)
-    read = FORMATS[found].read
-    if read is None:  # no mark leads here
-        raise InputError("files of this format are not read", where=name, got=found)
     with np.errstate(over="ignore", invalid="ignore"):  # readers check what comes of numbers that overflow or are none
-        file = read(content, name)
+        file = _READERS[found](content, name)
         doubts = doubtful_values(file.cloud, name)
     usual = {"viewer": FORMATS[found].axes, "world": axes.WORLD, "file": file.axes or FORMATS[found].axes}
     chosen = usual.get(choice, choice)

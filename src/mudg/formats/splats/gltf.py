@@ -9,15 +9,17 @@ from __future__ import annotations
 import json
 import re
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from mudg.base import geometry, store
 from mudg.base.errors import InputError
+from mudg.base.records import ForeignRecord, Number, parse_record
 from mudg.core.harmonics import C0
 from mudg.formats.splats import binary
 from mudg.formats.splats.cloud import (
@@ -184,23 +186,8 @@ def rising(times: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 _KINDS: Final = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
-_WIDTHS: Final = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _READ: Final = (EXTENSION, "KHR_mesh_quantization", "KHR_node_visibility", "KHR_materials_unlit")
 """Extensions without which a file can be read, or that are read."""
-_LINEAR: Final = {"srgb_rec709_display": False, "lin_rec709_display": True, "BT.709-sRGB": False, "BT.709-linear": True}
-"""Colour spaces and whether they are linear; the last two are names of the drafts."""
-_KIND: Final = ("kernel", "colorSpace", "projection", "sortingMethod", "extensions", "extras")
-_STANDARD: Final[Mapping[str, frozenset[str]]] = {
-    owner: frozenset(f"{fields} extensions extras".split())
-    for owner, fields in {
-        "": "accessors animations asset buffers bufferViews cameras extensionsRequired extensionsUsed images materials "
-        "meshes nodes samplers scene scenes skins textures",
-        "nodes.": "camera children matrix mesh name rotation scale skin translation weights",
-        "primitives.": "attributes indices material mode targets",
-        "accessors.": "bufferView byteOffset componentType count max min name normalized sparse type",
-    }.items()
-}
-"""Objects of glTF 2.0 -> their fields, read or not; ``extras`` belong to users."""
 _ATTRIBUTE: Final = re.compile(
     r"POSITION|NORMAL|TANGENT|(TEXCOORD|COLOR|JOINTS|WEIGHTS)_\d+|" + re.escape(PREFIX) + r".*", re.DOTALL
 )
@@ -209,6 +196,95 @@ _MOST_JSON: Final = 64 << 20
 _DEPTH: Final = 32
 
 Array = NDArray[np.float64]
+Size = Annotated[int, Field(ge=0, lt=1 << 40)]
+Three = Annotated[list[Number], Field(min_length=3, max_length=3)]
+Four = Annotated[list[Number], Field(min_length=4, max_length=4)]
+Sixteen = Annotated[list[Number], Field(min_length=16, max_length=16)]
+
+
+class _Part(ForeignRecord):
+    """An object of glTF 2.0: what is read has a type, further fields of the standard are ``Any``."""
+
+    extensions: dict[str, Any] = {}
+    extras: Any = None
+    name: Any = None
+
+
+class _Node(_Part):
+    children: list[Size] = []
+    mesh: Size | None = None
+    matrix: Sixteen | None = None
+    rotation: Four = [0.0, 0.0, 0.0, 1.0]
+    translation: Three = [0.0, 0.0, 0.0]
+    scale: Three = [1.0, 1.0, 1.0]
+    camera: Any = None
+    skin: Any = None
+    weights: Any = None
+
+
+class _Primitive(_Part):
+    attributes: dict[str, Size]
+    indices: Any = None
+    material: Any = None
+    mode: Any = None
+    targets: Any = None
+
+
+class _Mesh(_Part):
+    primitives: list[_Primitive] = []
+
+
+class _Accessor(_Part):
+    bufferView: Size
+    byteOffset: Size = 0
+    componentType: Literal[5120, 5121, 5122, 5123, 5126]
+    count: Size
+    type: str
+    normalized: bool = False
+    max: Any = None
+    min: Any = None
+
+
+class _View(_Part):
+    buffer: Literal[0] = 0
+    byteOffset: Size = 0
+    byteLength: Size
+    byteStride: Size = 0
+
+
+class _GltfScene(_Part):
+    nodes: list[Size] = []
+
+
+class _Document(_Part):
+    asset: dict[str, Any] = {}
+    extensionsUsed: list[str] = []
+    extensionsRequired: list[str] = []
+    scene: Size = 0
+    scenes: list[_GltfScene] = []
+    nodes: list[_Node] = []
+    meshes: list[_Mesh] = []
+    accessors: list[_Accessor] = []
+    bufferViews: list[_View] = []
+    buffers: list[dict[str, Any]] = []
+    animations: list[Any] = []
+    cameras: Any = None
+    images: Any = None
+    materials: Any = None
+    samplers: Any = None
+    skins: Any = None
+    textures: Any = None
+
+
+class _Splatting(ForeignRecord):
+    """The extension; the last two colour spaces are names of its drafts."""
+
+    kernel: Literal["ellipse"] = "ellipse"
+    colorSpace: Literal["srgb_rec709_display", "lin_rec709_display", "BT.709-sRGB", "BT.709-linear"] | None = None
+    projection: Any = None
+    sortingMethod: Any = None
+    extensions: dict[str, Any] = {}
+    extras: Any = None
 
 
 def from_bytes(content: bytes, where: str) -> SplatFile:
@@ -218,27 +294,29 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     file = _GlbFile(content, where)
     clouds, triangles = [], 0
     for matrix, mesh in file.placed():
-        for primitive in file.entries(mesh, "primitives"):
-            extensions = primitive.get("extensions")
-            if isinstance(extensions, dict) and EXTENSION in extensions:
-                clouds.append(_moved(file.cloud(primitive, extensions[EXTENSION]), matrix, where))
+        for primitive in mesh.primitives:
+            if EXTENSION in primitive.extensions:
+                clouds.append(_moved(file.cloud(primitive), matrix, where))
             else:
                 triangles += 1
     if not clouds:
         what, expected = "the GLB file holds no Gaussians", f"meshes with {EXTENSION}"
         raise InputError(what, where=where, expected=expected, remedy="triangles and points cannot be imported")
     if triangles:
-        file.warn(f"{triangles} meshes without Gaussians were passed over")
-    if file.entries(file.document, "animations"):
-        file.warn("its animations are not read: everything is where the nodes put it at rest")
-    notes: tuple[str, ...] = ()
-    if file.passed:
-        notes = (sentence(sorted(file.passed), "the document"),)
+        file.warnings.append(f"{triangles} meshes without Gaussians were passed over")
+    if file.document.animations:
+        file.warnings.append("its animations are not read: everything is where the nodes put it at rest")
+    notes = (sentence(sorted(file.passed), "the document"),) if file.passed else ()
     axes = "RDF" if file.of_old_transform(2) else ""
     if axes:
-        file.warn(f"{file.generator} wrote {in_words(axes)}, where glTF has y up: read so; --axes viewer reads as glTF")
-    cloud = replace(joined(clouds), antialias=file.antialias)
-    return SplatFile(cloud, axes, f"its program {file.generator}", file.step_m, notes, tuple(file.warnings))
+        reads = f"{file.generator} wrote {in_words(axes)}, where glTF has y up: read so"
+        file.warnings.append(f"{reads}; --axes viewer reads as glTF")
+    extras = file.document.asset.get("extras")
+    drawing = extras.get("drawing") if isinstance(extras, dict) else None
+    antialias = isinstance(drawing, dict) and drawing.get("antialias") is True
+    cloud = replace(joined(clouds), antialias=antialias)
+    by, warnings = f"its program {file.generator}", tuple(dict.fromkeys(file.warnings))
+    return SplatFile(cloud, axes, by, file.step_m, notes, warnings)
 
 
 def _moved(cloud: SplatCloud, matrix: Array, where: str) -> SplatCloud:
@@ -259,11 +337,14 @@ def _moved(cloud: SplatCloud, matrix: Array, where: str) -> SplatCloud:
     return cloud.moved(rigid)
 
 
+Entry = TypeVar("Entry")
+
+
 class _GlbFile:
     """The JSON document and the binary chunk, every index checked before it is used."""
 
     def __init__(self, content: bytes, where: str) -> None:
-        self.where = where
+        self.where, self.total, self.step_m = where, 0, 0.0
         magic, version, size = binary.unpacked("<III", content, 0, "the header", where)
         if magic != MAGIC:
             raise InputError("not a GLB file", where=where, expected="the first bytes glTF", got=repr(content[:4]))
@@ -277,172 +358,90 @@ class _GlbFile:
             what = "the first chunk of a GLB file is its JSON document"
             raise InputError(what, where=where, got=f"{length} bytes of {kind:#x}")
         text = bytes(binary.part(content, 20, length, "the JSON chunk", where))
-        document = store.parse_json(text.decode("utf-8", "replace"), f"{where}: JSON")
-        if not isinstance(document, dict):
-            raise InputError("the document of a GLB file is an object", where=f"{where}: JSON")
-        self.document: dict[str, Any] = document
-        self.binary = memoryview(b"")
-        self.total, self.step_m = 0, 0.0
-        self.passed: set[str] = set()
-        self.warnings = dict[str, None]()  # each once, in order
-        asset = document.get("asset")
-        asset = asset if isinstance(asset, dict) else {}
-        self.generator = "".join(c for c in str(asset.get("generator", ""))[:60] if c.isprintable())
-        extras = asset.get("extras")
-        drawing = extras.get("drawing") if isinstance(extras, dict) else None
-        self.antialias = isinstance(drawing, dict) and drawing.get("antialias") is True
-        self._note("", document)
-        self._check_extensions()
-        place = 20 + length
+        value = store.parse_json(text.decode("utf-8", "replace"), f"{where}: JSON")
+        self.document = parse_record(_Document, value, f"{where}: JSON: ")
+        self.binary, place = memoryview(b""), 20 + length
         if place < len(content):
             length, kind = binary.unpacked("<II", content, place, "the second chunk", where)
             if kind == BIN_CHUNK:
                 self.binary = binary.part(content, place + 8, length, "the binary chunk", where)
-
-    def warn(self, sentence: str) -> None:
-        """Say something of the file once."""
-        self.warnings[sentence] = None
-
-    def _note(self, within: str, owner: dict[str, Any]) -> None:
-        """Note the fields of an object of the document that glTF does not have."""
-        self.passed.update(f"{within}{name}" for name in owner if name not in _STANDARD[within])
-
-    def _check_extensions(self) -> None:
-        """Refuse a file that cannot be read without extensions that are not known here; list those that it can be read
-        without."""
-        for name in ("extensionsRequired", "extensionsUsed"):
-            stated = self.document.get(name, [])
-            if not isinstance(stated, list) or any(not isinstance(one, str) for one in stated):
-                raise InputError(f"{name} is no list of names", where=f"{self.where}: JSON", got=repr(stated)[:60])
-            unknown = [one for one in stated if one not in _READ]
-            if unknown and name == "extensionsRequired":
-                what, where = "the GLB file needs an extension that is not read", f"{self.where}: JSON"
-                remedy = "write the file without it, or as SPZ"
-                raise InputError(what, where=where, got=listed(unknown), expected=", ".join(_READ), remedy=remedy)
-            self.passed.update(unknown)
+        unknown = [name for name in self.document.extensionsRequired if name not in _READ]
+        if unknown:
+            what, expected = "the GLB file needs an extension that is not read", ", ".join(_READ)
+            remedy = "write the file without it, or as SPZ"
+            raise InputError(what, where=f"{where}: JSON", got=listed(unknown), expected=expected, remedy=remedy)
+        self.passed = {name for name in self.document.extensionsUsed if name not in _READ}
+        self.passed.update(self.document.model_extra or ())
+        for kind in ("nodes", "accessors"):
+            for record in getattr(self.document, kind):
+                self.passed.update(f"{kind}.{name}" for name in record.model_extra)
+        self.warnings = list[str]()
+        generator = str(self.document.asset.get("generator", ""))[:60]
+        self.generator = "".join(letter for letter in generator if letter.isprintable())
 
     def of_old_transform(self, before: int) -> bool:
         """Whether splat-transform of a major version below this one wrote the file."""
         match = re.match(r"splat-transform v?(\d{1,4})\.", self.generator)
         return match is not None and int(match[1]) < before
 
-    def entries(self, owner: dict[str, Any], name: str) -> list[dict[str, Any]]:
-        """A list of objects in the document; empty if it is not there."""
-        found = owner.get(name, [])
-        if not isinstance(found, list) or any(not isinstance(entry, dict) for entry in found):
-            raise InputError(f"{name} is no list of objects", where=f"{self.where}: JSON")
-        return found
-
-    def entry(self, name: str, index: Any) -> dict[str, Any]:
+    def entry(self, name: str, entries: Sequence[Entry], index: int) -> Entry:
         """The object that an index names."""
-        found = self.entries(self.document, name)
-        if type(index) is not int or not 0 <= index < len(found):
-            what = f"an index names nothing in {name}"
-            raise InputError(what, where=f"{self.where}: JSON", expected=f"0 to {len(found) - 1}", got=repr(index)[:40])
-        return found[index]
+        if index >= len(entries):
+            what, expected = f"an index names nothing in {name}", f"below {len(entries)}"
+            raise InputError(what, where=f"{self.where}: JSON", expected=expected, got=str(index))
+        return entries[index]
 
-    def number(self, owner: dict[str, Any], name: str, default: int) -> int:
-        """A whole number that is not negative."""
-        value = owner.get(name, default)
-        if type(value) is not int or not 0 <= value < 1 << 40:
-            raise InputError(f"{name} is no size", where=f"{self.where}: JSON", got=repr(value)[:40])
-        return value
-
-    def vector(self, owner: dict[str, Any], name: str, default: tuple[float, ...]) -> Array:
-        """A list of finite numbers."""
-        value = owner.get(name, default)
-        if (
-            not isinstance(value, list | tuple)
-            or len(value) != len(default)
-            or any(type(v) not in (int, float) for v in value)
-        ):
-            what = f"{name} is no list of {len(default)} numbers"
-            raise InputError(what, where=f"{self.where}: JSON", got=repr(value)[:60])
-        try:
-            made = np.array(value, np.float64)
-        except OverflowError as error:
-            raise InputError(f"{name} holds a number that is too large", where=f"{self.where}: JSON") from error
-        if not np.isfinite(made).all():
-            raise InputError(f"{name} holds a number that is not finite", where=f"{self.where}: JSON")
-        return made
-
-    # -- nodes -------------------------------------------------------------------------------------
-
-    def placed(self) -> Iterator[tuple[Array, dict[str, Any]]]:
+    def placed(self) -> Iterator[tuple[Array, _Mesh]]:
         """Matrix and mesh of every node of the scene."""
-        scene = self.entry("scenes", self.document.get("scene", 0))
-        waiting = [(np.eye(4), index, 0) for index in self._indices(scene, "nodes")]
+        scene = self.entry("scenes", self.document.scenes, self.document.scene)
+        waiting = [(np.eye(4), index, 0) for index in scene.nodes]
         seen: set[int] = set()
         while waiting:
             matrix, index, depth = waiting.pop(0)
-            node = self.entry("nodes", index)
+            node = self.entry("nodes", self.document.nodes, index)
             if index in seen or depth > _DEPTH:
                 what = "the nodes of the GLB file are no tree"
                 raise InputError(what, where=f"{self.where}: JSON", got=f"node {index} twice")
             seen.add(index)
-            self._note("nodes.", node)
-            matrix = matrix @ self._matrix(node)
-            extensions = node.get("extensions")
-            extensions = extensions if isinstance(extensions, dict) else {}
-            visible = extensions.get("KHR_node_visibility")
+            if node.matrix is not None:
+                own = np.array(node.matrix, np.float64).reshape(4, 4).T
+            else:
+                turn = unit(np.array([node.rotation])[:, [3, 0, 1, 2]], f"{self.where}: JSON")[0]
+                scale = np.array(node.scale, np.float64)
+                scale = np.ones(3) if (scale < 1e-5).all() else scale  # a node that an animation hides
+                own = geometry.from_rotation_translation(
+                    geometry.matrix_from_quaternion(turn), np.array(node.translation, np.float64)
+                )
+                own[:3, :3] *= scale
+            matrix = matrix @ own
+            visible = node.extensions.get("KHR_node_visibility")
             if isinstance(visible, dict) and visible.get("visible") is False:
-                self.warn("nodes that the file hides were left out")
+                self.warnings.append("nodes that the file hides were left out")
                 continue
-            if "EXT_mesh_gpu_instancing" in extensions:
-                self.warn("instances (EXT_mesh_gpu_instancing) are not read: their mesh is there once")
-            if "mesh" in node:
-                yield matrix, self.entry("meshes", node["mesh"])
-            waiting += [(matrix, child, depth + 1) for child in self._indices(node, "children")]
+            if "EXT_mesh_gpu_instancing" in node.extensions:
+                self.warnings.append("instances (EXT_mesh_gpu_instancing) are not read: their mesh is there once")
+            if node.mesh is not None:
+                yield matrix, self.entry("meshes", self.document.meshes, node.mesh)
+            waiting += [(matrix, child, depth + 1) for child in node.children]
 
-    def _indices(self, owner: dict[str, Any], name: str) -> list[int]:
-        found = owner.get(name, [])
-        if not isinstance(found, list) or any(type(index) is not int for index in found):
-            raise InputError(f"{name} is no list of indices", where=f"{self.where}: JSON", got=repr(found)[:60])
-        return found
-
-    def _matrix(self, node: dict[str, Any]) -> Array:
-        if "matrix" in node:
-            return self.vector(node, "matrix", tuple(np.eye(4).reshape(-1))).reshape(4, 4).T
-        quat = unit(self.vector(node, "rotation", (0.0, 0.0, 0.0, 1.0))[None, [3, 0, 1, 2]], f"{self.where}: JSON")[0]
-        matrix = geometry.from_rotation_translation(
-            geometry.matrix_from_quaternion(quat), self.vector(node, "translation", (0.0,) * 3)
-        )
-        scale = self.vector(node, "scale", (1.0, 1.0, 1.0))
-        if (scale < 1e-5).all():  # a node that an animation hides
-            scale = np.ones(3)
-        matrix[:3, :3] *= scale
-        return matrix
-
-    # -- accessors ---------------------------------------------------------------------------------
-
-    def cloud(self, primitive: dict[str, Any], kind: Any) -> SplatCloud:
+    def cloud(self, primitive: _Primitive) -> SplatCloud:
         """The Gaussians of a primitive, in the frame of its node."""
-        attributes = primitive.get("attributes")
-        if not isinstance(attributes, dict) or not isinstance(kind, dict):
-            raise InputError("a primitive has no attributes", where=f"{self.where}: JSON")
-        if kind.get("kernel", "ellipse") != "ellipse":
-            what = "only ellipsoids are read"
-            raise InputError(what, where=f"{self.where}: {EXTENSION}", got=repr(kind.get("kernel"))[:40])
-        space = kind.get("colorSpace")
-        if space is None:
-            self.warn("it names no colorSpace, which the standard requires: read as sRGB")
-        elif not isinstance(space, str) or space not in _LINEAR:
-            what, where = "the colour space of the Gaussians is not known", f"{self.where}: {EXTENSION}: colorSpace"
-            remedy = "convert the colours to sRGB"
-            raise InputError(what, where=where, expected=", ".join(_LINEAR), got=repr(space)[:60], remedy=remedy)
-        self._note("primitives.", primitive)
-        self.passed.update(f"attributes.{name}" for name in attributes if not _ATTRIBUTE.fullmatch(name))
-        inner = kind.get("extensions")
-        compressed = [name for name in inner if "compression" in name] if isinstance(inner, dict) else []
+        attributes, where = primitive.attributes, f"{self.where}: {EXTENSION}"
+        kind = parse_record(_Splatting, primitive.extensions[EXTENSION], f"{where}: ")
+        compressed = [name for name in kind.extensions if "compression" in name]
         if compressed:
-            what, where = "the Gaussians of the GLB file are compressed", f"{self.where}: {EXTENSION}"
-            got, expected = listed(compressed), "attributes without compression"
-            raise InputError(what, where=where, got=got, expected=expected, remedy="write it without, or as SPZ")
-        self.passed.update(f"{EXTENSION}.{name}" for name in kind if name not in _KIND)
-        self.passed.update(f"{EXTENSION}.extensions.{name}" for name in (inner if isinstance(inner, dict) else ()))
+            what, got = "the Gaussians of the GLB file are compressed", listed(compressed)
+            expected, remedy = "attributes without compression", "write it without, or as SPZ"
+            raise InputError(what, where=where, got=got, expected=expected, remedy=remedy)
+        self.passed.update(f"primitives.{name}" for name in primitive.model_extra or ())
+        self.passed.update(f"attributes.{name}" for name in attributes if not _ATTRIBUTE.fullmatch(name))
+        self.passed.update(f"{EXTENSION}.{name}" for name in kind.model_extra or ())
+        self.passed.update(f"{EXTENSION}.extensions.{name}" for name in kind.extensions)
+        if kind.colorSpace is None:
+            self.warnings.append("it names no colorSpace, which the standard requires: read as sRGB")
         for name, usual in (("projection", "perspective"), ("sortingMethod", "cameraDistance")):
-            if kind.get(name, usual) != usual:
-                self.warn(f"{name} {kind[name]!r:.40} is not drawn: {usual} instead")
+            if (stated := getattr(kind, name) or usual) != usual:
+                self.warnings.append(f"{name} {stated!r:.40} is not drawn: {usual} instead")
         means = self.values(attributes, "POSITION", 3)
         count = len(means)
         self.total += count
@@ -451,85 +450,76 @@ class _GlbFile:
             raise InputError(what, where=self.where, got=f"{self.total} Gaussians")
         rotation = self.values(attributes, PREFIX + "ROTATION", 4, count)
         if np.abs(np.linalg.norm(rotation, axis=1) - 1).max(initial=0) > 0.05:
-            self.warn("rotations are not of length 1, as the standard requires: they were brought to it")
-        scale = self.values(attributes, PREFIX + "SCALE", 3, count)
+            self.warnings.append("rotations are not of length 1, as the standard requires: they were brought to it")
         opacity = self.values(attributes, PREFIX + "OPACITY", 1, count)[:, 0]
-        if not np.isfinite(opacity).all():
-            raise InputError("the opacity of a Gaussian is not finite", where=self.where)
-        logits, logs = self._logits_and_logs(opacity, scale)
+        scale = self.values(attributes, PREFIX + "SCALE", 3, count)
+        outside = (scale < 0).any() or (np.abs(opacity - 0.5) > 0.5 + _ROUNDING).any()
+        if outside and self.of_old_transform(3):
+            words = "wrote logits and logarithms, where glTF has opacities and sizes: read so"
+            self.warnings.append(f"{self.generator} {words}")
+            logits, logs = opacity, scale
+        else:
+            logits, logs = self._logits(opacity), self._logarithms(scale)
         degrees = [d for d in range(4) if f"{PREFIX}SH_DEGREE_{d}_COEF_0" in attributes]
         if degrees != list(range(len(degrees))) or not degrees:
             what = "the harmonics of a primitive leave a degree out"
             raise InputError(what, where=f"{self.where}: JSON", got=str(degrees))
         bands = [f"{PREFIX}SH_DEGREE_{degree}_COEF_{order}" for degree in degrees for order in range(2 * degree + 1)]
         sh = np.stack([self.values(attributes, band, 3, count) for band in bands], 1)
-        if _LINEAR.get(str(space), False):
+        if kind.colorSpace in ("lin_rec709_display", "BT.709-linear"):
             sh = _of_display(sh)
-        read = tuple(f"{PREFIX}SH_DEGREE_{d}_" for d in degrees)
-        beyond = [name for name in attributes if name.startswith(f"{PREFIX}SH_DEGREE_") and not name.startswith(read)]
-        if beyond:
-            self.warn(f"harmonics beyond degree 3 were dropped: {listed(beyond)}")
+        if any(name.startswith(f"{PREFIX}SH_DEGREE_") and name not in bands for name in attributes):
+            self.warnings.append("harmonics beyond degree 3 were dropped")
         self.step_m = max(self.step_m, spacing_m(means))
         columns = [values.astype(np.float32) for values in (rotation[:, [3, 0, 1, 2]], logs, logits, sh)]
         return checked(SplatCloud(means, *columns), self.where)
 
-    def _logits_and_logs(self, opacity: Array, scale: Array) -> tuple[NDArray[np.floating], Array]:
-        """Logits f64[n] and logarithms f64[n, 3]; a program that is known for it wrote these in place of opacities and
-        sizes."""
-        raw = (scale < 0).any() or (opacity < -_ROUNDING).any() or (opacity > 1 + _ROUNDING).any()
-        if raw and self.of_old_transform(3):
-            self.warn(f"{self.generator} wrote logits and logarithms, where glTF has opacities and sizes: read so")
-            return opacity, scale
-        if (bad := (opacity < -_ROUNDING) | (opacity > 1 + _ROUNDING)).any():
+    def _logits(self, opacity: Array) -> NDArray[np.floating]:
+        bad = ~((opacity >= -_ROUNDING) & (opacity <= 1 + _ROUNDING))
+        if bad.any():
             row = int(bad.argmax())
-            what = "the opacity of a Gaussian is not between 0 and 1"
+            what, expected = "the opacity of a Gaussian is not between 0 and 1", "0 to 1"
             got = f"{opacity[row]:.4g}; {int(bad.sum())} of {len(opacity)}: they look like logits"
             remedy = "write 1 / (1 + exp(-logit)) into the file"
-            raise InputError(what, where=f"{self.where}: Gaussian {row}", expected="0 to 1", got=got, remedy=remedy)
-        if raw:
+            raise InputError(what, where=f"{self.where}: Gaussian {row}", expected=expected, got=got, remedy=remedy)
+        return logit(opacity)
+
+    def _logarithms(self, scale: Array) -> Array:
+        if (scale < 0).any():
             row = int((scale < 0).any(1).argmax())
             what, where = "the size of a Gaussian is negative", f"{self.where}: Gaussian {row}"
             got = f"{scale[row].tolist()}: they look like logarithms"
             raise InputError(what, where=where, expected="metres", got=got, remedy="write exp(scale) into the file")
         with np.errstate(divide="ignore", invalid="ignore"):
-            return logit(opacity), np.maximum(np.log(scale), LEAST_LOG)
+            return np.maximum(np.log(scale), LEAST_LOG)
 
-    def values(self, attributes: dict[str, Any], name: str, width: int, count: int | None = None) -> Array:
+    def values(self, attributes: Mapping[str, int], name: str, width: int, count: int | None = None) -> Array:
         """An attribute as f64[count, width], normalised integers as numbers."""
+        where = f"{self.where}: {name}"
         if name not in attributes:
             what = "an attribute of the Gaussians is missing"
             raise InputError(what, where=self.where, expected=name, got=", ".join(attributes)[:160])
-        accessor = self.entry("accessors", attributes[name])
-        self._note("accessors.", accessor)
-        component = accessor.get("componentType")
-        if component not in _KINDS or _WIDTHS.get(str(accessor.get("type"))) != width or "sparse" in accessor:
-            what, got = "an attribute of the Gaussians has the wrong type", f"{accessor.get('type')} of {component}"
-            raise InputError(what, where=f"{self.where}: {name}", expected=f"{width} numbers", got=got)
-        rows, dtype = self.number(accessor, "count", 0), np.dtype(_KINDS[component])
-        binary.refuse_count(rows, f"{self.where}: {name}")
+        accessor = self.entry("accessors", self.document.accessors, attributes[name])
+        if accessor.type != _SHAPES[width] or "sparse" in (accessor.model_extra or ()):
+            what, got = "an attribute of the Gaussians has the wrong type", accessor.type
+            raise InputError(what, where=where, expected=_SHAPES[width], got=got)
+        rows, dtype = accessor.count, np.dtype(_KINDS[accessor.componentType])
+        binary.refuse_count(rows, where)
         if count is not None and rows != count:
             what = "the attributes of the Gaussians differ in length"
-            raise InputError(what, where=f"{self.where}: {name}", expected=str(count), got=str(rows))
-        view = self.entry("bufferViews", accessor.get("bufferView"))
-        packed = view.get("extensions")
-        buffers = self.entries(self.document, "buffers")
-        if view.get("buffer", 0) != 0 or packed or (buffers and "uri" in buffers[0]):
+            raise InputError(what, where=where, expected=str(count), got=str(rows))
+        view = self.entry("bufferViews", self.document.bufferViews, accessor.bufferView)
+        if view.extensions or "uri" in (self.document.buffers or [{}])[0]:
             what = "an attribute of the Gaussians lies outside the file, or is compressed"
-            got = f"buffer {view.get('buffer', 0)!r:.20}, extensions {listed(packed or ())}"
-            remedy = "pack the file with its buffers, without compression"
-            raise InputError(what, where=f"{self.where}: {name}", expected="the binary chunk", got=got, remedy=remedy)
-        stride = self.number(view, "byteStride", 0) or width * dtype.itemsize
-        begins, inner = self.number(view, "byteOffset", 0), self.number(accessor, "byteOffset", 0)
+            got, remedy = f"extensions {listed(view.extensions)}", "pack the file with its buffers, without compression"
+            raise InputError(what, where=where, expected="the binary chunk", got=got, remedy=remedy)
+        stride = view.byteStride or width * dtype.itemsize
         size = (rows - 1) * stride + width * dtype.itemsize
-        if (
-            stride < width * dtype.itemsize
-            or inner + size > self.number(view, "byteLength", 0)
-            or begins + inner + size > len(self.binary)
-        ):
-            what = "an attribute reaches beyond the file's content"
-            raise InputError(what, where=f"{self.where}: {name}", got=f"{size} bytes")
-        raw = np.ndarray((rows, width), dtype, self.binary, begins + inner, (stride, dtype.itemsize)).astype(np.float64)
-        if dtype.kind == "f" or not accessor.get("normalized", False):
+        begin, end = view.byteOffset + accessor.byteOffset, accessor.byteOffset + size
+        if stride < width * dtype.itemsize or end > view.byteLength or begin + size > len(self.binary):
+            raise InputError("an attribute reaches beyond the file's content", where=where, got=f"{size} bytes")
+        raw = np.ndarray((rows, width), dtype, self.binary, begin, (stride, dtype.itemsize)).astype(np.float64)
+        if dtype.kind == "f" or not accessor.normalized:
             return raw
         return np.maximum(raw / np.iinfo(dtype).max, -1.0)
 

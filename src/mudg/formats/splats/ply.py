@@ -17,7 +17,6 @@ resolved, which belongs to size and opacity), elements and lists of others, and 
 from __future__ import annotations
 
 import re
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -32,40 +31,26 @@ from mudg.formats.splats.cloud import VERTICAL, SplatCloud, SplatFile, checked, 
 from mudg.formats.unknown_fields import listed, sentence
 
 MAX_HEADER: Final = 1 << 16
-MOST_LISTS: Final = 2_000_000
-"""Rows of lists that are walked over to reach Gaussians behind them: seconds."""
 FLAT_LOG: Final = float(np.log(1e-6))
 """Thickness of flat Gaussians, whose files state none."""
 _MODES: Final = {"mip": True, "antialiased": True, "antialias": True, "default": False, "classic": False, "2dgs": False}
-_MOTION: Final = tuple("trbf motion omega t_ time scale_t scaling_t rot_r rotation_r velocity duration".split())
-"""Beginnings of columns with which methods for moving scenes move their Gaussians."""
 _UNREAD: Final = ("nx", "ny", "nz", "red", "green", "blue", "alpha")
 _ELEMENTS: Final = (
     "face edge tristrips material camera extrinsic intrinsic image_size frame disparity color_space version".split()
 )
 """Columns and elements of others that say nothing about Gaussians (from ``extrinsic`` on: ml-sharp). PLY has no closed
 list."""
-_TYPES: Final = {
-    name: kind
-    for kind, names in {
-        "i1": "char int8",
-        "u1": "uchar uint8",
-        "i2": "short int16",
-        "u2": "ushort uint16",
-        "i4": "int int32",
-        "u4": "uint uint32",
-        "f4": "float float32",
-        "f8": "double float64",
-    }.items()
-    for name in names.split()
-}
-_LENGTHS: Final = {name for name, kind in _TYPES.items() if kind[0] != "f"}
+_MOTION: Final = tuple("trbf motion omega t_ time scale_t scaling_t rot_r rotation_r velocity duration".split())
+"""Beginnings of columns with which methods for moving scenes move their Gaussians."""
+_NAMES: Final = "char uchar short ushort int uint float double int8 uint8 int16 uint16 int32 uint32 float32 float64"
+_TYPES: Final = dict(zip(_NAMES.split(), 2 * "i1 u1 i2 u2 i4 u4 f4 f8".split(), strict=True))
+_ORDERS: Final = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 _REST: Final = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
 """Number of ``f_rest`` columns: degree."""
 
 
 def to_bytes(cloud: SplatCloud, classes: bool = False, marks: Sequence[str] = ()) -> bytes:
-    """A cloud as a PLY file; ``classes`` adds the column of our own, ``marks`` are comments (``marks_of``)."""
+    """A cloud as a PLY file; ``classes`` adds the column of our own, ``marks`` are comments."""
     with_classes = classes and cloud.class_ids is not None
     columns = [cloud.means, np.zeros_like(cloud.means), cloud.sh[:, 0], channel_major(cloud.sh)]
     columns += [cloud.logits[:, None], cloud.log_scales, cloud.quats]
@@ -115,13 +100,11 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     used = {*wanted, *_indexed("f_rest", rest), *_UNREAD, *filters, *(["class"] if ours else [])}
     passed = [name for name in names if name not in used]
     moving = [name for name in passed if name.lower().startswith(_MOTION)]
-    warnings = list(file.warnings)
-    if _REST[rest] > 3:
-        warnings.append("harmonics beyond degree 3 were dropped")
+    if rest_of := [name for name in passed if name not in moving]:
+        notes.append(sentence(rest_of, "element vertex"))
+    warnings = [*file.warnings, *(["harmonics beyond degree 3 were dropped"] if _REST[rest] > 3 else [])]
     if moving:
         warnings.append(f"columns of motion over time are not read: {listed(moving)}; the Gaussians are as they rest")
-    if len(passed) > len(moving):
-        notes.append(sentence([name for name in passed if name not in moving], "element vertex"))
     single = [axis for axis, name in enumerate("xyz") if table.dtype[name] == np.float32]
     step = spacing_m(means[:, single]) if single else 0.0
     return SplatFile(cloud, file.axes, file.axes_by, step, tuple(notes), tuple(warnings))
@@ -161,12 +144,6 @@ def _filtered(cloud: SplatCloud, filter_m: NDArray[np.float64], where: str) -> S
 # -- headers ---------------------------------------------------------------------------------------
 
 
-def marks_of(antialias: bool, z_up: bool) -> list[str]:
-    """Comments on what differs from the usual PLY of Gaussians: they are to be drawn antialiased; the axes are those of
-    this program."""
-    return ["SplatRenderMode: mip"] * antialias + ["Vertical Axis: z"] * z_up
-
-
 def header(elements: list[tuple[str, int, list[tuple[str, str]]]], comments: Sequence[str] = ()) -> bytes:
     """The header of a PLY file: elements with their number of rows and their properties (type, name)."""
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
@@ -175,19 +152,9 @@ def header(elements: list[tuple[str, int, list[tuple[str, str]]]], comments: Seq
     return ("\n".join([*lines, "end_header"]) + "\n").encode()
 
 
-@dataclass
-class _Element:
-    """An element of the header; a column of a list has the types of its length and of its entries, another one of no
-    length."""
-
-    name: str
-    count: int
-    columns: list[tuple[str, str, str]]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PlyFile:
-    """Tables of a binary PLY, and what its comments say: the rest as in ``SplatFile``."""
+    """Tables of a PLY, and what its comments say: the rest as in ``SplatFile``."""
 
     tables: dict[str, NDArray[Any]]
     antialias: bool
@@ -197,112 +164,91 @@ class PlyFile:
     warnings: tuple[str, ...]
 
 
+@dataclass
+class _Element:
+    """An element of the header: its columns (name, numpy type), and the first of its columns that is a list."""
+
+    name: str
+    count: int
+    columns: list[tuple[str, str]]
+    has_list: str = ""
+
+
 def read_elements(content: bytes, where: str, wanted: tuple[str, ...]) -> PlyFile:
-    """The wanted elements of a binary PLY as structured arrays that look into ``content``. Raises InputError: no PLY,
-    an ASCII one, a malformed header, wanted elements with lists, or content that is too short."""
+    """The wanted elements of a PLY as structured arrays; those of a binary one look into ``content``. Raises
+    InputError: no PLY, a malformed header, lists in or before wanted elements, or content that is too short."""
     elements, comments, place, order = _parsed_header(content, where)
     tables: dict[str, NDArray[Any]] = {}
     last = max((index for index, element in enumerate(elements) if element.name in wanted), default=-1)
     for element in elements[: last + 1]:
-        lists = any(length for length, _, _ in element.columns)
-        if lists and element.name in wanted:
-            name = next(name for length, _, name in element.columns if length)
-            what, where = "the Gaussians of a PLY file have lists", f"{where}: element {element.name!r}"
-            got = f"property list {name!r}"
-            raise InputError(what, where=where, got=got, remedy="write one property for each number")
-        if lists:
-            place = _after_lists(content, place, element, order, where)
-            continue
+        here = f"{where}: element {element.name!r}"
+        if element.has_list and (element.count or element.name in wanted):
+            what, got = "a PLY file has lists in its vertices, or before them", f"property list {element.has_list!r}"
+            raise InputError(what, where=here, got=got, remedy="write vertices first, one property for each number")
         try:
-            dtype = np.dtype([(name, order + kind) for _, kind, name in element.columns])
+            dtype = np.dtype([(name, (order or "<") + kind) for name, kind in element.columns])
         except ValueError as error:
             what = "two properties of a PLY element have one name"
             raise InputError(what, where=where, got=str(error)[:200]) from error
         size = element.count * dtype.itemsize
-        rows = binary.part(content, place, size, f"element {element.name!r}", where)
+        if not order:
+            lines = content[place:].split(b"\n", element.count)
+            rows = b"\n".join(lines[: element.count])
+            dtype = np.dtype([(name, "<f8") for name, _ in element.columns])
+            table = binary.text_table(rows, len(element.columns), element.count, here)
+            size = len(rows) + 1
+        else:
+            table = binary.part(content, place, size, f"element {element.name!r}", where)
         if dtype.itemsize and element.name in wanted:
-            tables[element.name] = np.frombuffer(rows, dtype)
+            tables[element.name] = np.frombuffer(table, dtype)
         place += size
-    more = [element.name for element in elements if element.name not in wanted and element.count]
-    unknown, warnings = [name for name in more if name not in _ELEMENTS], list[str]()
+    others = [one.name for one in elements if one.name not in (*wanted, *_ELEMENTS) and one.count]
+    warnings = list[str]()
     antialias = _antialias(comments, warnings)
     axes, by = _axes(comments, warnings)
-    offset = next((line for line in comments if re.search(r"(?i)\b(offset|shift|epsg|utm|georef\w*|crs)\b", line)), "")
-    colors = [name for name in more if "color" in name.lower()]
-    if colors:  # of apple/ml-sharp, for example
+    if colors := [one.name for one in elements if "color" in one.name.lower() and one.name not in wanted]:
         warnings.append(f"the colour space in element {listed(colors)} is not read: colours are taken as sRGB")
-    if offset:
-        warnings.append(
-            f"the comment {offset[:80]!r} is not used: places are as the file has them (--origin-m chooses the origin)"
-        )
-    return PlyFile(tables, antialias, axes, by, (sentence(unknown, "the header"),) if unknown else (), tuple(warnings))
+    for line in comments:
+        if re.search(r"(?i)\b(offset|shift|epsg|utm|georef\w*|crs)\b", line):
+            places = "places are as the file has them (--origin-m chooses the origin)"
+            warnings.append(f"the comment {line[:80]!r} is not used: {places}")
+    return PlyFile(tables, antialias, axes, by, (sentence(others, "the header"),) if others else (), tuple(warnings))
 
 
 def _parsed_header(content: bytes, where: str) -> tuple[list[_Element], list[str], int, str]:
-    """Elements, comments, where the rows begin, and the order of bytes."""
+    """Elements, comments, where the rows begin, and the order of bytes; empty: text."""
     if content[:3] != b"ply":
         raise InputError("not a PLY file", where=where, expected="the first line 'ply'", got=repr(content[:16]))
     end = content.find(b"end_header", 0, MAX_HEADER)
     line_end = content.find(b"\n", end, end + 16) if end >= 0 else -1
-    if end < 0 or line_end < 0:
+    if line_end < 0:
         what = "the header of the PLY file does not end"
         raise InputError(what, where=where, expected=f"end_header within {MAX_HEADER} bytes")
-    order, elements, comments = "", list[_Element](), list[str]()
+    order, elements, comments = None, list[_Element](), list[str]()
     for line in content[:end].decode("ascii", "replace").splitlines():
-        words = line.split()
-        if not words or words[0] == "ply":
-            continue
-        if words[0] in ("comment", "obj_info"):
-            comments.append(" ".join(words[1:]))
-        elif words[0] == "format" and len(words) == 3:
-            order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(words[1], "")
-            if not order:
-                what, remedy = "this kind of PLY is not read", "save it as a binary PLY"
-                raise InputError(what, where=where, expected="binary_little_endian", got=words[1][:40], remedy=remedy)
-        elif words[0] == "element" and len(words) == 3 and words[2].isdecimal() and len(words[2]) < 12:
-            elements.append(_Element(words[1], int(words[2]), []))
-        elif words[0] == "property" and len(words) == 3 and words[1] in _TYPES and elements:
-            elements[-1].columns.append(("", _TYPES[words[1]], words[2]))
-        elif (
-            words[:2] == ["property", "list"]
-            and len(words) == 5
-            and words[2] in _LENGTHS
-            and words[3] in _TYPES
-            and elements
-        ):
-            elements[-1].columns.append((_TYPES[words[2]], _TYPES[words[3]], words[4]))
-        else:
-            what = "a line in the header of the PLY file is not understood"
-            expected = "format, element NAME COUNT, property TYPE NAME, or property list TYPE TYPE NAME"
-            raise InputError(what, where=where, got=repr(line[:80]), expected=expected)
-    if not order or not elements:
+        match line.split():
+            case [] | ["ply"]:
+                pass
+            case ["comment" | "obj_info", *words]:
+                comments.append(" ".join(words))
+            case ["format", kind, _] if kind in _ORDERS:
+                order = _ORDERS[kind]
+            case ["element", name, count] if count.isdecimal() and len(count) < 12:
+                elements.append(_Element(name, int(count), []))
+            case ["property", kind, name] if kind in _TYPES and elements:
+                elements[-1].columns.append((name, _TYPES[kind]))
+            case ["property", "list", length, kind, name] if {length, kind} <= _TYPES.keys() and elements:
+                elements[-1].has_list = elements[-1].has_list or name
+            case _:
+                what = "a line in the header of the PLY file is not understood"
+                expected = f"format {' or '.join(_ORDERS)}, element NAME COUNT, property TYPE NAME, or property list"
+                raise InputError(what, where=where, got=repr(line[:80]), expected=expected)
+    if order is None or not elements:
         raise InputError("the header of the PLY file names no format or no elements", where=where)
     for element in elements:
         if element.name in ("vertex", "chunk", "sh"):
             binary.refuse_count(element.count, f"{where}: element {element.name}")
     return elements, comments, line_end + 1, order
-
-
-def _after_lists(content: bytes, place: int, element: _Element, order: str, where: str) -> int:
-    """Where the rows of an element with lists, which stand before the Gaussians, end."""
-    if element.count > MOST_LISTS:
-        what, where = "a PLY file has too many lists before its Gaussians", f"{where}: element {element.name!r}"
-        remedy = "write the vertices first"
-        raise InputError(what, where=where, expected=f"at most {MOST_LISTS}", got=str(element.count), remedy=remedy)
-    columns = []
-    for length, kind, _ in element.columns:
-        columns.append((struct.Struct(order + np.dtype(length).char) if length else None, np.dtype(kind).itemsize))
-    try:
-        for _ in range(element.count):
-            for length, size in columns:
-                entries = 1
-                if length is not None:
-                    entries = max(length.unpack_from(content, place)[0], 0)
-                    place += length.size
-                place += entries * size
-    except struct.error as error:
-        raise InputError("the file ends within a list", where=f"{where}: element {element.name!r}") from error
-    return place
 
 
 # -- comments --------------------------------------------------------------------------------------
@@ -406,8 +352,7 @@ Array = NDArray[np.float64]
 
 
 def compressed_to_bytes(cloud: SplatCloud, marks: Sequence[str] = ()) -> bytes:
-    """A cloud as a compressed PLY file; rows are brought into Morton order. ``marks``: comments, as in
-    ``marks_of``."""
+    """A cloud as a compressed PLY file; rows are brought into Morton order. ``marks``: comments."""
     cloud = cloud.take(binary.morton_order(cloud.means))
     chunks = -(-len(cloud) // CHUNK)
     of_chunk = np.arange(len(cloud)) // CHUNK
@@ -464,30 +409,33 @@ def compressed_from_bytes(content: bytes, where: str) -> SplatFile:
         expected = f"{-(-len(vertex) // CHUNK)} chunks"
         raise InputError(what, where=where, expected=expected, got=f"{len(chunk)}: {listed(names[:4])}, ...")
     of_chunk = np.arange(len(vertex)) // CHUNK
-    bounds = {name: chunk[name].astype(np.float64) for name in _BOUNDS if name in names}
-    low, high = (np.stack([bounds[name] for name in _BOUNDS[at : at + 3]], 1) for at in (0, 3))
-    means = _between(_unpack_11_10_11(words["packed_position"]), low, high, of_chunk)
-    low_size, high_size = (np.stack([bounds[name] for name in _BOUNDS[at : at + 3]], 1) for at in (6, 9))
-    scales = _between(_unpack_11_10_11(words["packed_scale"]), low_size, high_size, of_chunk)
+    tinted = all(name in names for name in _BOUNDS[12:])  # files of the first version state no bounds of colours
+    bounds = np.stack([chunk[name].astype(np.float64) for name in _BOUNDS[: 18 if tinted else 12]], 1)
+    bounds = bounds.reshape(len(chunk), -1, 2, 3)
+
+    def between(shares: Array, kind: int) -> Array:
+        """Values at shares [n, 3] of the way from the lower to the upper bounds of their chunks."""
+        low, high = bounds[:, kind, 0], bounds[:, kind, 1]
+        with np.errstate(over="ignore", invalid="ignore"):
+            return low[of_chunk] + shares * (high - low)[of_chunk]
+
+    means = between(_unpack_11_10_11(words["packed_position"]), 0)
+    scales = between(_unpack_11_10_11(words["packed_scale"]), 1)
     rgba = np.stack([words["packed_color"] >> shift & 255 for shift in (24, 16, 8, 0)], 1) / 255
-    color = rgba[:, :3]  # files of the first version state no bounds of colours
-    if all(name in names for name in _BOUNDS[12:]):
-        dark, bright = (np.stack([bounds[name] for name in _BOUNDS[at : at + 3]], 1) for at in (12, 15))
-        color = _between(color, dark, bright, of_chunk)
+    color = between(rgba[:, :3], 2) if tinted else rgba[:, :3]
     word = words["packed_rotation"]
     three = (np.stack([word >> shift & 1023 for shift in (20, 10, 0)], 1) / 1023 - 0.5) * np.sqrt(2)
     quats = binary.from_smallest_three(word >> 30, three)
     sh = np.concatenate([((color - 0.5) / C0)[:, None], _rest(file.tables.get("sh"), len(vertex), where)], 1)
     columns = [values.astype(np.float32) for values in (quats, scales, logit(rgba[:, 3]), sh)]
     cloud = checked(SplatCloud(means, *columns, antialias=file.antialias), where)
-    step = spacing_m(np.concatenate([low, high])) if chunk.dtype["min_x"].itemsize == 4 else 0.0
+    step = spacing_m(bounds[:, 0].reshape(-1, 3)) if chunk.dtype["min_x"].itemsize == 4 else 0.0
     known = {"chunk": _BOUNDS, "vertex": _PACKED, "sh": _indexed("f_rest", max(_COMPRESSED_REST))}
-    unknown = {
-        element: [n for n in table.dtype.names or () if n not in known[element]]
-        for element, table in file.tables.items()
-    }
-    notes = [sentence(names, f"element {element}") for element, names in unknown.items() if names]
-    return SplatFile(cloud, file.axes, file.axes_by, step, (*file.notes, *notes), file.warnings)
+    notes = list(file.notes)
+    for element, table in file.tables.items():
+        if unknown := [name for name in table.dtype.names or () if name not in known[element]]:
+            notes.append(sentence(unknown, f"element {element}"))
+    return SplatFile(cloud, file.axes, file.axes_by, step, tuple(notes), file.warnings)
 
 
 def _rest(table: NDArray[np.void] | None, count: int, where: str) -> Array:
@@ -519,9 +467,3 @@ def _pack_11_10_11(values: Array) -> NDArray[np.uint32]:
 
 def _unpack_11_10_11(words: NDArray[np.uint32]) -> Array:
     return np.stack([(words >> 21) / 2047, (words >> 11 & 1023) / 1023, (words & 2047) / 2047], 1)
-
-
-def _between(shares: Array, low: Array, high: Array, of_chunk: NDArray[np.intp]) -> Array:
-    """Values at shares [n, 3] of the way from the lower to the upper bounds [chunks, 3]."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return low[of_chunk] + shares * (high - low)[of_chunk]

@@ -15,6 +15,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import zipfile
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
@@ -204,13 +205,13 @@ def _webp(picture: Picture) -> bytes:
 def from_bytes(content: bytes, where: str) -> SplatFile:
     """The Gaussians of a SOG file; fields that it does not know are passed over. Raises InputError: no SOG file of
     version 2, or a damaged one."""
-    archive = binary.BoundedZip(content, where)
-    names = [name for name in archive.names if name.rpartition("/")[2] == "meta.json"]
+    archive = binary.opened_zip(content, where)
+    names = [name for name in archive.namelist() if name.rpartition("/")[2] == "meta.json"]
     if not names:
-        got = listed(archive.names) or "an empty zip"
+        got = listed(archive.namelist()) or "an empty zip"
         raise InputError("the zip is no SOG file", where=where, expected="meta.json", got=got)
     folder = names[0].removesuffix("meta.json")
-    stated = store.parse_json(archive.read(names[0], _MOST_META), f"{where}: {names[0]}")
+    stated = store.parse_json(binary.zip_member(archive, names[0], _MOST_META, where), f"{where}: {names[0]}")
     if isinstance(stated, dict) and stated.get("version") != 2:
         got, remedy = str(stated.get("version", "1 (none stated)"))[:20], "convert it, for example with splat-transform"
         raise InputError("this version of SOG is not read", where=where, expected="2", got=got, remedy=remedy)
@@ -261,7 +262,7 @@ def _harmonics(stated: SogHarmonics, pixels: _Pictures, where: str) -> Array:
 class _Pictures:
     """The pictures of one file, checked for size before they are unpacked."""
 
-    def __init__(self, archive: binary.BoundedZip, folder: str, count: int, where: str) -> None:
+    def __init__(self, archive: zipfile.ZipFile, folder: str, count: int, where: str) -> None:
         self._archive, self._folder, self._count, self._where = archive, folder, count, where
         self.lossy = False
 
@@ -272,7 +273,8 @@ class _Pictures:
     def picture(self, name: str, size: tuple[int, int] | None) -> Picture:
         """A picture u8[H, W, 4]; of a given width and least height, or with a pixel for every Gaussian and few more."""
         where = f"{self._where}: {name}"
-        content = self._archive.read(self._folder + name, 16 * max(self._count, MAX_PALETTE) + (1 << 20))
+        most = 16 * max(self._count, MAX_PALETTE) + (1 << 20)
+        content = binary.zip_member(self._archive, self._folder + name, most, self._where)
         try:
             with Image.open(io.BytesIO(content), formats=["WEBP", "PNG"]) as image:
                 width, height = image.size

@@ -15,8 +15,9 @@ harmonics (value - 128) / 128, coefficient by coefficient. Rotation of versions 
 from __future__ import annotations
 
 import struct
+import zlib
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +57,7 @@ def to_bytes(cloud: SplatCloud, antialias: bool = False) -> bytes:
     if float(np.abs(cloud.means).max(initial=0)) * (1 << bits) > (1 << 23) - 1:
         raise InputError("a Gaussian lies too far from the origin for SPZ", expected="at most 8388 km")
     head = struct.pack(HEADER, MAGIC, 3, len(cloud), cloud.degree, bits, _ANTIALIAS * antialias, 0)
-    return binary.gzip_bytes(head + b"".join(_planes(cloud, bits)))
+    return zlib.compress(head + b"".join(_planes(cloud, bits)), 9, 31)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,23 +92,37 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     if content[:2] != b"\x1f\x8b":
         what = "not an SPZ file"
         raise InputError(what, where=where, expected="a gzip file, or one that begins with NGSP", got=repr(content[:4]))
-    stream = binary.GzipStream(content, where)
-    magic, *fields, _ = struct.unpack(HEADER, stream.read(struct.calcsize(HEADER), "the header"))
+    packer, size = zlib.decompressobj(31), struct.calcsize(HEADER)
+    head_bytes = binary.inflated(packer, content, size, where)
+    magic, *fields, _ = binary.unpacked(HEADER, head_bytes, 0, "the header", where)
     if magic != MAGIC:
         raise InputError("not an SPZ file", where=where, expected="NGSP in the compressed content", got=f"{magic:#x}")
     head = _Header(*fields)
     if head.version not in (1, 2, 3):
         raise InputError("this version of SPZ is not read", where=where, expected="1 to 4", got=str(head.version))
     binary.refuse_bomb(head.count, content, where)
-    planes = [stream.read(size, f"the {name}") for name, size in zip(_PLANES, head.sizes(where))]
-    more = stream.rest(_MOST_EXTENSIONS) if head.flags & _EXTENSIONS else b""
+    sizes, extended = head.sizes(where), bool(head.flags & _EXTENSIONS)
+    body = binary.inflated(packer, packer.unconsumed_tail, sum(sizes) + _MOST_EXTENSIONS * extended, where)
+    planes, place = [], 0
+    for size, name in zip(sizes, _PLANES):
+        planes.append(bytes(binary.part(body, place, size, f"the {name}", where)))
+        place += size
     if head.flags <= _ANTIALIAS | _EXTENSIONS:  # programs with further flags may have further planes
-        stream.close()
-    return _file(planes, head, _extensions(more, where) if head.flags & _EXTENSIONS else {}, where)
+        more = binary.inflated(packer, packer.unconsumed_tail, 1, where)
+        if more or not packer.eof:
+            what = "goes on after its last value" if more else "ends before its checksum"
+            what, remedy = f"the compressed content {what}", "the header does not fit the content"
+            raise InputError(what, where=where, remedy=remedy)
+    return _file(planes, head, _extensions(body[place:], where) if extended else {}, where)
 
 
 def _from_streams(content: bytes, where: str) -> SplatFile:
     """Version 4: one zstandard frame per plane."""
+    try:
+        import zstandard
+    except ImportError as error:
+        what = "SPZ of version 4 is read with the package zstandard, which is not installed"
+        raise ResourceError(what, remedy="pip install zstandard, or write the file as version 3") from error
     _, *fields, streams, toc = binary.unpacked("<IIIBBBBI", content, 0, "the header", where)
     head = _Header(*fields)
     if head.version != 4:
@@ -118,18 +133,18 @@ def _from_streams(content: bytes, where: str) -> SplatFile:
     if streams != len(sizes) or toc < 32:
         what = "the header of the SPZ file does not fit its content"
         raise InputError(what, where=where, expected=f"{len(sizes)} streams", got=f"{streams} streams, table at {toc}")
-    table = binary.numbers(content, toc, "<u8", 2 * streams, "the table of streams", where).reshape(-1, 2)
+    table = struct.iter_unpack("<QQ", binary.part(content, toc, 16 * streams, "the table of streams", where))
     extensions = _extensions(content[32:toc], where) if head.flags & _EXTENSIONS else {}
-    package, place, planes = _zstandard(), toc + 16 * streams, list[bytes]()
-    for name, size, (packed, raw) in zip(_PLANES, sizes, table.tolist()):
+    place, planes = toc + 16 * streams, list[bytes]()
+    for name, size, (packed, raw) in zip(_PLANES, sizes, table):
         if raw != size:
             what = f"the {name} have another size than the header says"
             raise InputError(what, where=where, expected=str(size), got=str(raw))
         part = binary.part(content, place, packed, f"the {name}", where)
         try:
-            with package.ZstdDecompressor(max_window_size=1 << 27).stream_reader(bytes(part)) as reader:
+            with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(bytes(part)) as reader:
                 planes.append(reader.read(size + 1))
-        except package.ZstdError as error:
+        except zstandard.ZstdError as error:
             raise InputError("the compressed content is damaged", where=f"{where}: {name}", got=str(error)) from error
         if len(planes[-1]) != size:
             raise InputError(f"the {name} have another size than the header says", where=where, expected=str(size))
@@ -173,16 +188,6 @@ def _file(planes: list[bytes], head: _Header, extensions: dict[int, bytes], wher
     cloud = _cloud(planes, head, where)
     step = spacing_m(cloud.means, np.float16) if head.version == 1 else 2.0**-head.bits
     return SplatFile(cloud, axes, f"extension {_AXES:#010x}", step, tuple(notes), tuple(warnings))
-
-
-def _zstandard() -> Any:
-    """The optional package."""
-    try:
-        import zstandard
-    except ImportError as error:
-        what = "SPZ of version 4 is read with the package zstandard, which is not installed"
-        raise ResourceError(what, remedy="pip install zstandard, or write the file as version 3") from error
-    return zstandard
 
 
 # -- values ----------------------------------------------------------------------------------------
