@@ -129,5 +129,5 @@ class Fit(Watched):
             inputs |= self.digests(named)
         inputs |= self.digests({"lpips_weights": self.settings.virtual.lpips_weights})
         drawing_device(self.settings.device, "fit", self.settings.raster)  # refused before anything is written
-        given = fit.FitInputs(self.scene, cast("Path", self.fused), virtual, begun)
-        return partial(fit.write_fit, self.settings, given)
+        given = self.settings, self.scene, cast("Path", self.fused)
+        return partial(fit.write_fit, *given, virtual=virtual, start=begun)

@@ -91,7 +91,7 @@ GROUPS: Final = (
     ("Classes", ("miou", "accuracy")),
     ("At LiDAR points", ("lidar_abs_rel", "lidar_rmse_m", "lidar_delta1", "lidar_psnr", "agreement")),
     ("Vehicles and lanes", ("agent_iou", "lane_iou", "lane_correlation", "lane_psnr", "nta_iou", "ntl_iou")),
-    ("Steadiness", ("warp_error", "temporal_flickering", "clip_f")),
+    ("Steadiness", ("warp_error", "temporal_flickering")),
 )
 OPTIONAL: Final = frozenset({"At LiDAR points", "Vehicles and lanes", "Steadiness"})
 """Groups that are left out, and distances of them, where no method has a number."""
