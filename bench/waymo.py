@@ -23,7 +23,7 @@ import numpy as np
 from PIL import Image
 
 from mudg.base.geometry import yaw_matrix
-from mudg.formats.importers.waymo.logs import crc32c, masked_crc32c
+from mudg.formats.importers.waymo_logs import crc32c, masked_crc32c
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import write_waymo
@@ -34,7 +34,7 @@ IMPORT = """
 import sys
 from pathlib import Path
 from mudg.formats.importers.common import ImportOptions
-from mudg.formats.importers.waymo.importer import import_waymo
+from mudg.formats.importers.waymo import import_waymo
 source, out, frames, workers = sys.argv[1:]
 import_waymo(Path(source), Path(out), ImportOptions(frames=(0, int(frames)), workers=int(workers)))
 """

@@ -13,7 +13,7 @@ from pathlib import PurePath
 
 import numpy as np
 
-from mudg.formats.importers.waymo.logs import masked_crc32c
+from mudg.formats.importers.waymo_logs import masked_crc32c
 from mudg.formats.splats import binary
 
 Damage = Callable[[bytes, np.random.Generator], bytes]

@@ -8,7 +8,6 @@ import struct
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import bad_logs
 import numpy as np
@@ -21,8 +20,7 @@ from roundtrip import needs_native
 from mudg.base.errors import InputError
 from mudg.base.types import Camera
 from mudg.city import light as photos
-from mudg.formats.importers import kitti360
-from mudg.formats.importers.waymo import importer as waymo
+from mudg.formats.importers import kitti360, waymo
 from mudg.scene import labels
 from mudg.scene.read import check_image, decode_image
 from mudg.scoring.detections import read_mask
@@ -31,7 +29,7 @@ from mudg.viewer import gallery
 IMAGES: dict[str, tuple[Change, str]] = {
     # what is wrong: (how the image is changed, words of the error)
     "cut off": (lambda c: c[: len(c) // 2], "cannot be decoded"),
-    "empty": (lambda _: b"", "not a PNG or JPEG|frame lacks images"),
+    "empty": (lambda _: b"", "not a PNG or JPEG"),
     "16 bits": (bad_logs.sixteen_bits, "not 8-bit"),
     "EXIF-rotated": (bad_logs.turned, "stored rotated"),
     "declares a huge size": (bad_logs.declaring(60_000, 60_000), "too large"),
@@ -130,10 +128,7 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "texture": ("RGB", photos.surface),
     "label": ("L", lambda path: labels._decode_grey(path.read_bytes(), "here")),
     "label of KITTI-360": ("L", kitti360._grey),
-    "label of Waymo": (
-        "I;16",
-        lambda path: waymo.panoptic_ids(SimpleNamespace(divisor=1000, png=path.read_bytes()), CAMERA, "here"),
-    ),
+    "label of Waymo": ("I;16", lambda path: waymo.panoptic_ids(path.read_bytes(), CAMERA, "here")),
 }
 
 

@@ -186,7 +186,7 @@ def test_the_second_input_may_stand_after_the_scene(verb: str, flag: str, field:
     [
         ("fit scene --out x --loss.ssim-weight=-1", "--loss.ssim-weight", "-1"),
         ("learn --out x --data.width=-3", "--data.width", "-3"),
-        ("render scene --model fit --out x --harmonize.steps=-1", "--harmonize.steps", "-1"),
+        ("render scene --model fit --out x --width-px=-1", "--width-px", "-1"),
         ("ingest city x --city.n-frames=-2", "--city.n-frames", "-2"),
         ("run city --out x --fit.loss.ssim-weight nan", "--fit.loss.ssim-weight", "nan"),
         ("demo --out x --fit.densify.max-gaussians 3", "--fit.densify.max-gaussians", "3"),

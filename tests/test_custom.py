@@ -187,9 +187,7 @@ def test_traps_are_refused_in_words_by_doctor_and_ingest_alike(log: Path, tmp_pa
     assert not (tmp_path / "scene").exists()
 
 
-@pytest.mark.parametrize(
-    ("kind", "words"), [("another size", "camera's size"), ("missing", "file not found")]
-)
+@pytest.mark.parametrize(("kind", "words"), [("another size", "camera's size"), ("missing", "file not found")])
 def test_bad_images_are_named(log: Path, tmp_path: Path, kind: str, words: str) -> None:
     """What else may be wrong with an image: test_bad_images.py."""
     path = log / "images" / "front" / "000002.png"

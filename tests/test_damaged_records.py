@@ -23,8 +23,6 @@ from mudg.base import checkpoint, store
 from mudg.base.config import result_settings
 from mudg.base.types import FusedCloud, PointCloud
 from mudg.diffusion import convert
-from mudg.editing import edit
-from mudg.editing.runs import RunParts
 from mudg.gaussians.storage import StartFit
 from mudg.scene.clouds import read_fused, write_fused
 from mudg.scene.observations import read_observations
@@ -118,7 +116,6 @@ READERS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object]]] = {
     "interrupted run, replaced": (begun, lambda folder: small_run(folder, 2, overwrite=True)),
     "fit to go on with": (fitted, lambda folder: StartFit.of_folder(folder, {"scene": "1", "fused": "2"})),
     "fused clouds": (fused, read_fused),
-    "fused clouds of an edit": (fused, lambda f: edit._report_of(RunParts({}, None, f, True), read_fused(f))),
     "observations": (observed, lambda folder: read_observations(folder / "views" / "front_recorded")[0]),
     "whole run": (chain, read_chain),
     "whole run on a page": (lambda folder: run_of(folder) / "run.json", gallery.read_shown),

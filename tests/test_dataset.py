@@ -467,8 +467,6 @@ def test_layers_of_render_are_those_of_the_views_and_say_how_far_to_trust_them(
             seen = np.isfinite(depth) & np.isfinite(arrays["distance"])
             assert (arrays["distance"][seen] >= depth[seen] - 1e-3).all()
             assert 0 <= view["trust"]["determined"] <= 1
-    with pytest.raises(UsageError, match="edit script"):
-        mudg.render(scene, fit, out=tmp_path / "x", layers=("normals",), remove_tracks=("car-1",))
 
 
 def test_a_scene_in_memory_is_filmed_saved_and_exported_with_its_edits(run: tuple[Path, Path], tmp_path: Path) -> None:

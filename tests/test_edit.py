@@ -31,7 +31,7 @@ from mudg.core.table import Table
 from mudg.editing import apply as assets
 from mudg.editing import model as edited
 from mudg.editing.apply import carry_out, edited_cloud, edited_model, surface_light, take_light
-from mudg.editing.plan import Actor, Background, EditPlan, EditSources, EditWorld, collisions, plan_edits
+from mudg.editing.plan import Actor, EditPlan, EditWorld, collisions, plan_edits
 from mudg.editing.script import parse_edits, read_edits
 from mudg.gaussians.model import CERTAINTY, SceneModel, compose
 from mudg.gaussians.nodes import DeformableNode, RigidNode, SkyNode, StaticNode
@@ -217,8 +217,8 @@ def world_of(model: SceneModel) -> EditWorld:
     return EditWorld({**world.actors, track.id: other}, ego, None)
 
 
-def planned(text: str, world: EditWorld, opened=lambda source: None, background=lambda name: None) -> EditPlan:
-    return plan_edits(parse_edits(text, "edits.yaml"), world, EditSources(opened, background))
+def planned(text: str, world: EditWorld, opened=lambda source: None) -> EditPlan:
+    return plan_edits(parse_edits(text, "edits.yaml"), world, opened)
 
 
 def carried(model: SceneModel, text: str, opened=lambda source: None) -> SceneModel:
@@ -390,7 +390,7 @@ def test_the_light_of_surfaces_is_that_of_the_pixels_that_show_them() -> None:
 
 
 def test_objects_take_the_light_of_another_street() -> None:
-    """Gaussians and fused points alike, those that are put in and those that are kept; what asks to stay stays."""
+    """Gaussians and fused points alike; what asks to stay stays."""
     model, dim = toy(), toy()
     with torch.no_grad():
         dim.table["sh_dc"][dim.table.labels["node"] == 0] = (0.2 - 0.5) / SH_C0
@@ -398,37 +398,23 @@ def test_objects_take_the_light_of_another_street() -> None:
     gain = edited.light_gain(here, there)
     assert gain.max() < 0.9
     asset = edited.asset_of(model, "car-1", light_rgb=here)
-    ego = Motion.recorded([0.0, 2.0], np.stack([geometry.yaw_matrix(0.0)] * 2))
-    x, y = np.meshgrid(np.arange(-6, 40, 0.5), np.arange(-8, 8, 0.5), indexing="ij")
-    ground = np.stack([x, y, 0 * x], -1).reshape(-1, 3)
-    points = PointCloud(np.zeros((1, 3), np.float32), np.full((1, 3), 200, np.uint8), "object", None)
-    street = PointCloud(np.zeros((1, 3), np.float32), np.full((1, 3), 90, np.uint8), "world", None)
-    cloud = FusedCloud(street, {"car-1": points})
-    world = EditWorld(EditWorld.of_model(model, None).actors, ego, HeightMap.from_points(ground))
+    empty = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), "world")
     place = "id: new, asset: {file: x.safetensors}, path: [[0, 20, 3, 0]], shadow: 0"
 
-    def made(background: str, insert: str) -> tuple[SceneModel, FusedCloud]:
-        text = f"- insert: {{{place}{insert}}}\n- background: {{run: other{background}}}"
-        plan = planned(text, world, lambda source: asset, lambda name: Background(dim, ego, ground, street, there))
+    def light_of(more: str) -> list[float]:
+        plan = planned(f"- insert: {{{place}{more}}}", world_of(dim), lambda source: asset)
         plan.views = (view(),)
-        take_light(plan, model)
-        assert not [note for note in plan.notes if note["kind"] == "light not matched"]
-        return edited_model(model, plan), edited_cloud(cloud, plan)
+        take_light(plan, dim)
+        assert not plan.notes
+        made, points = edited_model(dim, plan), edited_cloud(FusedCloud(empty, {}), plan).objects["new"].rgb / 255
+        rows = made.table.labels["node"] == made.nodes.index(made.dynamic_object("new"))
+        colors = 0.5 + SH_C0 * made.table["sh_dc"].detach()[rows].double().numpy()
+        return [float(edited.linear_of(shown.clip(0)).mean()) for shown in (colors, points)]
 
-    def shown(scene: SceneModel, name: str) -> float:
-        rows = scene.table.labels["node"] == scene.nodes.index(scene.dynamic_object(name))
-        colors = 0.5 + SH_C0 * scene.table["sh_dc"].detach()[rows].double().numpy()
-        return float(edited.linear_of(colors.clip(0)).mean())
-
-    plain, cloud_plain = made(", match_light: false", ", match_light: false")
-    full, cloud_full = made("", "")
-    for name in ("car-1", "new"):
-        assert shown(full, name) / shown(plain, name) == pytest.approx(gain[0], rel=0.02)
-        before, after = (edited.linear_of(c.objects[name].rgb / 255).mean() for c in (cloud_plain, cloud_full))
-        assert after / before == pytest.approx(gain[0], rel=0.05)
-    assert cloud_plain.objects["car-1"].rgb.max() == 200 and cloud_full.static.rgb.max() == 90
-    assert shown(plain, "car-1") == pytest.approx(shown(model, "car-1"))
-    blind = planned(f"- insert: {{{place}}}", world, lambda source: asset)
+    plain, full = light_of(", match_light: false"), light_of("")
+    assert full[0] / plain[0] == pytest.approx(gain[0], rel=0.02)
+    assert full[1] / plain[1] == pytest.approx(gain[0], rel=0.05)
+    blind = planned(f"- insert: {{{place}}}", world_of(model), lambda source: asset)
     take_light(blind, model)
     assert [note["ids"] for note in blind.notes] == [["new"]]
     assert torch.allclose(blind.inserted["new"].asset.columns["sh_dc"], asset.columns["sh_dc"], atol=1e-5)
@@ -448,25 +434,6 @@ def test_a_contact_shadow_darkens_the_ground_by_its_strength() -> None:
     assert ratio[20, 20] == pytest.approx(0.4 ** (1 / 2.2), abs=0.06)
     assert ratio[0, 0] == pytest.approx(1.0, abs=0.01)
     assert ratio.max() <= 1.01
-
-
-def test_a_directed_shadow_lies_where_the_sun_casts_it() -> None:
-    """A sun at 45 degrees in the direction +y: the shadow reaches one height of the box to the right, however the box
-    is turned."""
-    length, width, height = SIZE
-    for yaw in (0.0, 0.7):
-        local = geometry.yaw_matrix(-yaw)[:3, :3] @ np.array([0.0, 1.0, 1.0]) / math.sqrt(2)
-        xy, share = edited._covered(np.array(SIZE), local)
-        world = xy @ geometry.yaw_matrix(yaw)[:2, :2].T
-        half = (width * math.cos(yaw) + length * abs(math.sin(yaw))) / 2
-        dark = world[share > 0.9]
-        assert dark[:, 1].min() == pytest.approx(-half - height, abs=0.8) and dark[:, 1].max() < half + 0.3
-        assert -half - height - 0.5 < world[:, 1].min()
-    xy, share = edited._covered(np.array(SIZE), np.array([0.0, 0.0, 1.0]))
-    still = edited._covered(np.array(SIZE), None)
-    assert abs(share.sum() - still[1].sum()) < 0.1 * still[1].sum()  # straight above: the contact shadow
-    with pytest.raises(InputError, match="elevation_deg"):
-        parse_edits("- insert: {asset: {file: a}, near: {ahead_m: 9}, sun: {azimuth_deg: 0, elevation_deg: 2}}", "e")
 
 
 def test_inserting_replacing_and_colliding() -> None:
@@ -519,7 +486,6 @@ def test_edits_on_another_device_are_the_same() -> None:
         ("- lane_change: {id: car-1, left_m: 1, start_s: 9, duration_s: 2}", "outside the path"),
         ("- stop: {id: car-1, at_s: 9}", "outside its path"),
         ("- remove: {ids: [car-1]}\n- stop: {id: car-1, at_s: 1}", "line 2: stop.id"),
-        ("- background: {run: other}", "belongs is not known"),
         ("- erase: {}", "nothing says what to erase"),
         ("- erase: {balls: [[1, 2, 3]]}", "a ball is not described"),
         ("- erase: {balls: [[1, 2, 3, 0]]}", "a ball is not described"),
@@ -553,7 +519,7 @@ def test_the_ready_scripts_fit_the_demo(repository: Path) -> None:
     world = EditWorld(actors, Motion.recorded(ego.times_s, ego.world_from_ego))
     asset = edited.asset_of(toy(), "car-1")
     for path in scripts:
-        plan = plan_edits(read_edits(path), world, EditSources(lambda source: asset, lambda name: None))
+        plan = plan_edits(read_edits(path), world, lambda source: asset)
         assert plan.removed or plan.changes
         assert not [found for found in collisions(plan) if "ego" in found["ids"]]
 
@@ -585,30 +551,6 @@ def test_the_city_is_drawn_again_with_an_object_elsewhere_or_with_another_look()
     for change in (lambda: city.rearranged({"car-999": None}), lambda: city.recast("car-999", look)):
         with pytest.raises(UsageError, match="no such object"):
             change()
-
-
-def test_another_street_lies_where_the_vehicle_drives() -> None:
-    """The same street, elsewhere, turned and 2 m lower, put back around the objects: nothing changes."""
-    model = toy()
-    away = geometry.yaw_matrix(0.5, (30.0, -7.0, -2.0))
-    ground = np.asarray(slope(0.0).heights)
-    x, y = np.meshgrid(np.arange(-6, 40, 0.5), np.arange(-8, 8, 0.5), indexing="ij")
-    xyz = np.stack([x, y, 0 * x], -1).reshape(-1, 3)
-    assert np.nanmax(np.abs(ground)) < 1e-9
-    other = assets.with_background(model, model, away).without_nodes(["car-1"])
-    ego = Motion.recorded([0.0, 2.0], np.stack([geometry.yaw_matrix(0.0)] * 2))
-    street = Background(other, replace(ego, poses=away @ ego.poses), geometry.transform_points(away, xyz))
-    world = EditWorld(EditWorld.of_model(model, None).actors, ego, HeightMap.from_points(xyz))
-    plan = planned("- background: {run: other}", world, background=lambda name: street)
-    made = edited_model(model, plan)
-    assert made.node_names() == ("car-1",)
-    assert (picture(made) - picture(model)).abs().max() < 0.02  # the sky was turned by whole texels
-    assert torch.allclose(made.table["means"], model.table["means"], atol=1e-4)
-    plan = planned("- background: {run: other, keep: [ego]}", world, background=lambda name: street)
-    alone = edited_model(model, plan)
-    assert alone.node_names() == ()
-    with pytest.raises(InputError, match="own path"):
-        planned("- background: {run: other, keep: [objects]}", world)
 
 
 def test_scripts_run_on_a_fitted_scene_alone(tmp_path: Path) -> None:

@@ -54,6 +54,3 @@ def test_the_lead_car_of_a_recorded_drive(drive: Path, tmp_path: Path, text: str
         beside = (here > 12) & (np.abs(azimuth) > 0.5)
         kept = {tuple(p) for p in after.xyz}
         assert all(tuple(p) in kept for p in before.xyz[beside][::50])  # outside of the edit beams stay bit for bit
-    became = store.read_json(out / "lidar.json")
-    assert became["cleared"] > 100 and became["on_ground"] > 0
-    assert (became["on_objects"] > 20) == text.startswith("- move")

@@ -18,7 +18,7 @@ from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
 from mudg.editing.apply import complete_asset, hidden_by
 from mudg.editing.model import SHOWN, Hidden, continued, noted, shaded_cells, with_closed_sides, without_traces
-from mudg.editing.plan import Actor, EditSources, EditWorld, plan_edits, shown_anew
+from mudg.editing.plan import Actor, EditWorld, plan_edits, shown_anew
 from mudg.editing.script import parse_edits
 from mudg.gaussians.model import CERTAINTY, SceneModel
 from mudg.gaussians.nodes import RigidNode, SkyNode, StaticNode
@@ -30,7 +30,6 @@ FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 RASTER = RasterConfig(near_m=0.2)
 LIT, SHADED, CAR = 0.55, 0.3, 0.1
 CLASSES = (ID["road"], ID["building"], ID["car"])
-NO_SOURCES = EditSources(lambda s: None, lambda n: None)
 
 
 def lead(step_m: float = 1.5) -> tuple[Actor, list[View]]:
@@ -192,10 +191,8 @@ def test_colours_continue_without_markings() -> None:
 @pytest.mark.parametrize("usual", [False, True])
 def test_a_script_says_whose_traces_go(usual: bool) -> None:
     actor, _ = lead()
-    sources = EditSources(lambda s: None, lambda n: None, close_street=usual)
-
-    def closed(text: str) -> set[str]:
-        return plan_edits(parse_edits(text, "e"), EditWorld({"a": actor, "b": actor}, ego=actor.motion), sources).closed
+    world = EditWorld({"a": actor, "b": actor}, ego=actor.motion)
+    closed = lambda text: plan_edits(parse_edits(text, "e"), world, lambda source: None, usual).closed
 
     verbs = {
         "remove": "ids: [a]",
@@ -313,9 +310,7 @@ AWAY = [View(CAMERA, geometry.yaw_matrix(0.0, (0, 2.0, 0)) @ view.world_from_cam
     [
         *(("- move: {id: car, left_m: 2}", VIEWS, True), ("- move: {id: car, yaw_deg: 10}", VIEWS, True)),
         ("- move: {id: car, along_m: 3}", VIEWS, False),
-        ("- move: {id: car, left_m: 2, close_sides: false}", VIEWS, False),
         *(("- move: {id: ego, left_m: 2}", AWAY, True), ("- move: {id: ego, left_m: 2}", VIEWS, False)),
-        ("- move: {id: ego, left_m: 2, close_sides: false}", AWAY, False),
         ("- move: {id: ego, left_m: 2}\n- remove: {ids: [car]}", AWAY, False),
         ("- remove: {ids: [car]}", AWAY, False),
     ],
@@ -323,8 +318,8 @@ AWAY = [View(CAMERA, geometry.yaw_matrix(0.0, (0, 2.0, 0)) @ view.world_from_cam
 def test_only_what_is_seen_from_another_side_is_closed(text: str, views: list[View], closed: bool) -> None:
     """Of a vehicle that moves, and of one that another path shows."""
     ego = Motion.recorded(np.array(TIMES, float), np.stack([geometry.yaw_matrix(0.0)] * len(TIMES)))
-    plan = plan_edits(parse_edits(text, "sides"), EditWorld({"car": ACTOR}, ego), NO_SOURCES)
-    assert plan.sides & shown_anew(plan, VIEWS, views) == ({"car"} if closed else set())
+    plan = plan_edits(parse_edits(text, "sides"), EditWorld({"car": ACTOR}, ego), lambda source: None)
+    assert shown_anew(plan, VIEWS, views) == ({"car"} if closed else set())
 
 
 def test_an_asset_has_all_its_sides() -> None:

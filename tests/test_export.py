@@ -23,12 +23,9 @@ from mudg.base.errors import InputError, MudgError, UsageError
 from mudg.base.types import PointCloud, View
 from mudg.baselines.bezier import BezierNode
 from mudg.baselines.pvg import VibrationNode, starting_columns
-from mudg.core.edit import HeightMap, Motion
 from mudg.core.metrics import psnr
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.editing.apply import background_of, read_asset
-from mudg.editing.plan import EditWorld, place_background
-from mudg.editing.runs import find_run
+from mudg.editing.apply import read_asset
 from mudg.exporting import export
 from mudg.exporting import export as scenes
 from mudg.exporting.settings import ExportConfig, ImportConfig
@@ -247,24 +244,6 @@ def test_a_file_becomes_a_scene(tmp_path: Path) -> None:
     assert np.array_equal(again.sh, cloud.sh) and np.array_equal(again.class_ids, cloud.class_ids)
     with pytest.raises(UsageError, match="settings of objects"):
         imported(tmp_path / "a.ply", tmp_path / "fit2", kind="scene", label="car")
-
-
-def test_a_street_of_a_file_lies_where_the_vehicle_begins(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    ground = np.column_stack([rng.uniform(100, 130, 3000), rng.uniform(-4, 4, 3000), rng.normal(7, 0.01, 3000)])
-    wall = np.column_stack([rng.uniform(100, 130, 300), rng.uniform(3, 4, 300), rng.uniform(7, 12, 300)])
-    means = np.concatenate([ground, wall]).astype(np.float32)
-    cloud = replace(toy_splats.cloud(3300), means=means, logits=np.full(3300, 3, np.float32))
-    (tmp_path / "a.ply").write_bytes(formats.ply.to_bytes(cloud))
-    imported(tmp_path / "a.ply", tmp_path / "street", kind="scene", axes="world", origin_m=(100, 0, 0))
-    found = background_of(find_run(tmp_path / "street"), "street")
-    assert abs(np.median(found.ground_xyz[:, 2]) - 7) < 0.02 and len(found.ground_xyz) > 500
-    pose = geometry.yaw_matrix(0.5, (20, 5, 1))
-    flat = np.stack(np.meshgrid(np.arange(0, 60, 0.4), np.arange(-20, 40, 0.4)), -1).reshape(-1, 2)
-    mine = HeightMap.from_points(np.column_stack([flat, np.full(len(flat), 1.0)]))
-    moves = np.stack([pose @ geometry.yaw_matrix(0.0, (x, 0, 0)) for x in (0.0, 10.0)])
-    placed = place_background(EditWorld({}, Motion.recorded([0.0, 1.0], moves), mine), found)
-    assert np.allclose(placed, geometry.yaw_matrix(0.5, (20, 5, 1 - 7)), atol=0.05)
 
 
 def test_what_cannot_be_imported_is_refused(tmp_path: Path) -> None:

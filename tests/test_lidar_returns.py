@@ -28,11 +28,9 @@ from mudg.gaussians.nodes import StaticNode
 from mudg.scene.beams import beams_of, held_out, moving_tracks, training_sweeps, with_silent
 from mudg.scene.sweep_sets import read_sweep_sets
 from mudg.scoring import sweeps as scores
-from mudg.sim.lidar import BeamTable, LidarRequest
+from mudg.sim.lidar import TABLES, BeamTable, LidarRequest, read_table, wanted_sweeps, write_sweeps
 from mudg.sim.returns import learn_returns, places_gone
 from mudg.sim.session import Instant, Session
-from mudg.sim.sweeps import wanted_sweeps, write_sweeps
-from mudg.sim.tables import TABLES, read_table
 
 CITY = CityConfig(
     seed=3,

@@ -1,4 +1,4 @@
-"""Locations: the same calls on this machine and in an object store; nothing half there, no secret shown."""
+"""Addresses in an object store: nothing half there, no secret shown."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def _empty_memory() -> Iterator[None]:
     files.store.clear()
 
 
-@pytest.fixture(params=["local", "memory"])
-def root(request: pytest.FixtureRequest, tmp_path: Path) -> Location:
-    return Location.of(tmp_path / "store" if request.param == "local" else "memory://bucket/store")
+@pytest.fixture
+def root() -> Location:
+    return Location.of("memory://bucket/store")
 
 
 class Faulty:
@@ -139,52 +139,32 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
 # ---- single files --------------------------------------------------------------------------------
 
 
-def test_files_are_saved_read_listed_and_removed(root: Location) -> None:
-    assert not root.exists() and root.names() == [] and (root / "b/one").save(b"1") and (root / "a").save(b"12")
-    assert (root / "b/one").save(b"123") and root.names() == ["a", "b"] and (root / "b").names() == ["one"]
+def test_files_are_saved_read_listed_and_removed(root: Location, tmp_path: Path) -> None:
+    assert not root.exists() and root.names() == []
+    for name, content in (("b/one", b"1"), ("a", b"12"), ("b/one", b"123")):
+        (root / name).save(content)
+    assert root.names() == ["a", "b"] and (root / "b").names() == ["one"]
     assert (root / "b" / "one").load() == b"123" and root.tree() == {"a": 2, "b/one": 3}
-    assert root.load_below(["a", "gone"]) == {"a": b"12"}
     assert root.exists() and (root / "b").exists() and (root / "a").exists()
-    (root / "b").remove()
-    (root / "b").remove()
-    (root / "a").remove()
+    for name in ("b", "b", "a"):
+        (root / name).remove()
     assert root.names() == [] and not (root / "b").exists()
-    with pytest.raises(InputError):
-        (root / "a").load()
-    if root.local is None:
-        (root / "a").save(b"1")
-        refused("whole bucket", Location.of("memory://bucket").remove, raises=UsageError)
+    refused("nothing is at", (root / "a").load)
+    (root / "a").save(b"1")
+    refused("whole bucket", Location.of("memory://bucket").remove, raises=UsageError)
+    (tmp_path / "here").write_bytes(b"here")
+    assert Location.of(tmp_path).names() == ["here"] and Location.of(tmp_path / "here").load() == b"here"
+    refused("an address", Location.of(tmp_path).push, tmp_path, raises=UsageError)
 
 
-def test_only_one_makes_a_file(root: Location) -> None:
-    claim = root / "claims" / "x.json"
-    assert claim.save(b"first", only_if_absent=True) and not claim.save(b"second", only_if_absent=True)
-    assert claim.load() == b"first" and (root / "claims").names() == ["x.json"]
-    claim.remove()
-    assert claim.save(b"third", only_if_absent=True)
-
-
-def test_a_disk_without_links_still_lets_one_make_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_makes_a_file_also_on_a_disk_without_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise OSError(95, "Operation not supported")
 
-    monkeypatch.setattr(os, "link", refuse)
-    claim = Location.of(tmp_path / "claim")
-    assert claim.save(b"first", only_if_absent=True) and not claim.save(b"second", only_if_absent=True)
-    assert claim.load() == b"first" and os.listdir(tmp_path) == ["claim"]
-
-
-def test_a_lost_answer_to_an_exclusive_write_is_no_defeat(before: Callable[..., None]) -> None:
-    """The store's package asked twice: the first try arrived, its answer did not."""
-    files = fsspec.filesystem("memory")
-
-    def lose(name: str, args: tuple[Any, ...], options: dict[str, Any]) -> None:
-        if name == "pipe_file" and not files.exists(args[0]):
-            files.pipe_file(args[0], args[1])
-
-    before(lose)
-    assert Location.of("memory://bucket/claim").save(b"mine", only_if_absent=True)
-    assert not Location.of("memory://bucket/claim").save(b"theirs", only_if_absent=True)
+    for claim in (tmp_path / "linked/claim", tmp_path / "copied/claim"):
+        assert store.create_once(claim, b"first") and not store.create_once(claim, b"second")
+        assert claim.read_bytes() == b"first" and os.listdir(claim.parent) == ["claim"]
+        monkeypatch.setattr(os, "link", refuse)
 
 
 # ---- failures ------------------------------------------------------------------------------------
@@ -222,15 +202,10 @@ def test_failures_are_told(
 
     before(fail)
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "wJalrXUtnFEMI")
-    for call in (
-        lambda at: at.load(),
-        lambda at: at.save(b"1"),
-        lambda at: at.names(),
-        lambda at: at.exists(),
-        lambda at: at.tree(),
-    ):
+    at = Location.of("memory://bucket/x")
+    for call in (at.load, lambda: at.save(b"1"), at.names, at.exists, at.tree):
         with pytest.raises(ResourceError, match=words) as caught:
-            call(Location.of("memory://bucket/x"))
+            call()
         assert caught.value.where == "memory://bucket/x" and caught.value.remedy
         assert "wJalrXUtnFEMI" not in str(caught.value)
 

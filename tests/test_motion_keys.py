@@ -76,7 +76,6 @@ def test_frames_in_a_gap_of_a_curve_are_refused_or_left_out(truth: Scene, tmp_pa
     assert "no pose for 1.30 s" in warnings(left, "ego path")
 
 
-
 def test_lost_packets_of_kitti_leave_their_frames_out(tmp_path: Path) -> None:
     folder = kitti_folders.write_raw_drive(tmp_path / "day", kitti_folders.Drive(tuple(range(16))), twisted=False)
     for number in range(3, 14):

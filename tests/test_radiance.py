@@ -254,7 +254,8 @@ def test_renders_as_observations_without_classes(world, tmp_path):
     assert seen.rgb.shape == (3, 16, 24) and torch.isfinite(seen.rgb).all()
     known = seen.depth[torch.isfinite(seen.depth)]
     assert len(known) and (known > 0).all()
-    other = render(out=tmp_path / "other", settings=RenderConfig(remove_tracks=("car",)))
+    (tmp_path / "edits.yaml").write_text("- remove: {ids: [car]}\n")
+    other = render(out=tmp_path / "other", edits=tmp_path / "edits.yaml", settings=RenderConfig())
     refused("no objects", other.run, raises=UsageError)
 
 

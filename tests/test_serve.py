@@ -22,8 +22,7 @@ from mudg.base.types import Camera, Scene
 from mudg.scene.road import Road
 from mudg.sim import CameraRequest, Instant, Pinhole, Session, wire
 from mudg.sim.drive import BicycleState, Drive
-from mudg.sim.driver import Policy
-from mudg.sim.pilots import DriverView, PlanPilot
+from mudg.sim.pilots import DriverView, PlanPilot, Policy
 from mudg.sim.server import serving
 from mudg.sim.settings import ServeConfig
 

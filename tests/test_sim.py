@@ -21,10 +21,9 @@ from mudg.core.table import Table
 from mudg.gaussians.model import CERTAINTY, SceneModel
 from mudg.gaussians.nodes import StaticNode
 from mudg.gaussians.rendering import render_view
-from mudg.sim.lidar import BeamTable, LidarReply, LidarRequest
+from mudg.sim.lidar import BeamTable, LidarReply, LidarRequest, read_table
 from mudg.sim.optics import Fisheye, FTheta, Pinhole, faces_of
 from mudg.sim.session import LAYERS, CameraRequest, Instant, Session
-from mudg.sim.tables import read_table
 
 LOOK = geometry.invert(geometry.CAM_FROM_EGO_AXES)
 PLAIN = Pinhole(64, 48, 50.0, 50.0, 32.0, 24.0)

@@ -271,6 +271,10 @@ def test_harmonics_beyond_degree_3_are_lost() -> None:
 # -- what is said of a file, what is refused --------------------------------------------------------
 
 
+def by(generator: str) -> dict[str, Any]:
+    return {"asset": {"version": "2.0", "generator": generator}}
+
+
 def axes_field(payload: bytes) -> list[tuple[int, bytes]]:
     """The extension of an SPZ file that states its axes."""
     return [(0xADBE0003, payload)]
@@ -288,13 +292,22 @@ def far_ply(offset: np.ndarray, kind: str = "double") -> bytes:
 
 FOURTH = rows(**{f"f_rest_{n}": float(n) for n in range(72)})
 LINEAR = {"opacity": [0.9, 0.2, 0.7], "scale_0": [0.1, 0.3, 0.2], "scale_1": [0.2, 0.1, 0.3]}
+HIDDEN = {"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": False}}}
 LINEAR["scale_2"] = [0.01, 0.05, 0.2]
 
 
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
+        ("a.ply", ply(rows(opacity=[0.9, 0.2, 0.7])), "logits are due"),
+        ("a.ply", ply(rows(opacity=1.0)), "logits are due"),
+        ("a.ply", ply(rows(**{name: value for name, value in LINEAR.items() if name != "opacity"})), "logarithms are"),
+        ("a.ply", ply(rows(opacity=[255.0, 40.0, 128.0])), "from 0 to 255"),
+        ("a.ply", ply(rows(f_dc_0=200.0, f_dc_1=120.0, f_dc_2=90.0)), "from 0 to 255"),
+        ("a.ply", ply(rows(trbf_center=0.5, motion_0=0.1)), "motion over time are not read: 'trbf_center', 'motion_0'"),
+        ("a.ply", ply(after=("element color_space 1\nproperty uchar color_space", b"\1")), "'color_space' is not read"),
         ("a.ply", ply(FOURTH), "beyond degree 3"),
+        ("a.ply", ply(head=["comment offset 500000 5400000 200"]), "offset 500000 5400000 200"),
         ("a.ply", far_ply(UTM, "float"), "steps of 500 mm"),
         ("a.ply", compressed_ply(600_000, 600_010), "steps of 62.5 mm"),
         ("a.splat", splat(rows(x=40_000.0)), "steps of 3.91 mm"),
@@ -306,8 +319,14 @@ LINEAR["scale_2"] = [0.01, 0.05, 0.2]
         ("a.spz", spz(3, 0, bits=8), "steps of 3.91 mm"),
         pytest.param("a.spz", spz(4), "--axes RDF", marks=zstandard),
         ("far.glb", glb(rows(x=300_000.0)), "steps of 31.2 mm"),
+        ("a.glb", glb(kind={"colorSpace": None}), "names no colorSpace"),
+        ("a.glb", glb(kind={"sortingMethod": "zDepth"}), "zDepth"),
+        ("a.glb", glb(kind={"projection": "orthographic"}), "orthographic"),
         ("a.glb", glb(document={"animations": [{"channels": [], "samplers": []}]}), "animations"),
+        ("a.glb", glb(node={"extensions": {"EXT_mesh_gpu_instancing": {}}}), "instances"),
+        ("a.glb", glb(turn_length=3.0), "length 1"),
         ("a.glb", glb(more="SH_DEGREE_4_COEF_0"), "degree 3"),
+        ("a.glb", glb(document={"nodes": [{"mesh": 0}, HIDDEN], "scenes": [{"nodes": [0, 1]}]}), "hides"),
     ],
 )
 def test_what_a_file_means_besides_is_said(
@@ -340,7 +359,11 @@ def test_what_a_file_means_besides_is_said(
         ("a.ply", ply(rows(scale_1=[0.0, 0.0, math.nan])), r"Gaussian 2[\s\S]*1 of 3[\s\S]*take them out"),
         ("a.ply", ply(rows(x=[math.inf, 0.0, 0.0])), r"Gaussian 0[\s\S]*take them out"),
         # lists
-        ("a.ply", ply(before=("element face 1\nproperty list uchar int vertex_indices", b"\0")), "write vertices first"),
+        (
+            "a.ply",
+            ply(before=("element face 1\nproperty list uchar int vertex_indices", b"\0")),
+            "write vertices first",
+        ),
         ("a.ply", ply(before=("element vertex 1\nproperty list uchar float features", b"\0")), "lists"),
         ("a.ply", ply(before=("element face 1\nproperty list uchar number a", b"")), "not understood"),
         # columns of other names
@@ -360,6 +383,7 @@ def test_what_a_file_means_besides_is_said(
         # glTF
         ("a.glb", glb(plain=False), r"opacity[\s\S]*between 0 and 1[\s\S]*logits"),
         ("a.glb", glb(rows(opacity=0.5), plain=False), r"size[\s\S]*negative[\s\S]*exp\(scale\)"),
+        ("a.glb", glb(rows(opacity=-9.0), plain=False, document=by("splat-transform 3.7.0")), "logits"),
         ("a.glb", glb(kind={"colorSpace": "ACEScg"}), r"colorSpace[\s\S]*srgb_rec709_display[\s\S]*ACEScg"),
         ("a.glb", glb(kind={"kernel": "gabor"}), r"kernel[\s\S]*ellipse"),
         (
@@ -563,3 +587,25 @@ def test_gaussians_far_out_in_a_scene_that_is_near_move_nothing(
     assert command(tmp_path, ply(table), ".ply", "--axes", "world") == 0
     means = load_model(tmp_path / "out").table["means"].detach().numpy()
     assert np.array_equal(means[:3], PLACES.astype(np.float32)) and "warning" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("generator", "plain", "axes"),
+    [
+        ("splat-transform 1.10.1", False, "RDF"),
+        ("splat-transform 2.3.1", False, "FUR"),
+        ("splat-transform 2.7.1", True, "FUR"),
+        ("splat-transform 3.7.0", True, "FUR"),
+        ("another 1.0", True, "FUR"),
+    ],
+)
+def test_a_program_that_disagrees_with_gltf_is_named_and_read_as_it_writes(
+    generator: str, plain: bool, axes: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = glb(plain=plain, document=by(generator))
+    cloud = read(content, "a.glb")
+    assert np.allclose(cloud.means, world(PLACES, axes))
+    assert np.allclose(cloud.log_scales, [[row[f"scale_{c}"] for c in range(3)] for row in ROWS], atol=1e-5)
+    assert np.allclose(cloud.logits, [row["opacity"] for row in ROWS], atol=1e-5)
+    assert (generator in capsys.readouterr().err) is not plain
+    assert np.allclose(read(content, "a.glb", "viewer").means, world(PLACES, "FUR"))  # what is asked for wins

@@ -26,15 +26,13 @@ from refusals import refused
 
 from mudg import app
 from mudg.base import location, store
-from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.errors import InputError, ResourceError
 from mudg.base.location import Location
-from mudg.fleet.records import BatchFolder
 
 pytestmark = [pytest.mark.cluster, pytest.mark.filterwarnings("ignore")]  # warnings of the servers' own packages
 
 SERVERS = dict(one.split("=", 1) for one in os.environ.get("MUDG_TEST_S3", "").split(",") if one)
 CITY = "--city.n-frames 2 --city.width 48 --city.height 32 --city.cameras front --no-contact-sheet".split()
-CONDITIONAL = {"moto": True, "rclone": False}
 
 
 @pytest.fixture(params=["moto", "rclone"])
@@ -72,20 +70,15 @@ def content(folder: Path) -> dict[str, str]:
     return {path.relative_to(folder).as_posix(): store.sha256_file(path) for path in files}
 
 
-def test_single_objects(root: Location, server: str) -> None:
+def test_single_objects(root: Location) -> None:
     assert root.names() == [] and not root.exists()
-    assert (root / "b/one").save(b"1") and (root / "b/one").save(b"12") and (root / "a").save(b"")
+    for name, content in (("b/one", b"1"), ("b/one", b"12"), ("a", b"")):
+        (root / name).save(content)
     assert (root / "b/one").load() == b"12" and (root / "a").load() == b""
     assert root.names() == ["a", "b"] and root.tree() == {"a": 0, "b/one": 2}
-    assert root.load_below(["a", "gone"]) == {"a": b""}
-    claim = root / "claim"
-    assert claim.save(b"first", only_if_absent=True)
-    if CONDITIONAL[server]:
-        assert not claim.save(b"second", only_if_absent=True) and claim.load() == b"first"
-    claim.remove()
-    claim.remove()
-    refused("nothing is at", claim.load)
-    assert root.names() == ["a", "b"]
+    (root / "a").remove()
+    (root / "a").remove()
+    refused("nothing is at", (root / "a").load)
 
 
 def test_folders_with_large_objects_and_odd_names(root: Location, tmp_path: Path) -> None:
@@ -123,9 +116,9 @@ def test_a_killed_upload_is_no_result_and_goes_on(root: Location, tmp_path: Path
     there = set((root / "run/part0").names())
     assert there
     sent: list[str] = []
-    put = Location._put
+    files, put = (root / "run")._files, (root / "run")._files.put
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Location, "_put", lambda self, frm, names: sent.extend(names) or put(self, frm, names))
+        patch.setattr(files, "put", lambda frm, to, **more: sent.extend(frm) or put(frm, to, **more))
         (root / "run").push(made)
     assert len(sent) <= 60 - len(there)
     (root / "run").fetch(tmp_path / "back")
@@ -206,110 +199,6 @@ def test_memory_does_not_grow_with_the_folder(root: Location, tmp_path: Path) ->
     assert 0 < grown < 300
 
 
-# batches ------------------------------------------------------------------------------------------
-
-STEP = """
-# step.sh SOURCE OUT NAME TALLY: copies a text, and writes a line per run
-echo run >> "$4/$3"
-sleep ${STEP_S:-0}
-[ -f "$1/log.txt" ] || { echo "error: the log holds no text" >&2; exit 3; }
-mkdir -p "$2" && cat "$1/log.txt" > "$2/result.txt"
-"""
-
-
-class BatchInAStore:
-    """Logs, list and results at an address; a step that copies; and how often each scene was begun."""
-
-    def __init__(self, root: Location, folder: Path, scenes: int) -> None:
-        self.root, self.folder, self.scenes = root, folder, scenes
-        self.out = root / "runs"
-        self.tally = folder / "tally"
-        self.tally.mkdir(parents=True)
-        (folder / "step.sh").write_text(STEP)
-        for name in self.names:
-            self.put_log(name, f"text of {name}\n")
-        (root / "list.txt").save("".join(f"logs/{name}\n" for name in self.names).encode())
-
-    @property
-    def names(self) -> list[str]:
-        return [f"s{number:02d}" for number in range(self.scenes)]
-
-    def put_log(self, name: str, text: str) -> None:
-        log = self.folder / "logs" / name
-        log.mkdir(parents=True, exist_ok=True)
-        (log / "other.txt").write_text(name)
-        if text:
-            (log / "log.txt").write_text(text)
-        (self.root / "logs" / name).push(log)
-
-    def words(self, machine: str, *more: str) -> list[str]:
-        step = ["--command", "sh", str(self.folder / "step.sh"), "{source}", "{out}", "{name}", str(self.tally)]
-        first = f"batch run --list {self.root}/list.txt --out {self.out} --quiet --jobs 1".split()
-        return [*first, "--scratch", str(self.folder / machine), *more, *step]
-
-    def start(
-        self, machine: str, *more: str, before: tuple[str, ...] = (), **environment: str
-    ) -> subprocess.Popen[bytes]:
-        words = [*before, sys.executable, "-m", "mudg", *self.words(machine, *more)]
-        return subprocess.Popen(words, env={**os.environ, **environment})
-
-    def runs(self) -> dict[str, int]:
-        return {path.name: len(path.read_text().splitlines()) for path in self.tally.iterdir()}
-
-    def results(self) -> dict[str, str]:
-        """Scene -> text of its result, of all that are on record."""
-        found = {}
-        for name in (self.out / "_batch/done").names():
-            record = json.loads((self.out / "_batch/done" / name).load())
-            assert record["scene"] not in found
-            found[record["scene"]] = (self.out / record["place"] / "result.txt").load().decode()
-        return found
-
-
-def wait_until(condition, seconds: float) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.1)
-
-
-ELSEWHERE = ("unshare", "--pid", "--fork", "--mount-proc", "--kill-child")
-"""Starts a program where process numbers mean something else, as on another machine."""
-
-
-def test_a_batch_whose_list_logs_and_results_lie_in_a_store(
-    root: Location, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    if subprocess.run([*ELSEWHERE, "true"], check=False, capture_output=True).returncode:
-        pytest.skip("no process spaces of its own for this user (unshare --pid)")
-    made = BatchInAStore(root, tmp_path, 6)
-    (made.root / "logs/s03").remove()
-    (tmp_path / "logs/s03/log.txt").unlink()
-    made.put_log("s03", "")
-    first = made.start("one", before=ELSEWHERE, STEP_S="2")
-    wait_until(lambda: sum(made.runs().values()) >= 2, 60)
-    first.kill()
-    first.wait()
-    begun = made.runs()
-    assert made.start("two").wait(120) == 2, "the other machine may still be at it"
-    assert made.start("two", "--take-over").wait(120) == 11
-    capfd.readouterr()
-    assert app.main(["batch", "status", str(made.out), "--json"]) == 0
-    record = json.loads(capfd.readouterr().out)
-    assert (record["finished"], record["left"], record["stages"]["command"]["failed"]) == (5, 0, 1)
-    assert record["reasons"][0]["reason"].endswith("the log holds no text")
-    made.put_log("s03", "text of s03\n")
-    assert app.main(["batch", "retry", str(made.out), "--reason", "3"]) == 0 and made.start("three").wait(120) == 0
-    assert made.results() == {name: f"text of {name}\n" for name in made.names}
-    once = {name for name, count in made.runs().items() if count == 1}
-    assert set(made.names) - once <= {"s03", *begun} and sum(made.runs().values()) <= made.scenes + 2
-    names = (made.out / "_batch").names()
-    assert [name for name in names if not name.startswith("list.")] == ["done", "logs", "plan.json"] and len(names) == 4
-    for machine in ("two", "three"):
-        assert not list((tmp_path / machine / "mudg_batch").iterdir())
-        assert not [path for path in (tmp_path / machine / "mudg_inputs").rglob("*") if path.suffix != ".lock"]
-
-
 class _Unreliable(http.server.BaseHTTPRequestHandler):
     """Passes requests on to a server; every seventh is answered with a failure, every eleventh answer never arrives."""
 
@@ -366,26 +255,3 @@ def unreliable(address: str) -> Iterator[tuple[str, type[_Unreliable]]]:
             yield f"http://127.0.0.1:{here.server_address[1]}", handler
         finally:
             here.shutdown()
-
-
-def test_of_six_drivers_one_works_on_a_batch(root: Location, server: str) -> None:
-    ready, driving, most = threading.Barrier(6), [0], [0]
-
-    def race(me: int) -> str:
-        ready.wait()
-        try:
-            with BatchFolder(root / "runs").owned():
-                driving[0] += 1
-                most[0] = max(most[0], driving[0])
-                time.sleep(3.0)
-                driving[0] -= 1
-                return "mine"
-        except UsageError:
-            return "refused"
-
-    # threads of one process take each other for dead; as other machines do, they must not
-    with pytest.MonkeyPatch.context() as patch, concurrent.futures.ThreadPoolExecutor(6) as pool:
-        patch.setattr("mudg.fleet.records.this_host", lambda: f"host {threading.get_ident()}")
-        answers = list(pool.map(race, range(6)))
-    if CONDITIONAL[server]:
-        assert answers.count("mine") <= 1 and most[0] <= 1

@@ -34,9 +34,8 @@ def _no_memory(_asked: object) -> tuple[bytes, str]:
 
 def site() -> Site:
     echo = lambda asked: (json.dumps(asked).encode(), "application/json")
-    film = lambda asked, send: [send(b"x" * 100_000) for _ in range(100)]
     answers = {"echo": echo, "broken": _broken, "no_memory": _no_memory}
-    return Site({"": PAGE, "small": b"small"}, answers, TOKEN, {"film": film})
+    return Site({"": PAGE, "small": b"small"}, answers, TOKEN)
 
 
 @pytest.fixture
@@ -137,7 +136,7 @@ def test_a_request_that_no_browser_sends_is_answered_or_dropped(
     assert said.count("\n") == (name == "a mistake of ours")
 
 
-@pytest.mark.parametrize("moment", ["half a request", "half a body", "loading", "a film"])
+@pytest.mark.parametrize("moment", ["half a request", "half a body", "loading"])
 def test_a_connection_that_is_reset_is_nothing_to_talk_about(
     moment: str, running: SiteServer, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -146,12 +145,11 @@ def test_a_connection_that_is_reset_is_nothing_to_talk_about(
         "half a request": b"GET / HTTP/1.1\r\nHost",
         "half a body": POST + b"Content-Length: 5\r\n\r\n1",
         "loading": b"GET / HTTP/1.1\r\n" + HOST + b"\r\n",
-        "a film": b"POST /film HTTP/1.1\r\n" + JSON_HEAD + b"Content-Length: 1\r\n\r\n1",
     }
     for _ in range(5):
         with connected(running) as connection:
             connection.sendall(requests[moment].replace(PORT, port))
-            if moment in ("loading", "a film"):
+            if moment == "loading":
                 assert connection.recv(1000)
             time.sleep(0.05)
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # a reset, not an end

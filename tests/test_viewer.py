@@ -1,4 +1,4 @@
-"""The viewer page: what is packed, what a browser draws of it, who may ask the server behind it, its exact videos."""
+"""The viewer page: what is packed, what a browser draws of it, who may ask the server behind it."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ import http.server
 import io
 import json
 import re
-import socket
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -19,7 +17,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import pytest
 import torch
@@ -27,14 +24,13 @@ from browser import Browser, BrowserError
 from PIL import Image
 from refusals import refused
 from toy_fitted import STREET, toy_fitted, write_toy_run
-from view_server import allowed, ask, begin, seen_from, serving
+from view_server import allowed, ask, seen_from, serving
 
 from mudg import FittedScene
-from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.errors import UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera
 from mudg.core.trajectory import at_shift
-from mudg.editing import apply
 from mudg.editing.script import read_edits
 from mudg.formats.paths import read_path
 from mudg.gaussians.model import SceneModel
@@ -43,7 +39,7 @@ from mudg.gaussians.storage import save_model
 from mudg.scene.read import read_scene
 from mudg.viewer import page as viewer_page
 from mudg.viewer import view
-from mudg.viewer.live import GROUND, FrameSource, VideoRequest
+from mudg.viewer.live import GROUND
 from mudg.viewer.page import BLOCK, blob_of, coverage, level_of, opacity_of, pack_scene, smallest_three
 from mudg.viewer.server import token_for
 from mudg.viewer.settings import PageConfig
@@ -572,12 +568,11 @@ def test_the_server_answers_only_to_its_own_page(served: tuple[int, str]) -> Non
     for path in ("/../fit/model.json", "/%2e%2e/model.json", "//etc/passwd", "/model.json"):
         assert ask(port, "GET", path, Cookie=f"mudg_token={token}")[0] == 404
     own = f"http://127.0.0.1:{port}"
-    for path in ("/frame", "/video"):
-        assert ask(port, "POST", path, {}, Origin=own)[0] == 403
-        assert ask(port, "POST", path, {}, X_Mudg_Token="wrong", Origin=own)[0] == 403
-        assert ask(port, "POST", path, {}, X_Mudg_Token=token)[0] == 403
-        assert ask(port, "POST", path, {}, X_Mudg_Token=token, Origin="https://evil.example")[0] == 403
-        assert ask(port, "GET", f"{path}?token={token}")[0] == 404
+    assert ask(port, "POST", "/frame", {}, Origin=own)[0] == 403
+    assert ask(port, "POST", "/frame", {}, X_Mudg_Token="wrong", Origin=own)[0] == 403
+    assert ask(port, "POST", "/frame", {}, X_Mudg_Token=token)[0] == 403
+    assert ask(port, "POST", "/frame", {}, X_Mudg_Token=token, Origin="https://evil.example")[0] == 403
+    assert ask(port, "GET", f"/frame?token={token}")[0] == 404
     status, text = ask(port, "POST", "/frame", {"layer": "color"}, X_Mudg_Token=token, Origin=own)
     assert status == 400 and b"request" in text
 
@@ -622,31 +617,7 @@ def test_fits_of_different_logs_are_not_compared(toy: Toy, tmp_path: Path) -> No
     refused("another", view.find_sources(PageConfig(), toy[1], toy[0] / "scene", tmp_path / "fit").read)
 
 
-# videos of exact frames ---------------------------------------------------------------------------
-
-
-def question(times_s: tuple[float, ...] = (0.0, 0.2, 0.4), **changes: Any) -> dict[str, Any]:
-    """A video of the front camera."""
-    views = [seen_from(STREET.view(t, 160, 96)) for t in times_s]
-    lens = {name: value for name, value in views[0].items() if name not in ("eye", "axes")}
-    moments = [{"time_s": t, "eye": one["eye"], "axes": one["axes"]} for t, one in zip(times_s, views)]
-    what = {"scene": 0, "layer": "color", "hidden": [], "edits": "", "camera": "front", "fps": 10}
-    return {**what, **lens, "moments": moments, **changes}
-
-
-def pictures(content: bytes) -> list[np.ndarray]:
-    with av.open(io.BytesIO(content)) as container:
-        assert container.streams.video[0].average_rate == 10
-        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-
-
-def split(answer: bytes) -> tuple[list[dict[str, int]], bytes]:
-    """Lines of an answer, and the file after them."""
-    lines = []
-    while not lines or "bytes" not in lines[-1]:
-        line, answer = answer.split(b"\n", 1)
-        lines.append(json.loads(line))
-    return lines, answer
+# exact frames in a browser ------------------------------------------------------------------------
 
 
 @contextmanager
@@ -658,156 +629,23 @@ def shown(port: int, address: str, folder: Path) -> Iterator[Browser]:
         assert one.errors == []
 
 
-def test_a_video_shows_what_the_rasterizer_draws(served: tuple[int, str], toy: Toy) -> None:
-    (port, token), before = served, {path.name for path in toy[0].iterdir()}
-    status, answer = ask(port, "POST", "/video", question(), **allowed(port, token))
-    assert status == 200
-    lines, content = split(answer)
-    assert lines == [{"frame": k, "frames": 3} for k in (1, 2, 3)] + [{"bytes": len(content)}]
-    for picture, t in zip(pictures(content), (0.0, 0.2, 0.4), strict=True):
-        true = render_view(toy[2], STREET.view(t, 160, 96), raster_of(toy[2])).rgb.permute(1, 2, 0).numpy()
-        assert psnr(picture, true) > 32  # of 4:2:0
-    assert {path.name for path in toy[0].iterdir()} == before
-
-
-def test_a_video_follows_edits_and_what_is_hidden(served: tuple[int, str], toy: Toy) -> None:
-    port, token = served
-    script = "- move: {id: car-1, left_m: 3}\n"
-
-    def last(**changes: Any) -> np.ndarray:
-        status, answer = ask(port, "POST", "/video", question((0.4,), layer="class", **changes), **allowed(port, token))
-        assert status == 200
-        return pictures(split(answer)[1])[-1].astype(int)
-
-    plain, moved, hidden = last(), last(edits=script), last(hidden=["car-1"])
-    assert np.abs(plain - moved).max() > 60
-    assert np.abs(plain - hidden).max() > 60
-    assert np.abs(hidden - moved).max() > 60
-
-
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"moments": []}, "moments"),
-        ({"moments": question()["moments"] * 1001}, "moments"),
-        ({"moments": [{"time_s": 0.0, "eye": [0, 0], "axes": []}]}, "eye"),
-        ({"fps": 0}, "fps"),
+        ({"eye": [0, 0]}, "eye"),
+        ({"width": 0}, "width"),
         ({"layer": "normal"}, "layer"),
-        ({"out": "/tmp/x.mp4"}, "out"),
+        ({"out": "/tmp/x.png"}, "out"),
         ({"edits": "- jump: {}\n"}, "verb"),
-        ({"width": 8192, "height": 8192, "moments": question()["moments"] * 500}, "too large"),
     ],
 )
-def test_a_wrong_question_is_told(toy: Toy, changes: dict[str, Any], told: str) -> None:
-    with serving(toy[1], toy[0] / "scene", width_px=8192) as (port, token):
-        status, text = ask(port, "POST", "/video", question(**changes), **allowed(port, token))
+def test_a_wrong_question_is_told(served: tuple[int, str], changes: dict[str, Any], told: str) -> None:
+    port, token = served
+    body = {"scene": 0, "layer": "color", "hidden": [], "time_s": 0.4, "camera": "front"}
+    body |= {**seen_from(STREET.view(0.4, 160, 96)), **changes}
+    status, text = ask(port, "POST", "/frame", body, **allowed(port, token))
     assert status == 400
     assert told in text.decode()
-
-
-def test_one_video_is_made_at_a_time(toy: Toy) -> None:
-    source = FrameSource(lambda _: [toy[2]], read_scene(toy[0] / "scene"), 1600, torch.device("cpu"))
-    begun, go_on, told = threading.Event(), threading.Event(), list[bytes]()
-
-    def slow(content: bytes) -> None:
-        told.append(content)
-        begun.set()
-        assert go_on.wait(30)
-
-    asked = VideoRequest(**question())
-    first = threading.Thread(target=source.film, args=(asked, slow))
-    first.start()
-    assert begun.wait(30)
-    refused("another video", source.film, asked, lambda _: None, raises=ResourceError)
-    go_on.set()
-    first.join(30)
-    assert len(pictures(told[-1])) == 3
-    source.film(asked, lambda _: None)  # the next one may begin
-
-
-def test_a_video_that_nobody_waits_for_is_given_up(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn, real = list[float](), apply.render_view
-
-    def noted(*given: Any, **settings: Any) -> Any:
-        drawn.append(time.monotonic())
-        time.sleep(0.02)
-        return real(*given, **settings)
-
-    monkeypatch.setattr(apply, "render_view", noted)
-    with serving(toy[1], toy[0] / "scene") as (port, token):
-        long = question(tuple(0.001 * k for k in range(700)))
-        connection, answer = begin(port, "POST", "/video", long, **allowed(port, token))
-        assert json.loads(answer.readline()) == {"frame": 1, "frames": 700}
-        answer.close()
-        assert connection.sock is None or connection.sock.shutdown(socket.SHUT_RDWR) is None
-        connection.close()
-        end = time.monotonic() + 60
-        while time.monotonic() < end:  # it is refused until the first one has noticed
-            status, text = ask(port, "POST", "/video", question(), **allowed(port, token))
-            if status == 200:
-                break
-            assert status == 503 and b"another video" in text
-            time.sleep(0.1)
-    assert len(pictures(split(text)[1])) == 3
-    assert len(drawn) < 500
-
-
-def test_a_problem_on_the_way_is_told_in_the_answer(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = apply.render_view
-
-    def breaking(model: SceneModel, view: Any, raster: Any) -> Any:
-        if view.time_s > 0.3:
-            raise InputError("this moment cannot be drawn")
-        return real(model, view, raster=raster)
-
-    monkeypatch.setattr(apply, "render_view", breaking)
-    with serving(toy[1], toy[0] / "scene") as (port, token):
-        status, answer = ask(port, "POST", "/video", question(), **allowed(port, token))
-    lines = [json.loads(line) for line in answer.splitlines()]
-    assert status == 200
-    assert [set(line) for line in lines] == [{"frame", "frames"}, {"frame", "frames"}, {"problem"}]
-    assert "cannot be drawn" in lines[-1]["problem"]
-
-
-KEEP = """window.saved = []; const real = URL.createObjectURL;
-URL.createObjectURL = (blob) => { if (blob.type === 'video/mp4') window.saved.push(blob); return real(blob); }; 1"""
-SAVED = """saved[0].arrayBuffer().then((b) => { let text = '';
-  for (const v of new Uint8Array(b)) text += String.fromCharCode(v); return btoa(text); })"""
-CLICK = "document.getElementById('mp4').click()"
-
-
-@pytest.mark.slow
-def test_the_page_saves_a_video_and_cancels_one(toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with serving(toy[1], toy[0] / "scene") as (port, token):
-        with shown(port, f"{token}#m=recorded&c=front&t=0.2&s=1.5", tmp_path) as one:
-            one.run(KEEP)
-            one.run(f"{CLICK}; 1")
-            one.wait("window.saved.length === 1")
-            content = base64.b64decode(one.run(SAVED))
-            assert one.run("document.getElementById('note').textContent").startswith("Saved toy-street_color_0.20s.mp4")
-            film = pictures(content)
-            assert len(film) == 9  # 0.8 s, 10 per second
-            views = {round(v.time_s, 3): v for v in at_shift(read_scene(toy[0] / "scene"), "front", 1.5).views}
-            for k in (0, 2, 8):
-                true = render_view(toy[2], views[round(0.1 * k, 3)], raster_of(toy[2])).rgb.permute(1, 2, 0).numpy()
-                assert psnr(film[k], true) > 32
-            begun, go_on, real = list[int](), threading.Event(), apply.render_view
-
-            def held(*given: Any, **settings: Any) -> Any:
-                begun.append(1)
-                assert len(begun) < 3 or go_on.wait(60)
-                return real(*given, **settings)
-
-            monkeypatch.setattr(apply, "render_view", held)
-            one.run(f"{CLICK}; 1")
-            # exact frames count, too
-            one.wait("/^Cancel \\([0-2] of 9 frames\\)$/.test(document.getElementById('mp4').textContent)")
-            one.run(f"{CLICK}; 1")
-            one.wait("document.getElementById('note').textContent === 'The video was cancelled.'")
-            go_on.set()
-            assert one.run("[saved.length, document.getElementById('mp4').textContent]") == [1, "Exact video (MP4)"]
-            one.run("mudg.change({layer: 'normal'}); 1")
-            assert one.run("document.getElementById('mp4').disabled")
 
 
 PIXELS = """(() => { const {area} = mudg.last;

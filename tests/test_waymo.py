@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import struct
 import sys
@@ -12,54 +13,78 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import bad_logs
 import numpy as np
 import pytest
 import roundtrip
-import waymo_logs
 import write_waymo as made
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 from refusals import refused
-from waymo_logs import COLUMNS, ingest, write
+from write_waymo import write
 
 from mudg.base import geometry
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.geometry import invert, transform_points, yaw_matrix
 from mudg.base.types import Scene, Track
 from mudg.city import sensors as rig
-from mudg.formats.importers.waymo import importer as sensors
-from mudg.formats.importers.waymo import logs as tfrecord
-from mudg.formats.importers.waymo import records
-from mudg.formats.importers.waymo.logs import ParquetTable, TfrecordLog
-from mudg.formats.importers.waymo.records import CameraShot, LaserCalibration, LaserScan, WaymoBox
+from mudg.formats.importers import waymo
+from mudg.formats.importers import waymo_logs as logs
+from mudg.formats.importers.waymo_logs import (
+    CameraShot,
+    LaserCalibration,
+    LaserScan,
+    Message,
+    ParquetTable,
+    TfrecordLog,
+)
 from mudg.scene.labels import read_label
-from mudg.scene.read import read_image, read_points
+from mudg.scene.read import read_image, read_points, read_scene
 
 pytestmark = roundtrip.needs_native
 
 
-@pytest.fixture
-def city(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scene, tuple[Track, ...]]:
-    return waymo_logs.city(tmp_path_factory)
+ingest = bad_logs.importer("waymo")
+COLUMNS = 240
+City = tuple[Scene, tuple[Track, ...]]
+
+
+@pytest.fixture(scope="module")
+def city(tmp_path_factory: pytest.TempPathFactory) -> City:
+    """A tiny city whose boxes stand upright in the vehicle, as the data set's do, and its tracks at all times."""
+    folder = tmp_path_factory.mktemp("city")
+    truth, tracks = roundtrip.small_log(folder), []
+    for track in truth.tracks:
+        poses = track.world_from_object.copy()
+        for index, time in enumerate(track.times_s):
+            vehicle = truth.ego.pose_at(float(time))
+            local = invert(vehicle) @ poses[index]
+            poses[index, :3, :3] = (vehicle @ yaw_matrix(geometry.yaw_of(local)))[:3, :3]
+        tracks.append(replace(track, world_from_object=poses))
+    return replace(truth, tracks=tuple(tracks)), read_scene(folder).tracks
+
+
+@pytest.fixture(scope="module")
+def pristine(city: City) -> made.Log:
+    return made.log_of(*city, beams=rig.lidar_elevations(roundtrip.SMALL), columns=COLUMNS)
 
 
 @pytest.fixture
-def drive(tmp_path_factory: pytest.TempPathFactory) -> made.Log:
-    return waymo_logs.whole(tmp_path_factory)
+def drive(pristine: made.Log) -> made.Log:
+    """The city as a Waymo log that the test may change."""
+    return copy.deepcopy(pristine)
 
 
 @pytest.mark.parametrize("form, workers", [("v1", 1), ("v2", 2)])
-def test_round_trip(
-    form: str, workers: int, city: tuple[Scene, tuple[Track, ...]], drive: made.Log, tmp_path: Path
-) -> None:
+def test_round_trip(form: str, workers: int, city: City, drive: made.Log, tmp_path: Path) -> None:
     truth, own = city
     scene = ingest(write(drive, form, tmp_path / "log"), tmp_path / "scene", workers=workers)
     roundtrip.assert_same_log(scene, truth, labels=made.LABELS, cloud_m=2e-4, dt_s=1e-6, box_pose=0.03, intensity=1e-4)
     assert scene.ego.world_from_ego[0] == pytest.approx(np.eye(4), abs=1e-12)
     assert scene.frames[0].view.camera.readout_s == pytest.approx(made.READOUT_S, abs=1e-6)
     assert scene.frames[0].view.camera.shutter == "left_to_right"
-    assert any(form in note and "Day, sunny, location_sf" in note for note in scene.source.notes)
+    assert any(form in note for note in scene.source.notes)
     assert {scene.split[f"front/00000{n}"] for n in (0, 1, 2, 3)} == {"train"}
     assert scene.split["front_left/000004"] == "test"
     assert scene.frames[0].view.time_s == pytest.approx(0.05, abs=1e-6)  # the clock begins with the LiDAR's turn
@@ -78,16 +103,6 @@ def test_round_trip(
     assert uncarried_m > 0.2  # what boxes would be off without their times
 
 
-@pytest.mark.parametrize("hold, words", [("start", "at the timestamp"), ("pose", "at the frame's pose")])
-def test_the_moment_of_the_boxes_is_found(
-    hold: str, words: str, city: tuple[Scene, tuple[Track, ...]], tmp_path: Path
-) -> None:
-    log = made.log_of(*city, beams=rig.lidar_elevations(roundtrip.SMALL), columns=COLUMNS, boxes_hold=hold)
-    scene = ingest(write(log, "v1", tmp_path / "log"), tmp_path / "scene")
-    assert any(note.startswith(f"boxes hold {words} (") for note in scene.source.notes)
-    roundtrip.assert_same_log(scene, city[0], labels=made.LABELS, box_pose=0.04, cloud_m=2e-4)
-
-
 def test_both_formats_and_any_number_of_workers_give_the_same_scene(drive: made.Log, tmp_path: Path) -> None:
     one = ingest(write(drive, "v1", tmp_path / "one"), tmp_path / "a", workers=3)
     two = ingest(write(drive, "v2", tmp_path / "two"), tmp_path / "b", workers=1)
@@ -99,9 +114,7 @@ def test_both_formats_and_any_number_of_workers_give_the_same_scene(drive: made.
 
 
 @pytest.mark.parametrize("form", ["v1", "v2"])
-def test_chosen_frames_and_cameras_far_from_the_origin(
-    form: str, city: tuple[Scene, tuple[Track, ...]], tmp_path: Path
-) -> None:
+def test_chosen_frames_and_cameras_far_from_the_origin(form: str, city: City, tmp_path: Path) -> None:
     far = yaw_matrix(2.0, (-25211.25, 42391.08, -160.6))
     log = made.log_of(*city, beams=rig.lidar_elevations(roundtrip.SMALL), columns=COLUMNS, global_from_world=far)
     source, truth = write(log, form, tmp_path / "log"), city[0]
@@ -112,7 +125,7 @@ def test_chosen_frames_and_cameras_far_from_the_origin(
         original = truth.sweeps[index + 1]
         assert np.abs(sweep.world_from_lidar - shift @ original.world_from_lidar).max() < 1e-6
         assert len(read_points(scene, sweep).xyz) == len(read_points(truth, original).xyz)
-    assert any(f"({far[0, 3]:.0f}" in note.replace(".", "")[:60] or "-25" in note for note in scene.source.notes)
+    assert any("origin is (-25" in note for note in scene.source.notes)
     refused("no such camera", ingest, source, tmp_path / "c", cameras=("rear",), raises=UsageError)
 
 
@@ -200,13 +213,14 @@ def test_the_real_frame(shared_data: Callable[[str], Path], tmp_path: Path) -> N
 
 def test_boxes_of_the_real_frame_project_onto_the_recorded_rectangles(shared_data: Callable[[str], Path]) -> None:
     path = shared_data("waymo_frame") / "pvps_data_one_frame.tfrecord"
-    label = records.Message("Label", {**records.FRAME.fields[6].message.fields})
-    fields = {1: records.Field("name", "int"), 2: records.Field("labels", "messages", label)}
-    per_camera = records.Message("CameraLabels", fields)
-    message = records.Message("Frame", {9: records.Field("projected", "messages", per_camera)})
-    (place,) = tfrecord.record_places(path)
+    box = "x 1 double, y 2 double, width 4 double, length 5 double"  # rectangles: the centre, then the sides
+    label = Message("Label", "box 1 message, id 4 text", box=Message("Box", box))
+    message = Message(
+        "Frame", "projected 9 messages", projected=Message("Camera", "name 1 int, labels 2 messages", labels=label)
+    )
+    (place,) = logs.record_places(path)
     with path.open("rb") as file:
-        projected = records.parse_message(tfrecord.read_record(file, path, place), message, "real")["projected"]
+        projected = logs.parse_message(logs.read_payload(file, *place), message, "real")["projected"]
     log = TfrecordLog(path)
     frame = log.frames[0]
     boxes = {box.id: box for box in frame.boxes}
@@ -215,13 +229,13 @@ def test_boxes_of_the_real_frame_project_onto_the_recorded_rectangles(shared_dat
     for camera in projected:
         name = names[camera["name"]]
         calibration = log.cameras[name]
-        pose, _ = sensors.middle_of_exposure(frame.shots[name])
-        cam_from_vehicle = invert(pose @ sensors.vehicle_from_cam(calibration)) @ frame.global_from_vehicle
+        pose, _ = waymo.middle_of_exposure(frame.shots[name])
+        cam_from_vehicle = invert(pose @ waymo.vehicle_from_cam(calibration)) @ frame.global_from_vehicle
         fx, fy, cx, cy, *lens = calibration.intrinsic
         for item in camera["labels"]:
             box = next(box for key, box in boxes.items() if item["id"].startswith(key))
             corners = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), -1).reshape(-1, 3) * box.size_m
-            corners = transform_points(cam_from_vehicle @ yaw_matrix(box.heading, box.centre), corners)
+            corners = transform_points(cam_from_vehicle @ box.vehicle_from_box, corners)
             if (corners[:, 2] < 0.5).any():
                 continue
             x, y = corners[:, 0] / corners[:, 2], corners[:, 1] / corners[:, 2]
@@ -240,20 +254,20 @@ def test_boxes_of_the_real_frame_project_onto_the_recorded_rectangles(shared_dat
 
 
 def test_the_real_frame_without_images_is_refused_in_words(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
-    refused("no images", ingest, shared_data("waymo_frame") / "labels_only_one_frame.tfrecord", tmp_path / "scene")
+    refused("no camera", ingest, shared_data("waymo_frame") / "labels_only_one_frame.tfrecord", tmp_path / "scene")
 
 
 def test_the_real_table_of_poses(shared_data: Callable[[str], Path]) -> None:
     pytest.importorskip("pyarrow")
-    table = ParquetTable(shared_data("waymo_frame") / "v2_vehicle_pose.parquet")
-    column = "[VehiclePoseComponent].world_from_vehicle.transform"
-    found = table.columns(("key.segment_context_name", "key.frame_timestamp_micros", column))
-    assert len(found[column]) == 199
-    assert all(geometry.rigid_problem(np.array(values).reshape(4, 4), 1e-6) is None for values in found[column])
-    steps = np.diff(np.array(found["key.frame_timestamp_micros"], np.int64))
+    table = ParquetTable(shared_data("waymo_frame") / "v2_vehicle_pose.parquet", "vehicle_pose")
+    column = "world_from_vehicle.transform"
+    found = [row for _, row in table.records(("key.segment_context_name", "key.frame_timestamp_micros"), (column,))]
+    assert len(found) == 199
+    assert all(geometry.rigid_problem(np.array(row[column]).reshape(4, 4), 1e-6) is None for row in found)
+    steps = np.diff(np.array([row["key.frame_timestamp_micros"] for row in found], np.int64))
     assert ((steps > 90_000) & (steps < 110_000)).all()
-    assert np.allclose(table.value(57, column), found[column][57])
-    assert np.allclose(table.value(3, column), found[column][3])
+    for row in (57, 3):  # forwards, and back
+        assert np.allclose(table.value(row, column), found[row][column])
 
 
 # --- parts against slow twins ---------------------------------------------------------------------
@@ -263,20 +277,17 @@ def test_the_real_table_of_poses(shared_data: Callable[[str], Path]) -> None:
     "data, crc", [(b"123456789", 0xE3069283), (bytes(32), 0x8A9136AA), (b"\xff" * 32, 0x62A8AB43), (b"", 0)]
 )
 def test_crc32c_has_the_published_values(data: bytes, crc: int) -> None:
-    assert tfrecord.crc32c(data) == crc
+    assert logs.crc32c(data) == crc
 
 
 @pytest.mark.parametrize("length", [1, 63, 64, 65, 2319, 2320, 2321, 2328, 3571, 45479, 45480, 45488, 80064, 123457])
 def test_crc32c_folded_equals_byte_by_byte(length: int) -> None:
     data = np.random.default_rng(length).bytes(length)
-    assert tfrecord.crc32c(data) == made.crc32c_bitwise(data)
+    assert logs.crc32c(data) == made.crc32c_bitwise(data)
 
 
-INNER = records.Message("Inner", {1: records.Field("values", "doubles"), 3: records.Field("counts", "ints")})
-OUTER = records.Message(
-    "Outer",
-    {1: records.Field("name", "text"), 2: records.Field("number", "int"), 4: records.Field("inner", "messages", INNER)},
-)
+INNER = Message("Inner", "values 1 doubles, counts 3 ints")
+OUTER = Message("Outer", "name 1 text, number 2 int, inner 4 messages", inner=INNER)
 
 
 def test_messages_keep_wanted_fields_skip_others_and_take_both_forms_of_lists() -> None:
@@ -284,7 +295,7 @@ def test_messages_keep_wanted_fields_skip_others_and_take_both_forms_of_lists() 
     plain = made.doubles(1, [1.5, -2]) + made.number(3, 7) + made.number(3, -7)
     skipped = made.double(9, 1.0) + made.single(10, 1.0) + made.number(11, 300) + made.text(12, b"?")
     data = made.text(1, "Straße".encode()) + skipped + made.number(2, -5) + made.text(4, packed) + made.text(4, plain)
-    found = records.parse_message(data, OUTER, "x")
+    found = logs.parse_message(data, OUTER, "x")
     assert (found["name"], found["number"], len(found["inner"])) == ("Straße", -5, 2)
     for inner in found["inner"]:
         assert inner["values"].tolist() == [1.5, -2]
@@ -303,20 +314,20 @@ def test_messages_keep_wanted_fields_skip_others_and_take_both_forms_of_lists() 
         (b"\x10\x80", "inside a number"),
         (b"\x08\x01", "wire type 0, not 2"),
         (b"\x0a\x01\xff", "no text"),
-        (b"\x22\x03\x0a\x01\x00", "no multiple of 8"),
+        (b"\x22\x03\x0a\x01\x00", "no multiple of"),
     ],
 )
 def test_broken_messages_are_named(data: bytes, word: str) -> None:
-    caught = refused("message cannot be decoded", records.parse_message, data, OUTER, "file: record 3")
+    caught = refused("message cannot be decoded", logs.parse_message, data, OUTER, "file: record 3")
     assert word in caught.got
     assert "record 3" in caught.where
 
 
 @given(st.binary(max_size=200))
 def test_no_bytes_raise_anything_but_an_input_error(data: bytes) -> None:
-    for message in (records.FRAME, records.CONTEXT, records.MATRIX_FLOAT):
+    for message in (logs.FRAME, logs.CONTEXT, logs.MATRIX_FLOAT):
         try:
-            records.parse_message(data, message, "x")
+            logs.parse_message(data, message, "x")
         except InputError:
             continue
 
@@ -325,83 +336,37 @@ def test_points_without_a_pose_are_left_out_and_counted() -> None:
     image = np.ones((2, 8, 4), np.float32)
     poses = np.full((2, 8, 6), 0.1, np.float32)
     poses[1, 3:] = 0
-    laser = LaserCalibration("top", (), -0.2, 0.1, np.eye(4))
-    points = sensors.points_of_scan(LaserScan([image, image], poses), laser, np.eye(4), "x")
-    assert (points.without_pose, len(points.xyz)) == (10, 22)
-
-
-@pytest.mark.parametrize("start, duration", [(0.0, 0.1), (-0.004, 0.098), (0.1, -0.1)])
-def test_the_turn_is_measured_from_pixel_poses(start: float, duration: float) -> None:
-    def place(time: np.ndarray) -> np.ndarray:
-        return np.stack([100 + 12 * time, 0.3 * time, np.full_like(time, 4.0)], -1)
-
-    poses = np.zeros((4, 100, 6), np.float32)
-    poses[..., 3:] = place(start + (np.arange(100) + 0.5) / 100 * duration)
-    poses[2:, 40:] = 0
-    times = np.arange(-0.1, 0.25, 0.0125)
-    found = sensors.measure_turn(poses, 5.0, times + 5.0, place(times))
-    assert found is not None
-    assert np.abs(np.array(found) - [start, duration]).max() < 1e-5
-    assert sensors.measure_turn(poses, 5.0, times + 5.0, place(times * 1e-3)) is None
-    nominal = sensors.TurnClock()
-    assert (sensors.median_clock([found]) == nominal) == (start == 0.0)
+    laser = LaserCalibration((), (-0.2, 0.1), np.eye(4))
+    points = waymo.points_of_scan(LaserScan([image, image], poses), laser, np.eye(4), 0.05, "x")
+    assert (points.no_returns, len(points.xyz)) == (10, 22)
 
 
 def test_a_view_is_that_of_the_middle_of_the_exposure() -> None:
     pose = yaw_matrix(0.4, (5.0, 6.0, 1.0))
     velocity = np.array([10.0, -2.0, 0.5, 0, 0, 0.8])
     shot = CameraShot(pose, 100.0, velocity, 0.002, 99.985, 100.027)
-    moved, time = sensors.middle_of_exposure(shot)
+    moved, time = waymo.middle_of_exposure(shot)
     late = time - 100.0
     assert late == pytest.approx(0.006, abs=1e-9)
     assert np.abs(moved - yaw_matrix(0.4 + 0.8 * late, pose[:3, 3] + velocity[:3] * late)).max() < 1e-12
-    assert sensors.readout_s(shot) == pytest.approx(0.04)
     unknown = CameraShot(pose, 100.0, None, 0.002, 99.985, 100.027)
-    assert sensors.middle_of_exposure(unknown) == (pose, 100.0)
+    assert waymo.middle_of_exposure(unknown) == (pose, 100.0)
 
 
-def timed(times: np.ndarray, late: np.ndarray, velocity: np.ndarray, **changes: Any) -> list[records.TimedBoxes]:
-    """An object that drives straight, boxed where it is when it is seen."""
-    frames = []
-    for time, delay in zip(times, late, strict=True):
-        vehicle = yaw_matrix(0.1 * time, (3.0 * time, 0, 0))
-        world = yaw_matrix(0.5, velocity * (time + delay) + [20, 5, 1])
-        local = invert(vehicle) @ world
-        values = {"id": "-a_b", "label": "vehicle", "size_m": (4.0, 2.0, 1.5)} | changes
-        box = WaymoBox(centre=tuple(local[:3, 3]), heading=geometry.yaw_of(local), **values)
-        frames.append(records.TimedBoxes(float(time), vehicle, [box], np.array([delay]), f"frame at {time}"))
-    return frames
-
-
-@pytest.mark.parametrize("late", [np.full(6, 0.03), np.array([0.049, 0.0495, -0.0495, -0.049, -0.04, -0.03])])
-def test_boxes_are_carried_to_the_moment_of_the_points(late: np.ndarray) -> None:
-    times, velocity = np.arange(6) * 0.1, np.array([12.0, -3.0, 0.0])
-    (track,), notes = records.build_tracks(timed(times, late, velocity))
-    assert np.abs(track.world_from_object[:, :3, 3] - (times[:, None] * velocity + [20, 5, 1])).max() < 1e-9
-    assert (track.id, track.label, track.size_m.tolist(), notes) == ("t-a_b", "vehicle", [4.0, 2.0, 1.5], [])
-
-
-def test_tracks_cover_the_images_of_their_frames() -> None:
-    velocity = np.array([12.0, -3.0, 0.0])
-    frames = timed(np.arange(4) * 0.1, np.zeros(4), velocity)
-    frames = [replace(frame, images_s=(frame.time_s - 0.03, frame.time_s + 0.02)) for frame in frames]
-    (track,), _ = records.build_tracks(frames)
-    assert track.times_s == pytest.approx([-0.03, 0, 0.1, 0.2, 0.3, 0.32])
-    assert np.abs(track.world_from_object[:, :3, 3] - (track.times_s[:, None] * velocity + [20, 5, 1])).max() < 1e-9
-    (alone,), _ = records.build_tracks(frames[:1])
-    assert alone.times_s == pytest.approx([-0.03, 0, 0.02])
-    assert np.ptp(alone.world_from_object, axis=0).max() == 0
-
-
-def test_tracks_are_split_at_gaps_and_odd_ones_named() -> None:
-    times = np.array([0, 0.1, 0.2, 1.0, 1.1])
-    tracks, notes = records.build_tracks(timed(times, np.zeros(5), np.zeros(3), label="unknown", id="a"))
-    assert [(track.id, len(track.times_s)) for track in tracks] == [("a", 3), ("a.1", 2)]
-    assert "split" in notes[0]
-    assert "2 boxes have a class that is not known" in notes[1]
-    frames = timed(times, np.zeros(5), np.zeros(3))
-    doubled = records.TimedBoxes(0.0, np.eye(4), [frames[0].boxes[0]] * 2, np.zeros(2), "frame 7")
-    refused("two boxes of one object", records.build_tracks, [doubled])
+def test_tracks_cover_the_images_of_their_frames_and_are_split_at_gaps(drive: made.Log, tmp_path: Path) -> None:
+    left = drive.frames[2]["boxes"][0]["id"]
+    drive.frames[2]["boxes"] = []
+    for number, frame in enumerate(drive.frames):  # half a second apart
+        late = 0.4 * number
+        frame["timestamp_us"] += round(late * 1e6)
+        for image in frame["images"]:
+            image.update({name: image[name] + late for name in ("pose_time", "trigger", "done")})
+    scene = ingest(write(drive, "v1", tmp_path / "log"), tmp_path / "scene")
+    assert any("split" in note for note in scene.source.notes)
+    pieces = [track for track in scene.tracks if track.id in (left, f"{left}.1")]
+    taken = sorted(frame.view.time_s for frame in scene.frames)
+    ends = [(track.times_s[0], track.times_s[-1]) for track in pieces]
+    assert len(pieces) == 2 and ends[0][0] <= taken[0] and ends[0][1] >= taken[3] and ends[1][1] >= taken[-1]
 
 
 # --- damaged, contradictory and incomplete logs ---------------------------------------------------
@@ -420,6 +385,16 @@ def infinite(log: made.Log) -> None:
     log.frames[3]["lasers"][0]["returns"][0][0, 0, 0] = np.inf
 
 
+def each_box(spoil: Callable[[dict[str, Any]], object]) -> Callable[[made.Log], object]:
+    return lambda log: [spoil(box) for frame in log.frames for box in frame["boxes"]]
+
+
+def swap_sides(box: dict[str, Any]) -> None:
+    """What a reader makes of boxes if it takes the field of the width for that of the length."""
+    length, width, height = box["size"]
+    box["size"] = (width, length, height)
+
+
 def lacks_an_image(log: made.Log) -> None:
     log.frames[2]["images"].pop(1)
 
@@ -430,13 +405,17 @@ BOTH: dict[str, tuple[Callable[[made.Log], object], str]] = {
     "hand": (lambda log: change(log.lasers[0], extrinsic=lambda pose: pose @ MIRROR), "left-handed"),
     "unit": (milliseconds, "not of one time"),
     "image clock": (lambda log: change(log.frames[2]["images"][1], pose_time=lambda t: t * 1e3), "not of one time"),
-    "box": (lambda log: log.frames[1]["boxes"][0].update(size=(4.0, -2.0, 1.5)), "box makes no sense"),
+    "box": (lambda log: log.frames[1]["boxes"][0].update(size=(4.0, -2.0, 1.5)), "size makes no sense"),
     "rows": (lambda log: change(log.lasers[0], inclinations=lambda beams: beams[:-1]), "row for every beam"),
     "numbers": (infinite, "not finite"),
     "image": (lambda log: change(log.frames[1]["images"][0], image=lambda c: c[:300]), "cannot be decoded"),
-    "camera": (lacks_an_image, "frame lacks images or scans"),
-    "laser": (lambda log: log.frames[2]["lasers"].pop(0), "frame lacks images or scans"),
+    "camera": (lacks_an_image, "do not pair up"),
+    "laser": (lambda log: log.frames[2]["lasers"].pop(0), "do not pair up"),
     "calibration": (lambda log: log.cameras.pop(1), "no calibration"),
+    "heading": (lambda log: log.frames[1]["boxes"][0].update(heading=np.nan), "not finite"),
+    "two boxes": (lambda log: change(log.frames[1], boxes=lambda boxes: boxes[:1] * 2), "two boxes at one moment"),
+    "sides": (each_box(swap_sides), "length and width of boxes are swapped"),
+    "long id": (each_box(lambda box: box.update(id="n" * 201)), "name is too long"),
     "laser calibration": (lambda log: log.lasers[0].update(number=9), "no calibration"),
     "pixel poses": (lambda log: change(log.frames[2]["lasers"][0], poses=lambda p: p[:, ::2]), "differ in size"),
     "exposure": (lambda log: log.frames[0]["images"][0].update(shutter=0.5), "exposure times contradict"),
@@ -446,9 +425,11 @@ BOTH: dict[str, tuple[Callable[[made.Log], object], str]] = {
 }
 
 
-@pytest.mark.parametrize("form", ["v1", "v2"])
-@pytest.mark.parametrize("case", BOTH)
-def test_what_makes_no_sense_is_refused(case: str, form: str, drive: made.Log, tmp_path: Path) -> None:
+FIELDS = ("scale", "box", "rows", "camera", "laser", "exposure", "intrinsics", "two scans", "two images", "long id")
+
+
+@pytest.mark.parametrize("form, case", [*(("v1", case) for case in BOTH), *(("v2", case) for case in FIELDS)])
+def test_what_makes_no_sense_is_refused(form: str, case: str, drive: made.Log, tmp_path: Path) -> None:
     spoil, words = BOTH[case]
     spoil(drive)
     log = write(drive, form, tmp_path / "log")
@@ -479,7 +460,7 @@ def test_empty_scans_unknown_sensors_and_classes_are_taken_as_they_are(
     scene = ingest(write(drive, form, tmp_path / "log"), tmp_path / "scene")
     assert len(read_points(scene, scene.sweeps[1]).xyz) == 0
     assert "has no points" in capsys.readouterr().err
-    assert scene.track("t_odd").label == "unknown"
+    assert scene.track("t_odd").label == "type_9"
     assert len(scene.frames) == 10
     assert len(scene.sweeps) == 5
 
@@ -487,7 +468,7 @@ def test_empty_scans_unknown_sensors_and_classes_are_taken_as_they_are(
 def test_damaged_files_are_named_with_record_and_byte(drive: made.Log, tmp_path: Path) -> None:
     path = write(drive, "v1", tmp_path / "log")
     content = path.read_bytes()
-    third = list(tfrecord.record_places(path))[2].offset
+    third = list(logs.record_places(path))[2][1] - 12
 
     def flipped(at: int) -> bytes:
         return content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :]
@@ -526,17 +507,17 @@ def test_files_of_another_kind_are_refused(drive: made.Log, tmp_path: Path) -> N
 
 
 def test_range_images_are_unpacked_within_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
-    float_image = records.float_image
+    range_image = logs.range_image
     whole = made.matrix_float(np.ones((2, 3, 4), np.float32))
-    assert float_image(whole, 4, "x").shape == (2, 3, 4)
-    refused("wrong shape", float_image, whole, 6, "x")
-    refused("cut off", float_image, whole[:-6], 4, "x")
-    refused("cannot be unpacked", float_image, b"nonsense", 4, "x")
-    monkeypatch.setattr(records, "MAX_UNPACKED_BYTES", 1 << 20)
+    assert range_image(whole, 4, "x").shape == (2, 3, 4)
+    refused("wrong shape", range_image, whole, 6, "x")
+    refused("cut off", range_image, whole[:-6], 4, "x")
+    refused("cannot be unpacked", range_image, b"nonsense", 4, "x")
+    monkeypatch.setattr(logs, "MAX_UNPACKED_BYTES", 1 << 20)
     bomb = zlib.compress(bytes(2 << 20), 1)
-    refused("unpacks to more", float_image, bomb, 4, "x")
+    refused("unpacks to more", range_image, bomb, 4, "x")
     lying = made.text(1, bytes(16)) + made.text(2, b"".join(made.number(1, n) for n in (1 << 20, 1 << 20, 4)))
-    refused("wrong shape", float_image, zlib.compress(lying), 4, "x")
+    refused("wrong shape", range_image, zlib.compress(lying), 4, "x")
 
 
 def test_tables_that_are_missing_or_damaged(drive: made.Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -550,13 +531,14 @@ def test_tables_that_are_missing_or_damaged(drive: made.Log, tmp_path: Path, mon
     table.write_bytes(whole)
     pose = root / "lidar_pose" / f"{drive.name}.parquet"
     pose.rename(root / "away")
-    refused("pixel poses are missing", ingest, root, tmp_path / "scene")
+    refused("a component of the log is missing", ingest, root, tmp_path / "scene")
     (root / "away").rename(pose)
     (root / "camera_calibration" / f"{drive.name}.parquet").unlink()
     refused("a component of the log is missing", ingest, root, tmp_path / "scene")
     pyarrow = pytest.importorskip("pyarrow")
-    holes = pyarrow.table({"a": [1, None, 3]})
+    holes = pyarrow.table({"key.camera_name": [1, None, 3]})
     pytest.importorskip("pyarrow.parquet").write_table(holes, tmp_path / "holes.parquet")
-    assert refused("empty value", ParquetTable(tmp_path / "holes.parquet").columns, ("a",)).where.endswith("row 1")
+    table = ParquetTable(tmp_path / "holes.parquet", "lidar")
+    assert refused("empty value", lambda: list(table.records(("key.camera_name",), ()))).where.endswith("row 1")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    assert "mudg[data]" in refused("pyarrow", ParquetTable, pose, raises=ResourceError).remedy
+    assert "mudg[data]" in refused("pyarrow", ParquetTable, pose, "lidar_pose", raises=ResourceError).remedy

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -50,7 +51,6 @@ def log_of(
     beams: NDArray[np.float64],
     columns: int,
     global_from_world: Matrix = GLOBAL_FROM_WORLD,
-    boxes_hold: str = "seen",
 ) -> Log:
     """The scene as a Waymo log.
 
@@ -60,8 +60,6 @@ def log_of(
         beams: elevations f64[H], radians, upwards.
         columns: of the range images.
         global_from_world: where the data set's world lies.
-        boxes_hold: whether boxes stand where their objects were when the LiDAR looked at them (``seen``), at the
-            beginning of the turn (``start``) or in its middle (``pose``).
     """
     log = Log()
     mount = invert(truth.ego.pose_at(truth.sweeps[0].time_s)) @ truth.sweeps[0].world_from_lidar
@@ -79,7 +77,7 @@ def log_of(
         frame: dict[str, Any] = {"timestamp_us": EPOCH_US + round((sweep.time_s - 0.05) * 1e6), "pose": pose}
         frame["images"] = [_image(truth, name, index, global_from_world) for name in truth.cameras]
         frame["lasers"] = [_scan(truth, index, mount, beams, columns, global_from_world)]
-        frame["boxes"] = _boxes(truth, moving, sweep.time_s, boxes_hold)
+        frame["boxes"] = _boxes(truth, moving, sweep.time_s)
         log.frames.append(frame)
     return log
 
@@ -122,14 +120,13 @@ def _roll_pitch_yaw(pose: Matrix) -> list[float]:
     return [roll, pitch, np.arctan2(pose[1, 0], pose[0, 0]), *pose[:3, 3]]
 
 
-def _boxes(truth: Scene, moving: Sequence[Track], time_s: float, hold: str) -> list[dict[str, Any]]:
+def _boxes(truth: Scene, moving: Sequence[Track], time_s: float) -> list[dict[str, Any]]:
     vehicle = truth.ego.pose_at(time_s)
     own = {track.id: track for track in moving}
     boxes = []
     for track in truth.tracks:
         now = invert(vehicle) @ track.pose_at(time_s)
         late = ((0.5 - np.arctan2(now[1, 3], now[0, 3]) / (2 * np.pi)) % 1.0 - 0.5) * 0.1
-        late = {"seen": late, "start": -0.05, "pose": 0.0}[hold]
         seen = own[track.id].pose_at(time_s + late)
         shown = now if seen is None else invert(vehicle) @ seen
         facts = track.id, TYPE_NUMBERS[track.label], shown[:3, 3], track.size_m, yaw_of(now)
@@ -225,7 +222,7 @@ def context_message(log: Log) -> bytes:
     for laser in log.lasers:
         beams = doubles(2, laser["inclinations"]) + double(3, laser["min"]) + double(4, laser["max"])
         out += text(3, number(1, laser["number"]) + beams + transform(5, laser["extrinsic"]))
-    return out + text(4, text(2, b"Day") + text(3, b"location_sf") + text(4, b"sunny"))
+    return out + text(4, text(2, b"Day"))  # statistics, which the importer does not read
 
 
 def frame_message(log: Log, frame: dict[str, Any]) -> bytes:
@@ -262,6 +259,14 @@ def write_tfrecord(log: Log, path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(b"".join(record(frame_message(log, frame)) for frame in log.frames))
     return path
+
+
+def write(log: Log, form: str, folder: Path) -> Path:
+    """The log in format ``v1`` or ``v2``."""
+    if form == "v1":
+        return write_tfrecord(log, folder / f"segment-{log.name}_with_camera_labels.tfrecord")
+    pytest.importorskip("pyarrow")
+    return write_parquet(log, folder)
 
 
 # --- format 2 -------------------------------------------------------------------------------------
@@ -338,6 +343,4 @@ def write_parquet(log: Log, root: Path) -> Path:
     boxes = ((key(f, laser_object_id=b["id"]), b) for f in log.frames for b in f["boxes"])
     boxes = ((keys, [*map(float, (*b["centre"], *b["size"], b["heading"])), b["type"]]) for keys, b in boxes)
     save("lidar_box", "LiDARBox", ((keys, named(names, *values)) for keys, values in boxes))
-    conditions = named("time_of_day location weather", "Day", "location_sf", "sunny")
-    save("stats", "Stats", [(key(log.frames[0]), conditions)])
     return root

@@ -29,12 +29,11 @@ with atheris.instrument_imports(include=["mudg"]):
     from mudg.base import plain_pickle, plain_yaml
     from mudg.base.errors import MudgError
     from mudg.editing.script import parse_edits
-    from mudg.formats.importers import clouds, kitti_files
-    from mudg.formats.importers.waymo import logs, records
+    from mudg.formats.importers import clouds, kitti_files, waymo_logs
     from mudg.formats.splats.cloud import SplatCloud, SplatNode, SplatScene
     from mudg.formats.splats.formats import FORMATS, WriteRequest
     from mudg.scene import schema
-    from mudg.sim import tables
+    from mudg.sim import lidar as tables
 
 STATS = ("number_of_executed_units", "slowest_unit_time_sec", "peak_rss_mb")
 LIMITS = ("-timeout=1", "-rss_limit_mb=1024", "-max_len=4096", "-print_final_stats=1")
@@ -57,8 +56,8 @@ def in_file(read: Callable[[Path], object], ending: str = ".txt") -> Callable[[b
 def records_of(path: Path) -> None:
     """Every record of a TFRecord file, as a frame of Waymo."""
     with path.open("rb") as file:
-        for place in logs.record_places(path):
-            records.parse_message(logs.read_record(file, path, place), records.FRAME, "input")
+        for place in waymo_logs.record_places(path):
+            waymo_logs.parse_message(waymo_logs.read_payload(file, *place), waymo_logs.FRAME, "input")
 
 
 def scene_of(content: bytes) -> object:
@@ -68,7 +67,7 @@ def scene_of(content: bytes) -> object:
 
 def matrices_of(content: bytes) -> object:
     """A range image."""
-    return records.float_image(content, 4, "input")
+    return waymo_logs.range_image(content, 4, "input")
 
 
 def splats_by(read: Callable[[bytes, str], object]) -> Callable[[bytes], object]:
@@ -86,7 +85,7 @@ PARSERS: dict[str, Callable[[bytes], object]] = {
     "cloud-ply": lambda content: clouds.read_ply(content, "input"),
     "npz": lambda content: clouds.read_npz(content, "input"),
     "lzf": lambda content: clouds.lzf_decompress(content, 2000, "input"),
-    "waymo": lambda content: records.parse_message(content, records.FRAME, "input"),
+    "waymo": lambda content: waymo_logs.parse_message(content, waymo_logs.FRAME, "input"),
     "range-image": matrices_of,
     "tfrecord": in_file(records_of, ".tfrecord"),
     "calibration": in_file(kitti_files.read_calibration_text),

@@ -74,7 +74,8 @@ import json, pathlib, sys
 from dataclasses import asdict
 import numpy as np, torch, yaml
 import kitti_folders, roundtrip, toy_clips, toy_published
-import write_av2, write_custom, write_kitti360, write_nuplan, write_nuscenes, write_pandaset, waymo_logs
+import write_av2, write_custom, write_kitti360, write_nuplan, write_nuscenes, write_pandaset, write_waymo
+from mudg.city import sensors
 root = pathlib.Path(sys.argv[1]); logs = root / "logs"; logs.mkdir(parents=True)
 truth = roundtrip.small_log(root.parent / "truth")
 write_av2.write_av2(truth, logs / "argoverse2")
@@ -83,8 +84,8 @@ write_kitti360.write_kitti360(truth, logs / "kitti360")
 write_nuplan.write_nuplan(truth, logs / "nuplan")
 write_nuscenes.write_nuscenes(truth, logs / "nuscenes")
 write_pandaset.write_pandaset(truth, logs / "pandaset" / "001")
-log = waymo_logs._written(root.parent / "waymo city")
-waymo_logs.write(log, "v1", logs / "waymo_v1"); waymo_logs.write(log, "v2", logs / "waymo_v2")
+log = write_waymo.log_of(truth, truth.tracks, beams=sensors.lidar_elevations(roundtrip.SMALL), columns=240)
+write_waymo.write(log, "v1", logs / "waymo_v1"); write_waymo.write(log, "v2", logs / "waymo_v2")
 kitti_folders.write_raw_drive(logs / "kitti_raw" / "2011_09_26")
 kitti_folders.write_odometry(logs / "kitti_odometry"); kitti_folders.write_tracking(logs / "kitti_tracking")
 kitti_folders.write_object(logs / "kitti_object")

@@ -1,5 +1,5 @@
-"""A path on this machine, or an address in an object store behind fsspec (S3, Google Cloud, Azure): the same calls for
-both, as in ``(Location.of("s3://bucket/runs") / "kitti").fetch(Path("/scratch/kitti"))``.
+"""Addresses in an object store behind fsspec (S3, Google Cloud, Azure), as in
+``(Location.of("s3://bucket/runs") / "kitti").fetch(Path("/scratch/kitti"))``.
 
 An uploaded folder holds ``_contents.json``: size and SHA-256 of every file, and whether all have arrived. That record
 alone says what a result is. Requests that fail are repeated by the store's own package. Credentials come from the
@@ -14,14 +14,13 @@ import os
 import re
 import shutil
 import ssl
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 from mudg.base import log, memory, store
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
-from mudg.base.run_folder import all_names, is_temporary
 
 PACKAGES: Final[Mapping[str, tuple[str, str]]] = {
     **dict.fromkeys(("s3", "s3a"), ("s3fs", "s3")),
@@ -201,7 +200,7 @@ def _plain(name: str, where: str) -> str:
 
 def _files_below(folder: Path) -> list[str]:
     """Relative POSIX names of all regular files, sorted, without temporary ones and locks."""
-    names = (name for name in all_names(folder) if PurePosixPath(name).name not in ("lock", CONTENTS))
+    names = (name for name in store.all_names(folder) if PurePosixPath(name).name not in ("lock", CONTENTS))
     return [name for name in names if ".part" not in name and (folder / name).is_file()]
 
 
@@ -210,8 +209,8 @@ def _files_below(folder: Path) -> list[str]:
 
 @dataclass(frozen=True)
 class Location:
-    """A file or folder on this machine, or in an object store. ResourceError, everywhere: the store or the disk
-    fails."""
+    """A file or folder in an object store; or a path on this machine, which can be read here and has no other calls.
+    ResourceError, everywhere: the store or the disk fails."""
 
     text: str
     """The path, or the address in its one spelling. It never holds credentials."""
@@ -249,6 +248,8 @@ class Location:
 
     @property
     def _files(self) -> Any:
+        if self.local is not None:
+            raise UsageError("an address in an object store is needed", where=self.text)
         return _file_system(scheme_of(self.text), os.getpid())
 
     @property
@@ -259,10 +260,6 @@ class Location:
 
     def _facts(self) -> tuple[str, int]:
         """``file`` and its size in bytes, or ``directory``; an empty text where nothing is."""
-        if self.local is not None:
-            if self.local.is_file():
-                return "file", self.local.stat().st_size
-            return "directory" if self.local.is_dir() else "file" if self.local.exists() else "", 0
         with contextlib.suppress(FileNotFoundError), _in_words("looking it up", self.text):
             facts = self._files.info(self._path)
             return str(facts["type"]), int(facts.get("size") or 0)
@@ -274,73 +271,40 @@ class Location:
 
     def load(self) -> bytes:
         """The content of a file. InputError: none is there."""
+        if self.local is not None:
+            return store.read_bytes(self.local)
         missing = "nothing is at this address; check it, and whether its upload was finished"
         try:
             with _in_words("reading", self.text, missing):
-                found = self._files.cat_file(self._path) if self.local is None else store.read_bytes(self.local)
-                return bytes(found)
+                return bytes(self._files.cat_file(self._path))
         except IsADirectoryError as error:
             raise InputError("a folder is where a file should be", where=self.text) from error
 
-    def load_below(self, names: Sequence[str]) -> dict[str, bytes]:
-        """Contents of files right below, of a store many at a time; one that was removed meanwhile is left out."""
-        if self.local is not None:
-            found = {}
-            for name in names:
-                with contextlib.suppress(InputError):
-                    found[name] = store.read_bytes(self.local / name)
-            return found
-        paths = {f"{self._path}/{name}": name for name in names}
-        with _in_words("reading", self.text):
-            answers = self._files.cat(list(paths), on_error="return") if paths else {}
-        return {paths[path.lstrip("/")]: content for path, content in answers.items() if isinstance(content, bytes)}
-
-    def save(self, data: bytes, *, only_if_absent: bool = False) -> bool:
-        """Write a file completely or not at all; False if ``only_if_absent`` and something is there. Of several that do
-        so at once one gets True, if the store honours conditional writes (S3: ``If-None-Match``)."""
-        if self.local is not None:
-            if only_if_absent:
-                return store.create_once(self.local, data)
-            store.atomic_write(self.local, data)
-            return True
-        try:
-            with _in_words("writing", self.text, _NO_BUCKET):
-                self._files.pipe_file(self._path, data, **({"mode": "create"} if only_if_absent else {}))
-        except FileExistsError:
-            return self.load() == data  # the answer to the first try may have been lost
-        return True
+    def save(self, data: bytes) -> None:
+        """Write a file completely or not at all."""
+        with _in_words("writing", self.text, _NO_BUCKET):
+            self._files.pipe_file(self._path, data)
 
     def remove(self) -> None:
         """Remove a file, or a folder with all below it, its manifest first. Nothing there is no error."""
-        if self._facts()[0] == "directory" and not (self.local is not None and self.local.is_symlink()):
-            if "/" not in (self._path or self.text).strip("/"):
-                raise UsageError("a whole bucket or disk is not removed", where=self.text)
+        if self._facts()[0] == "directory":
+            if "/" not in self._path.strip("/"):
+                raise UsageError("a whole bucket is not removed", where=self.text)
             (self / store.MANIFEST).remove()
-            if self.local is not None:
-                with store.disk_errors("cannot remove a folder", self.local, "check who may write there"):
-                    shutil.rmtree(self.local)
-                return
-        elif self.local is not None:
-            store.remove(self.local)
-            return
         with contextlib.suppress(FileNotFoundError), _in_words("removing", self.text):
             self._files.rm(self._path, recursive=True)
 
     def names(self) -> list[str]:
-        """Names of what lies right below, sorted, without temporary files; empty where nothing is."""
+        """Names of what lies right below, sorted; empty where nothing is."""
         if self.local is not None:
-            below = os.listdir(self.local) if self.local.is_dir() else []
-        else:
-            below = []
-            with contextlib.suppress(FileNotFoundError), _in_words("listing", self.text):
-                paths = (str(path).strip("/") for path in self._files.ls(self._path, detail=False))
-                below = [path.rpartition("/")[2] for path in paths if path != self._path]
-        return sorted(name for name in below if name and not is_temporary(name))
+            return sorted(os.listdir(self.local)) if self.local.is_dir() else []
+        with contextlib.suppress(FileNotFoundError), _in_words("listing", self.text):
+            paths = (str(path).strip("/") for path in self._files.ls(self._path, detail=False))
+            return sorted(path.rpartition("/")[2] for path in paths if path != self._path)
+        return []
 
     def tree(self) -> dict[str, int]:
         """Sizes of all files below in bytes, by relative name."""
-        if self.local is not None:
-            return {name: (self.local / name).stat().st_size for name in _files_below(self.local)}
         with contextlib.suppress(FileNotFoundError), _in_words("listing", self.text):
             found = {str(path).strip("/"): facts for path, facts in self._files.find(self._path, detail=True).items()}
             head = f"{self._path}/"
@@ -388,15 +352,11 @@ class Location:
             for first in range(0, len(missing), _GROUP):
                 places = {name: to / name if name else to for name in missing[first : first + _GROUP]}
                 parts = {name: at.with_name(f".{at.name}.fetching.part") for name, at in places.items()}
-                if self.local is not None:
-                    for name, part in parts.items():
-                        store.copy_in_tree(self.local / name, part)
-                else:
-                    for part in parts.values():
-                        store.make_folder(part.parent)
-                    sources = [f"{self._path}/{name}" if name else self._path for name in parts]
-                    with _in_words("fetching", self.text, "a file was removed while it was fetched"):
-                        self._files.get(sources, [str(part) for part in parts.values()], batch_size=_FILES_AT_ONCE)
+                for part in parts.values():
+                    store.make_folder(part.parent)
+                sources = [f"{self._path}/{name}" if name else self._path for name in parts]
+                with _in_words("fetching", self.text, "a file was removed while it was fetched"):
+                    self._files.get(sources, [str(part) for part in parts.values()], batch_size=_FILES_AT_ONCE)
                 for name, part in parts.items():
                     size, sha256 = part.stat().st_size, store.sha256_file(part) if wanted[name].sha256 else ""
                     if wanted[name] != Expected(size, sha256):
@@ -466,18 +426,12 @@ class Location:
         with log.task(f"uploading {self}", len(files)) as bar:
             sent = sorted(set(files) - there - manifest)
             for names in (sent[first : first + _GROUP] for first in range(0, len(sent), _GROUP)):
-                if self.local is not None:
-                    for name in names:
-                        store.copy_in_tree(frm / name, self.local / name)
-                    store.sync_tree(self.local)
-                else:
-                    # S3 takes 10,000 parts of a file
-                    part = {"chunksize": max(_CHUNK, *(files[name].size // 9000 for name in names))}
-                    options = part if PACKAGES[scheme_of(self.text)][0] == "s3fs" else {}
-                    targets = [f"{self._path}/{name}" for name in names]
-                    with _in_words("uploading", self.text, _NO_BUCKET):
-                        sources = [str(frm / name) for name in names]
-                        self._files.put(sources, targets, batch_size=_FILES_AT_ONCE, **options)
+                # S3 takes 10,000 parts of a file
+                part = {"chunksize": max(_CHUNK, *(files[name].size // 9000 for name in names))}
+                options = part if PACKAGES[scheme_of(self.text)][0] == "s3fs" else {}
+                sources, targets = zip(*((str(frm / name), f"{self._path}/{name}") for name in names))
+                with _in_words("uploading", self.text, _NO_BUCKET):
+                    self._files.put(list(sources), list(targets), batch_size=_FILES_AT_ONCE, **options)
                 bar.advance(len(names))
         sizes = self.tree()
         for name in sorted(set(files) - manifest):
@@ -491,9 +445,5 @@ class Location:
 
     def put_file(self, file: Path) -> None:
         """Upload one file to this place."""
-        if self.local is not None:
-            with store.atomic_path(self.local) as temporary:
-                shutil.copyfile(store.regular(file), temporary)
-            return
         with _in_words("uploading", self.text, _NO_BUCKET):
             self._files.put_file(str(file), self._path)

@@ -160,28 +160,24 @@ _LONGEST_NAME, _LONGEST_PATH = 230, 3800
 """Bytes: what file systems take (255 and 4096), less what temporary names and files inside the folder add."""
 
 
-def refuse_overlap(out: Path | str | Sequence[Path], inputs: Mapping[str, Path | str | None]) -> None:
+def refuse_overlap(out: Path | str, inputs: Mapping[str, Path | str | None]) -> None:
     """UsageError for an output that is, holds or lies in an input, or that cannot be. To be called before anything is
     written. Links, ``..`` and, where the file system does not tell them apart, upper and lower case make no difference.
     inputs: name for messages -> file or folder that is read (None or empty: not given)."""
-    outs = [out] if isinstance(out, Path | str) else out
-    for one in outs:
-        _refuse_impossible(one)
-    lines_out = {str(one): _line_of(Path(one)) for one in outs}
-    heads_out = {line[0]: one for one, line in lines_out.items()}
-    heads_in: dict[object, tuple[str, Path | str]] = {}
+    _refuse_impossible(out)
+    line_out = _line_of(Path(out))
     for name, given in inputs.items():
         if given is None or not str(given):
             continue
         line = _line_of(Path(given))
-        heads_in[line[0]] = (name, given)
-        for head in line:
-            if head in heads_out:
-                _refuse("is also" if head == line[0] else "holds", heads_out[head], name, given)
-    for one, line in lines_out.items():
-        for head in line:
-            if head in heads_in:
-                _refuse("lies in", one, *heads_in[head])
+        if line_out[0] in line:
+            relation = "is also" if line_out[0] == line[0] else "holds"
+        elif line[0] in line_out:
+            relation = "lies in"
+        else:
+            continue
+        what, where, got = f"the output {relation} an input", f"output: {out}", f"{name}: {given}"
+        raise UsageError(what, where=where, got=got, remedy="choose an output apart from everything that is read")
 
 
 def _refuse_impossible(out: Path | str) -> None:
@@ -199,11 +195,6 @@ def _refuse_impossible(out: Path | str) -> None:
     if above is not None and not above.is_dir():
         remedy = "choose another --out"
         raise UsageError("the output lies below something that is no folder", where=text, got=str(above), remedy=remedy)
-
-
-def _refuse(relation: str, out: str, name: str, given: Path | str) -> None:
-    remedy = "choose an output apart from everything that is read"
-    raise UsageError(f"the output {relation} an input", where=f"output: {out}", got=f"{name}: {given}", remedy=remedy)
 
 
 def _line_of(path: Path) -> list[object]:
@@ -349,22 +340,14 @@ class RunDir:
     def __init__(
         self, out: Path, path: Path, output: VerbOutput, key: str, inputs: Mapping[str, str], *, complete: bool = False
     ) -> None:
-        self.out = out
-        self.path = path
-        self.verb = output.verb
-        self.key = key
-        self.inputs = dict(inputs)
-        self.complete = complete
+        self.out, self.path, self.verb, self.key, self.inputs = out, path, output.verb, key, dict(inputs)
+        self.complete = self._ended = complete
         self.fresh = not path.is_dir() or not any(path.iterdir())
         """Whether nothing was in the folder when it was opened."""
-        self._output = output
-        self._made_folder = path != out or not path.is_dir()
-        self._meter = Meter()
-        self._earlier: Usage | None = None
+        self._output, self._made_folder, self._meter = output, path != out or not path.is_dir(), Meter()
+        self._earlier = Usage()
+        """What earlier, interrupted runs of this same key have taken."""
         self._paths: dict[str, list[str]] = {}
-        self._ended = complete
-        self._seen: Mapping[str, Any] = {}
-        """What the folder's record said when it was opened."""
         self._board: Any = None
 
     @classmethod
@@ -420,26 +403,27 @@ class RunDir:
         run = cls(out, work, output, key, inputs)
         known = {name: path for name, path in (paths or {}).items() if path}
         run._paths = {name: [os.path.relpath(path, out), str(path.absolute())] for name, path in known.items()}
-        run._seen = state if work == out else run_state(work)
+        seen = state if work == out else run_state(work)
         if work != out and staged.get("key") == key and _is_finished(work):
             _drop_lock_of_the_dead(work / _LOCK)
             run._take_place()
             run.complete = True
             return run
-        run._begin(config)
+        run._begin(config, seen)
         if work != out:
             log.info(f"{output.verb}: {out} stays as it is until the new result is finished; that is made in {work}")
         return run
 
-    def _begin(self, config: Mapping[str, Any]) -> None:
-        """Lock the folder and write down what is made in it."""
+    def _begin(self, config: Mapping[str, Any], seen: Mapping[str, Any]) -> None:
+        """Lock the folder and write down what is made in it. seen: its record when it was opened."""
         import yaml
 
         take_lock(self.path / _LOCK)
-        if run_state(self.path) != self._seen:
+        if run_state(self.path) != seen:
             (self.path / _LOCK).unlink(missing_ok=True)
             what = "another process has worked in this folder meanwhile"
             raise ResourceError(what, where=str(self.path), remedy="repeat the command")
+        self._earlier = Usage.of_record(seen) if seen.get("key") == self.key else Usage()
         self._write_state("running", {})
         values = {"verb": self.verb, **json.loads(store.json_text(dict(config)))}
         store.write_text(self.path / _SETTINGS, yaml.safe_dump(values, sort_keys=False))
@@ -449,20 +433,13 @@ class RunDir:
 
         if state != "running":
             self._meter.stop()
-        spent = self.spent_before().then(self._meter.usage()).record()
+        spent = self._earlier.then(self._meter.usage()).record()
         own = sum(folder_bytes(self.path / name) for name in (_STATE, _LOCK))  # the first holds the size
         values = {"schema": store.RUN_SCHEMA, "verb": self.verb, "key": self.key, "inputs": self.inputs, "state": state}
         values |= {**spent, "written_bytes": folder_bytes(self.path) - own, "files": list(self._output.files)}
         values |= {"environment": environment(), "summary": dict(summary)}
         values |= {"paths": self._paths} if self._paths else {}
         store.write_json(self.path / _STATE, store.sealed(values, self.path) if state == "complete" else values)
-
-    def spent_before(self) -> Usage:
-        """What earlier, interrupted runs of this same key have taken."""
-        if self._earlier is None:
-            state = run_state(self.path)
-            self._earlier = Usage.of_record(state) if state.get("key") == self.key else Usage()
-        return self._earlier
 
     def log(self, **fields: Any) -> None:
         """Append one JSON line to log.jsonl; its numbers go to TensorBoard, too, if it is watched."""

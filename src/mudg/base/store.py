@@ -134,13 +134,6 @@ def write_in_tree(path: Path, content: bytes) -> None:
         Path(path).write_bytes(content)
 
 
-def copy_in_tree(source: Path, path: Path) -> None:
-    """``write_in_tree`` of another file's content."""
-    make_folder(path.parent)
-    with _writing(path):
-        shutil.copyfile(source, path)
-
-
 def sync_tree(folder: Path) -> None:
     """Wait until every file below ``folder`` is on the disk: one flush of everything where the system offers that,
     which is 30 times faster for many small files, else file by file."""

@@ -693,9 +693,9 @@ class Gaussians(_Brief):
 
 @dataclass(slots=True, eq=False, repr=False)
 class RasterTrace(_Brief):
-    """What densification needs to know about a render; of several views, with a leading dimension V. means2d: f32[N, 2]
-    pixels; its gradient is kept after backward. radii: i32[N, 2] half extent in pixels, 0 = not drawn. visible:
-    bool[N]. abs_grad2d: f32[N, 2], sum over pixels of absolute gradients; filled by backward if asked for."""
+    """What densification needs to know about a render. means2d: f32[N, 2] pixels; its gradient is kept after backward.
+    radii: i32[N, 2] half extent in pixels, 0 = not drawn. visible: bool[N]. abs_grad2d: f32[N, 2], sum over pixels of
+    absolute gradients; filled by backward if asked for."""
 
     means2d: Tensor
     radii: Tensor
@@ -705,9 +705,8 @@ class RasterTrace(_Brief):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Render(_Brief):
-    """A rendered view; of several views drawn at once, with a leading dimension V. rgb: f32[3, H, W]. depth: f32[1, H,
-    W] metres: expected camera z (accumulated / alpha). alpha: f32[1, H, W] in [0, 1]. extra: f32[C, H, W] or None:
-    accumulated, not divided by alpha."""
+    """A rendered view. rgb: f32[3, H, W]. depth: f32[1, H, W] metres: expected camera z (accumulated / alpha). alpha:
+    f32[1, H, W] in [0, 1]. extra: f32[C, H, W] or None: accumulated, not divided by alpha."""
 
     rgb: Tensor
     depth: Tensor

@@ -19,16 +19,12 @@ LightTime = Literal["as_recorded", "overcast", "dusk", "night"]
 
 
 class FogSettings(StrictRecord):
-    """Fog, or haze: extinction that is the same up to a height, or fades with it."""
+    """Fog, or haze: extinction that is the same up to a height."""
 
     visibility_m: Annotated[float, Field(ge=5, le=100_000)] = 150.0
     """Meteorological optical range, metres: where contrast falls to 5 %. Fog is below 1000."""
-    height_m: Annotated[float, Field(ge=0, le=2000)] = 0.0
-    """Height above the ground at which fog is thinner by the factor e, metres; 0 = the same at all heights below
-    ``top_m``."""
     top_m: Annotated[float, Field(ge=5, le=5000)] = 300.0
-    """Upper end of fog that does not fade with height, metres above the ground. It decides how much of the sky is
-    seen."""
+    """Upper end of the fog, metres above the ground. It decides how much of the sky is seen."""
 
 
 class RainSettings(StrictRecord):
@@ -49,8 +45,6 @@ class SnowSettings(StrictRecord):
     """Share of open level surfaces that is white."""
     mm_h: Annotated[float, Field(ge=0, le=10)] = 0.0
     """Rate of falling snow as water, millimetres per hour: 1 is moderate, 4 heavy; 0 = none falls."""
-    tracks: Annotated[float, Field(ge=0, le=1)] = 0.3
-    """What is left of the cover where wheels went."""
     wind_m_s: Wind = (0.5, 0.0)
     """Wind along world x and y, metres per second."""
     reach_m: Annotated[float, Field(ge=1, le=30)] = 8.0

@@ -181,8 +181,7 @@ class Chain:
         model, out = self.fitted(row, virtual), self.out / "render" / row.name
         if row.name != MIXED:
             return self.run(RenderViews(scene=scene or self.scene, model=model, out=out, settings=drawn))
-        how = replace(drawn.harmonize, model=self.config.model, precision=self.config.precision)
-        drawn = replace(drawn, repair=True, harmonize=how)
+        drawn = replace(drawn, repair=True, repair_model=self.config.model)
         return self.run(RenderViews(scene=self.scene, model=model, fused=self.fused, out=out, settings=drawn))
 
     # ---- fits ----

@@ -49,12 +49,10 @@ from mudg.core import metrics
 from mudg.diffusion import model_files
 from mudg.scene.read import read_scene
 from mudg.scene.road import Road
-from mudg.sim.cockpit import Cockpit
-from mudg.sim.drive import Drive, Following, RoadUser, beginning
-from mudg.sim.lidar import LidarRequest
+from mudg.sim.drive import Cockpit, Drive, Following, RoadUser, beginning
+from mudg.sim.lidar import LidarRequest, MountedLidar, mounted
 from mudg.sim.pilots import DriverView, EdgePilot, RoutePilot
 from mudg.sim.session import Instant, Session
-from mudg.sim.sweeps import MountedLidar, mounted
 from mudg.steps.settings import PresetName
 
 EXACT: Final = "exact city"

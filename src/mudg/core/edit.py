@@ -300,13 +300,6 @@ def grounded(motion: Motion, before: Motion, ground: HeightMap) -> Motion:
     return _set_on(motion, ground.height(new) - ground.height(old), ground.normal(old), ground.normal(new))
 
 
-def regrounded(motion: Motion, old: HeightMap, new: HeightMap) -> Motion:
-    """A path on other ground below the same places: the height above it and the tilt against it stay. Unknown ground
-    changes nothing."""
-    xy = motion.poses[:, :2, 3]
-    return _set_on(motion, new.height(xy) - old.height(xy), old.normal(xy), new.normal(xy))
-
-
 def _set_on(motion: Motion, rise: Array, before: Array, after: Array) -> Motion:
     """A path whose ground rises, and turns from one normal to another, at every key; NaN: stays."""
     poses = motion.poses.copy()

@@ -20,10 +20,9 @@ from mudg.base.palette import DYNAMIC_IDS
 from mudg.base.types import Camera, Track, View
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.rendering import outline_mask
-from mudg.sim.lidar import LidarReply, LidarRequest
+from mudg.sim.lidar import LidarReply, LidarRequest, mounted
 from mudg.sim.optics import Pinhole
 from mudg.sim.session import CameraReply, CameraRequest, Instant, Layer, Session, Trust
-from mudg.sim.sweeps import mounted
 
 SLACK_M: Final = (0.5, 1.5)
 """How far before and behind its box a surface may be that belongs to a parked object (windows let depth through)."""

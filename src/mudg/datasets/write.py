@@ -28,8 +28,8 @@ from mudg.editing.render import trajectories
 from mudg.editing.runs import find_run, scene_at
 from mudg.editing.settings import RenderConfig
 from mudg.scene.read import read_scene
+from mudg.sim.lidar import mounted
 from mudg.sim.session import Layer, Session, Trust
-from mudg.sim.sweeps import mounted
 
 Record = Mapping[str, Any]
 PNG_BYTES: Final = 2.2

@@ -34,22 +34,19 @@ from mudg.base.types import EgoPath, FusedCloud, Observation, PointCloud, Scene,
 from mudg.base.weather_settings import Conditions
 from mudg.core import trajectory
 from mudg.core.edit import HeightMap, Motion
-from mudg.core.harmonics import left_product_matrix
-from mudg.core.table import Table
 from mudg.core.weather import ShownView, drive_facts, edited_view
 from mudg.diffusion.inputs import InWeather
 from mudg.editing import model as edited
 from mudg.editing import plan as plans
 from mudg.editing.model import GROUND_CLASSES, Asset, linear_of
-from mudg.editing.plan import Actor, Background, EditPlan, EditSources, EditWorld
+from mudg.editing.plan import Actor, EditPlan, EditWorld
 from mudg.editing.runs import RunParts, find_run
 from mudg.editing.script import EditScript, conditions_of
-from mudg.gaussians.model import CERTAINTY, SceneModel
+from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import RigidNode, SkyNode
 from mudg.gaussians.rendering import raster_of, render_view
 from mudg.gaussians.start import SH_C0
 from mudg.gaussians.storage import load_model
-from mudg.scene.clouds import read_fused
 from mudg.scene.read import decode_image, read_scene
 
 EGO_FACT: Final = "edited_ego"
@@ -86,11 +83,8 @@ def left_behind(model: SceneModel, plan: EditPlan) -> tuple[tuple[str, ...], ...
     """Ids of what a plan cuts out of the background, of what it removes, of those behind which the street is closed,
     and of those whose sides are closed."""
     without_nodes = sorted({*plan.changes, *plan.removed} - set(model.node_names()))
-    sides = sorted(plan.sides & set(plan.before.actors)) if plan.views else []
     closed = sorted(plan.closed & set(plan.before.actors)) if plan.views else []
-    if plan.background is not None:  # it is gone with the street
-        without_nodes, closed = [], []
-    return tuple(without_nodes), tuple(plan.removed), tuple(closed), tuple(sides)
+    return tuple(without_nodes), tuple(plan.removed), tuple(closed), tuple(sorted(plan.sides))
 
 
 def _some(names: Sequence[str]) -> str:
@@ -103,11 +97,6 @@ def edited_model(
     """A fitted scene with a plan carried out. ``sky``: panorama of the plan's ``sky``. ``street``: what ``street_left``
     made of the scene before."""
     model = street_left(model, plan) if street is None else street
-    if plan.background is not None:
-        other, pose = plan.background
-        model = with_background(model, other.model, pose)
-        if plan.objects_gain is not None:
-            model = with_relit_objects(model, plan.objects_gain)
     nodes = list(model.nodes)
     for index, node in enumerate(nodes):
         if isinstance(node, RigidNode) and node.name in plan.changes:
@@ -117,7 +106,7 @@ def edited_model(
         actor = plan.after.actors[name]
         model = edited.with_asset(model, insertion.asset, name, actor.motion, actor.label)
         if insertion.shadow > 0:
-            model = edited.with_shadow(model, name, insertion.shadow, insertion.sun)
+            model = edited.with_shadow(model, name, insertion.shadow)
     if sky is not None and plan.sky is not None:
         model = replace(model, sky=_panorama(sky, plan.sky.yaw_deg, model))
     if plan.erased:
@@ -126,54 +115,6 @@ def edited_model(
         model = edited.without_rows(model, gone)
     model.sort_rows()
     return model
-
-
-def with_relit_objects(model: SceneModel, gain: NDArray[np.float64]) -> SceneModel:
-    """A copy whose objects give off their linear light times a gain f64[3]; what their colours add with direction grows
-    with them."""
-    mine, old = (model.table.labels["node"] > 0)[:, None, None], model.table["sh_dc"].detach()
-    columns = {"sh_dc": (new := torch.where(mine, edited.relit(old, gain), old))}
-    if "sh_rest" in model.table.columns:
-        before, after = ((0.5 + SH_C0 * value).clamp(min=1 / 255) for value in (old, new))
-        rest = model.table["sh_rest"].detach()
-        columns["sh_rest"] = torch.where(mine, rest * (after / before), rest)
-    return edited.changed(model, columns)
-
-
-def with_background(model: SceneModel, other: SceneModel, world_from_other: NDArray[np.float64]) -> SceneModel:
-    """A copy whose background and sky are those of another scene; its objects stay.
-
-    Classes are taken over by name, colours of degree 1 and more dropped: they hold the other scene's directions.
-    ``world_from_other``: rigid 4x4, a turn about z and a translation. UsageError: a background that changes with
-    time."""
-    for scene in (model, other):
-        if scene.nodes[0].kind != "static":
-            what = "a background that changes with time cannot be exchanged"
-            raise UsageError(what, got=f"kind {scene.nodes[0].kind}")
-    rows = (other.table.labels["node"] == 0).nonzero()[:, 0]
-    given = {name: value.detach()[rows].cpu() for name, value in other.table.columns.items()}
-    columns, labels = (edited.zeros_like(own, len(rows)) for own in (model.table.columns, model.table.labels))
-    columns |= {name: given[name] for name in ("log_scales", "logits", "sh_dc")}
-    columns["means"] = torch.from_numpy(geometry.transform_points(world_from_other, given["means"].numpy()))
-    turn = torch.from_numpy(geometry.quaternion_from_matrix(world_from_other)).float()
-    columns["quats"] = given["quats"] @ left_product_matrix(turn).T
-    if "semantics" in columns:
-        columns["semantics"] = torch.full((len(rows), len(model.classes)), edited.ABSENT_LOGIT)
-        for channel, train_id in enumerate(model.classes):
-            if train_id in other.classes:
-                columns["semantics"][:, channel] = given["semantics"][:, other.classes.index(train_id)]
-    if CERTAINTY in labels and other.certainty is not None:
-        labels[CERTAINTY] = other.certainty[rows].cpu().to(labels[CERTAINTY].dtype)
-    mine, there = (model.table.labels["node"] > 0).nonzero()[:, 0], model.device
-    joined = lambda street, own: {
-        key: torch.cat([street[key].to(there), value.detach()[mine]]) for key, value in own.items()
-    }
-    sky = None
-    if other.sky is not None:
-        shift = round(geometry.yaw_of(world_from_other) / np.pi * other.sky.rows)
-        turned = torch.roll(other.sky.table["panorama"].detach(), shift, dims=3)
-        sky = SkyNode(Table({"panorama": turned})).to(there)
-    return edited.changed(model, joined(columns, model.table.columns), joined(labels, model.table.labels), sky=sky)
 
 
 def _erased(plan: EditPlan, xyz: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -265,18 +206,6 @@ def edited_cloud(cloud: FusedCloud, plan: EditPlan) -> FusedCloud:
     for name in sorted(standing - set(objects)):
         static, objects[name] = _cut_points(static, _track(name, plan.before.actors[name]))
     objects = {name: points for name, points in objects.items() if name not in plan.removed}
-    if plan.background is not None:
-        other, world_from_other = plan.background
-        if other.points is None:
-            raise UsageError("the other run has no fused points", remedy="name a folder made by `mudg run`")
-        xyz = geometry.transform_points(world_from_other, other.points.xyz.astype(np.float64))
-        static = replace(other.points, xyz=xyz.astype(np.float32))
-        kept = {name: points for name, points in objects.items() if name not in standing}
-        if plan.objects_gain is not None:
-            lit = lambda rgb: edited.display_of(linear_of(rgb / 255) * plan.objects_gain)
-            as_bytes = lambda rgb: np.rint(lit(rgb).clip(0, 1) * 255).astype(np.uint8)
-            kept = {name: replace(points, rgb=as_bytes(points.rgb)) for name, points in kept.items()}
-        objects = kept
     objects |= {name: asset_points(insertion.asset) for name, insertion in plan.inserted.items()}
     if plan.erased:
         static = some_points(static, ~_erased(plan, static.xyz))
@@ -366,8 +295,6 @@ def _track(name: str, actor: Actor) -> Track:
 
 # -- a script carried out ---------------------------------------------------------------------------
 
-IMPORTED = "imported"
-"""Method of a scene that was read from a file of another program."""
 FACT = "edits"
 """Fact of an edited fitted scene: the script, its digest, and what its checks found."""
 
@@ -407,17 +334,10 @@ def carry_out(
         raise InputError(what, where="weather, light, season", remedy=remedy)
     ground = ground_of(cloud, model)
     world = EditWorld.of_model(model, ground) if scene is None else EditWorld.of_scene(scene, ground)
-
-    def background(name: str) -> Background:
-        if model is None:
-            what, remedy = "points alone cannot get another background", "give a fit (--fitted)"
-            raise InputError(what, where="run", got=name, remedy=remedy)
-        return background_of(find_run(script.path_of(name)), name)
-
     closes = scene is not None and scene.source.recipe is None  # a city has exact pictures of what an object hid
     from_run = lambda source: asset_from(find_run(script.path_of(source.run)), source.id)
     asset = lambda source: from_run(source) if source.file is None else read_asset(script.path_of(source.file))
-    plan = plans.plan_edits(script, world, EditSources(asset, background, close_street=closes))
+    plan = plans.plan_edits(script, world, asset, closes)
     plan.views = () if scene is None else tuple(frame.view for frame in scene.frames)
     if model is not None:
         take_light(plan, model)
@@ -427,31 +347,11 @@ def carry_out(
         plan.notes.append({"kind": "street not closed", "ids": names, "text": text})
     made = None if scene is None else edited_scene(scene, plan)
     views = tuple([frame.view for frame in s.frames] if s else [] for s in (scene, made))
-    plan.sides &= plans.shown_anew(plan, *views)
+    plan.sides = plans.shown_anew(plan, *views)
     notes = plans.check(plan, *views)
     for note in notes:
-        (log.info if note["kind"] == "lateral acceleration" else log.warn)(f"edit: {note['text']}")
+        log.warn(f"edit: {note['text']}")
     return EditedDrive(script, plan, made, None if cloud is None else edited_cloud(cloud, plan), notes)
-
-
-def background_of(parts: RunParts, name: str) -> Background:
-    """The street of a run; or of a file, which begins at its origin and leads along x. InputError: a fit by itself, of
-    which the path of the vehicle is not known, or one without ground."""
-    if parts.scene is None:
-        model = load_model(parts.model)
-        if model.facts.get("method") != IMPORTED:
-            what, expected = "of a fit alone it is not known where its street lies", "a folder made by `mudg run`"
-            raise InputError(what, where="run", got=name, expected=f"{expected} or by `mudg asset import --kind scene`")
-        known, still = edited.ground_points(model), Motion.recorded([0.0], np.eye(4)[None])
-        return Background(model, still, known if len(known) else edited.lowest_points(model))
-    scene, model = read_scene(parts.scene), load_model(parts.model)
-    ground, cloud = edited.ground_points(model), None if parts.fused is None else read_fused(parts.fused).static
-    if cloud is not None and cloud.semantics is not None:
-        ground = cloud.xyz[np.isin(cloud.semantics, GROUND_CLASSES)]
-    if not len(ground):
-        raise InputError("the other street has no ground: its fit knows no classes", where="run", got=name)
-    light = surface_light(model, [frame.view for frame in scene.frames])
-    return Background(model, Motion.recorded(scene.ego.times_s, scene.ego.world_from_ego), ground, cloud, light)
 
 
 # -- objects as files --------------------------------------------------------------------------------
@@ -571,22 +471,15 @@ def surface_light(model: SceneModel, views: Sequence[View]) -> NDArray[np.float6
 
 
 def take_light(plan: EditPlan, model: SceneModel) -> None:
-    """Give a plan's new objects, and those that are kept in another street, the light of the street where they will be.
-    ``plan``: with the views of the recording. ``model``: the fitted scene to be edited."""
+    """Give a plan's new objects the light of the street. ``plan``: with the views of the recording. ``model``: the
+    fitted scene to be edited."""
     wanting = [name for name, insertion in plan.inserted.items() if insertion.match_light]
-    if not wanting and not plan.match_objects:
-        return
-    here = surface_light(model, plan.views)
-    there = here if plan.background is None else plan.background[0].light_rgb
+    here = surface_light(model, plan.views) if wanting else None
     unknown = []
     for name in wanting:
         asset = plan.inserted[name].asset
-        unknown += [name] if there is None or asset.light_rgb is None else []
-        lit, _ = edited.matched_light(asset, there)
-        plan.inserted[name] = replace(plan.inserted[name], asset=lit, match_light=False)
-    if plan.match_objects:
-        plan.objects_gain = edited.light_gain(here, there)
-        unknown += [] if here is not None and there is not None else ["what was recorded"]
+        unknown += [name] if here is None or asset.light_rgb is None else []
+        plan.inserted[name] = replace(plan.inserted[name], asset=edited.matched_light(asset, here), match_light=False)
     if unknown:
         why = "for the light of one of the two streets is not known"
         how = "it takes recorded views: give --scene; export assets with --scene"
@@ -610,15 +503,12 @@ def drawer(model: SceneModel) -> Drawer:
 
 def weather_of(draw: Drawer, conditions: Conditions, scene: Scene) -> InWeather:
     """Weather for all views of a drive, with its light and ground. ``draw``: the views as they are, with depth and
-    classes. ``scene``: its recorded views tell the light of the drive, its path where wheels went and how fast the
-    cameras are. InputError: views without depth or classes."""
+    classes. ``scene``: its recorded views tell the light of the drive, its path how fast the cameras are. InputError:
+    views without depth or classes."""
     frames = sorted(scene.frames, key=lambda frame: (frame.view.time_s, frame.view.camera.name))
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(WITNESSES, len(frames))).round().astype(int))
     witnesses = [_shown(draw(frames[int(index)].view)) for index in chosen]
-    poses = scene.ego.world_from_ego
-    path = np.column_stack([poses[:, 0, 3], poses[:, 1, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])])  # x, y, yaw
-    drive = drive_facts(witnesses, path)
-    return InWeather(conditions, drive, SEED, functools.partial(trajectory.velocity, scene.ego))
+    return InWeather(conditions, drive_facts(witnesses), SEED, functools.partial(trajectory.velocity, scene.ego))
 
 
 def in_weather(draw: Drawer, how: InWeather) -> Drawer:

@@ -291,19 +291,13 @@ def with_asset(model: SceneModel, asset: Asset, name: str, motion: Motion, label
     return with_rows(model, columns, labels, nodes=(*model.nodes, node.to(model.device)))
 
 
-def relit(sh_dc: Tensor, gain: Array) -> Tensor:
-    """Colours of degree 0 f32[n, 1, 3] with their linear light multiplied by a gain f64[3]; what is below black
-    stays."""
-    shown = 0.5 + SH_C0 * sh_dc.detach().cpu().double().numpy()
-    lit = np.where(shown > 0, display_of(linear_of(shown) * gain), shown)
-    return torch.from_numpy((lit - 0.5) / SH_C0).to(sh_dc)
-
-
-def matched_light(asset: Asset, there: Array | None) -> tuple[Asset, Array]:
-    """The asset in the light of a scene (mean light f64[3] of its surfaces), and the gain f64[3] of its linear light
-    (``light_gain``)."""
+def matched_light(asset: Asset, there: Array | None) -> Asset:
+    """The asset in the light of a scene, of whose surfaces ``there`` f64[3] is the mean light (``light_gain``)."""
     gain = light_gain(None if asset.light_rgb is None else np.asarray(asset.light_rgb), there)
-    return replace(asset, columns={**asset.columns, "sh_dc": relit(asset.columns["sh_dc"], gain)}), gain
+    shown = 0.5 + SH_C0 * asset.columns["sh_dc"].double().numpy()
+    lit = np.where(shown > 0, display_of(linear_of(shown) * gain), shown)  # what is below black stays
+    relit = torch.from_numpy((lit - 0.5) / SH_C0).to(asset.columns["sh_dc"])
+    return replace(asset, columns={**asset.columns, "sh_dc": relit})
 
 
 def light_gain(here: Array | None, there: Array | None) -> Array:
@@ -327,27 +321,26 @@ SHADOW_BLUR: Final = 0.15
 """Width of a contact shadow's edge, as a share of the height of what casts it."""
 
 
-def with_shadow(model: SceneModel, name: str, strength: float, sun: Array | None = None) -> SceneModel:
+def with_shadow(model: SceneModel, name: str, strength: float) -> SceneModel:
     """A copy in which an object darkens the ground that it stands on.
 
     Under an overcast sky the ground below a box loses the share of light that the box covers. Black flat Gaussians at
     the bottom of the box, in its frame and so with it at all times, take away ``strength`` of the light below it, less
-    towards the edge, which is as wide as `SHADOW_BLUR` of the box's height. Where the sun shines, so does the ground
-    from which the box hides it. They carry no class and hardly any depth of their own. ``strength``: share of the
-    (linear) light that is missing below the middle of the box. ``sun``: direction f64[3] of the world towards the sun,
-    above the ground; None = none. The shadow turns with the object: it is right for the heading in the middle of its
-    path."""
+    towards the edge, which is as wide as `SHADOW_BLUR` of the box's height. They carry no class and hardly any depth of
+    their own. ``strength``: share of the (linear) light that is missing below the middle of the box."""
     node = model.dynamic_object(name)
-    toward, middle = None, len(node.times_s) // 2
-    if sun is not None:
-        toward = node.corrected_keys(slice(middle, middle + 1))[0, :3, :3].T @ sun
-    xy, share = _covered(np.array(node.size_m), toward)
+    size = np.array(node.size_m)
+    counts, blur = np.maximum(2, np.ceil(size[:2] / SHADOW_STEP_M).astype(int) + 1), SHADOW_BLUR * size[2]
+    axes = [(np.arange(count, dtype=np.float64) - (count - 1) / 2) * SHADOW_STEP_M for count in counts]
+    xy = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
+    edge = np.minimum(size[:2] / 2 - np.abs(xy) + blur, 2 * blur + 1e-6)
+    share = (edge / (2 * blur + 1e-6)).clip(0, 1).prod(1)
     # Overlapping Gaussians of opacity a on a grid of step s and spread s pass exp(-2 pi a) of the light, nearly.
     dark = 1 - (1 - strength) ** (1 / 2.2)  # in display values
     opacity = (-np.log(np.maximum(1 - dark * share, 1e-3)) / (2 * np.pi)).clip(1e-4, 0.95)
     count = len(xy)
     columns, labels = (zeros_like(own, count) for own in (model.table.columns, model.table.labels))
-    flat = np.column_stack([xy, np.full(count, -node.size_m[2] / 2 + SHADOW_LIFT_M)]).astype(np.float32)
+    flat = np.column_stack([xy, np.full(count, SHADOW_LIFT_M - size[2] / 2)]).astype(np.float32)
     columns["means"], columns["quats"][:, 0] = torch.from_numpy(flat), 1.0
     columns["log_scales"] = torch.log(torch.tensor([SHADOW_STEP_M, SHADOW_STEP_M, 0.01])).repeat(count, 1)
     columns["logits"] = torch.from_numpy(np.log(opacity / (1 - opacity))).float()
@@ -356,29 +349,6 @@ def with_shadow(model: SceneModel, name: str, strength: float, sun: Array | None
     made = with_rows(model, columns, labels)
     made.sort_rows()
     return made
-
-
-def _covered(size: Array, sun: Array | None) -> tuple[Array, Array]:
-    """Places f64[n, 2] of the ground around a box, in its frame, and how much of their light it takes f64[n]; with the
-    direction towards the sun there, the larger of what it takes of the sky's and of the sun's."""
-    height, blur = size[2], SHADOW_BLUR * size[2]
-    sides = size[:2] if sun is None else 2 * (size[:2] / 2 + np.abs(sun[:2]) * height / sun[2] + blur)
-    counts = np.maximum(2, np.ceil(sides / SHADOW_STEP_M).astype(int) + 1)
-    axes = [(np.arange(count, dtype=np.float64) - (count - 1) / 2) * SHADOW_STEP_M for count in counts]
-    xy = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
-    edge = np.minimum(size[:2] / 2 - np.abs(xy) + blur, 2 * blur + 1e-6)
-    share = (edge / (2 * blur + 1e-6)).clip(0, 1).prod(1)
-    if sun is None:
-        return xy, share
-    around = [[0.0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [0.7, 0.7], [-0.7, 0.7], [0.7, -0.7], [-0.7, -0.7]]
-    hidden = np.zeros(len(xy))
-    beam = (sun / np.linalg.norm(sun))[None]
-    for x, y in np.array(around) * blur:
-        places = np.column_stack([xy + [x, y], np.full(len(xy), -height / 2)])
-        poses = (geometry.from_rotation_translation(np.eye(3), -place) for place in places)
-        hidden += [np.isfinite(met_box(beam, pose, size)[0]) for pose in poses]
-    share = np.maximum(share, hidden / len(around))
-    return xy[share > 0], share[share > 0]
 
 
 # -- the street where an object of the recording is gone --------------------------------------------

@@ -17,40 +17,17 @@ from numpy.typing import NDArray
 
 from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError, nearest
-from mudg.base.types import PointCloud, Scene, View
-from mudg.base.weather_settings import WeatherSettings
+from mudg.base.types import Scene, View
 from mudg.core import edit as paths
 from mudg.core.edit import Displacement, HeightMap, Motion
 from mudg.editing.model import Asset, motion_of
-from mudg.editing.script import EGO, AssetSource, EditScript, EraseEdit
+from mudg.editing.script import CONDITIONS, EGO, AssetSource, DisplacingEdit, EditScript, EraseEdit
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import RigidNode
 
 Change = Callable[[Motion], Motion]
 OpenAsset = Callable[[AssetSource], Asset]
 """Reads the object that a script names."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Background:
-    """Another street: its fit, the path of its vehicle, points f32[N, 3] of its ground; its fused points and the mean
-    light f64[3] of its surfaces, if they are known."""
-
-    model: SceneModel
-    ego: Motion
-    ground_xyz: np.ndarray
-    points: PointCloud | None = None
-    light_rgb: np.ndarray | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class EditSources:
-    """Reads what a script names: objects, and backgrounds by the path that is written there."""
-
-    asset: OpenAsset
-    background: Callable[[str], Background]
-    close_street: bool = False
-    """Whether the street is closed behind what leaves its place, where a script does not say."""
 
 
 SAME_PLACE_M: Final = 1e-4
@@ -103,13 +80,11 @@ class EditWorld:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Insertion:
-    """An object that is put in: what it is; how dark its shadow is; whether it takes the light of the scene; the
-    direction f64[3] towards the sun that casts its shadow, or None."""
+    """An object that is put in: what it is; how dark its shadow is; whether it takes the light of the scene."""
 
     asset: Asset
     shadow: float
     match_light: bool
-    sun: np.ndarray | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -118,35 +93,31 @@ class EditPlan:
 
     Args:
         before, after: the world, its actors and the vehicle, without and with the edits.
+        open_asset: reads the object that a script names.
+        close_street: whether the street is closed behind what leaves its place, where a script does not say.
         changes: what is done to the path of an actor of the recording, in order.
         removed: actors of the recording that are not there any more. inserted: new ones, by id.
-        sky: settings of the last `sky`, or None. background: another street, and its pose world_from_other f64[4, 4].
-        match_objects: whether the objects that are kept take the light of that street. objects_gain: by which factor
-            f64[3] of their linear light, or None.
-        conditions: records of weather, light and season.
+        sky: settings of the last `sky`, or None. erased: records of ``erase``: parts of the street that are taken away.
         notes: what the reader should know, with numbers.
         views: recorded ones, which say what nobody saw of the street; none where there is no scene.
         closed: actors without whose traces the street is to be shown, if they were recorded (``editing/model.py``).
-        erased: records of ``erase``: parts of the street that are taken away.
-        sides: actors whose sides that no view showed are to be closed (``editing/model.py``).
+        sides: actors whose sides that no view showed are closed (``shown_anew``).
     """
 
     before: EditWorld
     after: EditWorld
+    open_asset: OpenAsset
+    close_street: bool = False
     changes: dict[str, list[Change]] = field(default_factory=dict)
     removed: list[str] = field(default_factory=list)
     inserted: dict[str, Insertion] = field(default_factory=dict)
     sky: Any = None
-    background: tuple[Background, np.ndarray] | None = None
-    match_objects: bool = False
-    objects_gain: np.ndarray | None = None
-    conditions: dict[str, Any] = field(default_factory=dict)
+    erased: list[EraseEdit] = field(default_factory=list)
     notes: list[dict[str, Any]] = field(default_factory=list)
     moves_ego: bool = False
     views: tuple[View, ...] = ()
     closed: set[str] = field(default_factory=set)
     sides: set[str] = field(default_factory=set)
-    erased: list[EraseEdit] = field(default_factory=list)
 
     def changed(self, name: str, motion: Motion) -> Motion:
         """The path of an actor of the recording with all that is done to it."""
@@ -156,37 +127,22 @@ class EditPlan:
         """Ids of actors whose path or looks are new."""
         return tuple(dict.fromkeys([*(name for name in self.changes if name in self.after.actors), *self.inserted]))
 
-    @property
-    def weather_of_beams(self) -> WeatherSettings | None:
-        """Weather that LiDAR beams go through: with fog or rain, else None."""
-        weather = self.conditions.get("weather")
-        return weather if weather is not None and (weather.fog or weather.rain) else None
 
-
-_DISPLACING: Final = frozenset({"move", "stop", "speed", "lane_change", "path"})
-"""Verbs after which an object is not where it was recorded."""
-
-
-def plan_edits(script: EditScript, world: EditWorld, sources: EditSources) -> EditPlan:
+def plan_edits(script: EditScript, world: EditWorld, open_asset: OpenAsset, close_street: bool = False) -> EditPlan:
     """Carry out a script on paths. InputError: an id that does not exist, or something that cannot be done; the message
     names the line and the verb."""
-    plan = EditPlan(world, world, conditions=script.conditions())
+    plan = EditPlan(world, world, open_asset, close_street)
     for edit in script.edits:
-        if edit.verb in plan.conditions:
+        if edit.verb in CONDITIONS:
             continue
         try:
-            _VERBS[edit.verb](plan, edit.settings, sources)
-            if edit.verb in _DISPLACING:
-                _close(plan, edit.settings.id, edit.settings, sources)
-                (plan.sides.add if edit.settings.close_sides else plan.sides.discard)(edit.settings.id)
+            _VERBS[edit.verb](plan, edit.settings)
+            if isinstance(edit.settings, DisplacingEdit):
+                _close(plan, edit.settings.id, edit.settings.close_street)
         except (InputError, UsageError) as told:
             where = f"{edit.where}: {edit.verb}" + (f".{told.where}" if told.where else "")
             raise InputError(told.what, **{**told.fields, "where": where}) from told
     plan.closed = {name for name in plan.closed if _left_its_place(plan, name)}
-    others = set[str]()
-    if EGO in plan.sides:  # from another path of the vehicle, all are seen anew
-        others = set(plan.before.actors) & set(plan.after.actors) - set(plan.changes) - set(plan.inserted)
-    plan.sides = plan.sides & set(plan.changes) - {EGO} | others
     return plan
 
 
@@ -201,27 +157,27 @@ def _left_its_place(plan: EditPlan, name: str) -> bool:
 # -- verbs -----------------------------------------------------------------------------------------
 
 
-def _remove(plan: EditPlan, fields: Any, sources: EditSources) -> None:
-    names = fields.ids if fields.ids is not None else _chosen(plan.after, fields)
-    for name in names:
+def _remove(plan: EditPlan, fields: Any) -> None:
+    for name in fields.ids if fields.ids is not None else _chosen(plan.after, fields):
         _actor(plan.after, name)
-        _take_away(plan, name)
-        _close(plan, name, fields, sources)
+        plan.inserted.pop(name, None)
+        _recorded_goes(plan, name)
+        plan.after = replace(plan.after, actors={key: value for key, value in plan.after.actors.items() if key != name})
+        _close(plan, name, fields.close_street)
 
 
-def _close(plan: EditPlan, name: str, fields: Any, sources: EditSources) -> None:
+def _close(plan: EditPlan, name: str, asked: bool | None) -> None:
     """Note whether the street is to be closed behind an object; the last edit that says so counts."""
-    if name == EGO or (fields.close_street is None and not sources.close_street):
-        return
-    (plan.closed.discard if fields.close_street is False else plan.closed.add)(name)
+    if name != EGO and (plan.close_street if asked is None else asked):
+        plan.closed.add(name)
+    elif asked is False:
+        plan.closed.discard(name)
 
 
-def _take_away(plan: EditPlan, name: str) -> None:
-    plan.inserted.pop(name, None)
+def _recorded_goes(plan: EditPlan, name: str) -> None:
     if name in plan.before.actors and name not in plan.removed:
         plan.removed.append(name)
         plan.changes.pop(name, None)
-    plan.after = replace(plan.after, actors={key: value for key, value in plan.after.actors.items() if key != name})
 
 
 def _chosen(world: EditWorld, fields: Any) -> list[str]:
@@ -244,18 +200,18 @@ def _chosen(world: EditWorld, fields: Any) -> list[str]:
     return names
 
 
-def _move(plan: EditPlan, fields: Any, _: EditSources) -> None:
+def _move(plan: EditPlan, fields: Any) -> None:
     by = Displacement(
         fields.along_m, fields.left_m, fields.up_m, math.radians(fields.yaw_deg), fields.from_s, fields.ramp_s
     )
     _change(plan, fields.id, functools.partial(paths.moved, by=by, ground=plan.after.ground if fields.ground else None))
 
 
-def _stop(plan: EditPlan, fields: Any, _: EditSources) -> None:
+def _stop(plan: EditPlan, fields: Any) -> None:
     _change(plan, fields.id, functools.partial(paths.stopped, at_s=fields.at_s, brake_m_s2=fields.brake_m_s2))
 
 
-def _speed(plan: EditPlan, fields: Any, _: EditSources) -> None:
+def _speed(plan: EditPlan, fields: Any) -> None:
     motion = _motion(plan.after, fields.id)
     begin = float(motion.times_s[0]) if fields.from_s is None else max(fields.from_s, float(motion.times_s[0]))
     ahead = max(0.0, (fields.factor - 1) * (float(motion.times_s[-1]) - begin))
@@ -265,7 +221,7 @@ def _speed(plan: EditPlan, fields: Any, _: EditSources) -> None:
     _change(plan, fields.id, functools.partial(paths.sped, factor=fields.factor, from_s=fields.from_s))
 
 
-def _lane_change(plan: EditPlan, fields: Any, _: EditSources) -> None:
+def _lane_change(plan: EditPlan, fields: Any) -> None:
     peak = paths.QUINTIC_PEAK * abs(fields.left_m) / fields.duration_s**2
     if peak > fields.most_lateral_m_s2:
         least = math.sqrt(paths.QUINTIC_PEAK * abs(fields.left_m) / fields.most_lateral_m_s2)
@@ -273,14 +229,12 @@ def _lane_change(plan: EditPlan, fields: Any, _: EditSources) -> None:
         got = f"{peak:.2f} m/s^2 ({fields.left_m:g} m in {fields.duration_s:g} s)"
         remedy = f"a duration_s of {math.ceil(least * 100) / 100:g} or more, or a larger most_lateral_m_s2"
         raise InputError("the lane change is too sharp", where="duration_s", expected=expected, got=got, remedy=remedy)
-    text = f"{fields.id} changes lanes with at most {peak:.2f} m/s^2 sideways"
-    plan.notes.append({"kind": "lateral acceleration", "id": fields.id, "m_s2": round(peak, 3), "text": text})
     by = {name: getattr(fields, name) for name in ("left_m", "start_s", "duration_s")}
     ground = plan.after.ground if fields.ground else None
     _change(plan, fields.id, functools.partial(paths.lane_changed, **by, ground=ground))
 
 
-def _path(plan: EditPlan, fields: Any, _: EditSources) -> None:
+def _path(plan: EditPlan, fields: Any) -> None:
     ground = plan.after.ground if fields.ground else None
     _change(plan, fields.id, functools.partial(_other_path, points=_points(fields.points), ground=ground))
 
@@ -302,19 +256,17 @@ def _points(points: list[list[float]]) -> np.ndarray:
     return made
 
 
-def _replace(plan: EditPlan, fields: Any, sources: EditSources) -> None:
-    old, asset = _actor(plan.after, fields.id), sources.asset(fields.by)
+def _replace(plan: EditPlan, fields: Any) -> None:
+    old, asset = _actor(plan.after, fields.id), plan.open_asset(fields.by)
     up = Displacement(up_m=(asset.size_m[2] - old.size_m[2]) / 2)  # wheels stay where they were
     new = Actor(asset.label, asset.size_m, paths.moved(old.motion, up))
-    if fields.id in plan.before.actors and fields.id not in plan.removed:
-        plan.removed.append(fields.id)
-        plan.changes.pop(fields.id, None)
+    _recorded_goes(plan, fields.id)
     plan.inserted[fields.id] = Insertion(asset, 0.0, fields.match_light)
     plan.after = replace(plan.after, actors={**plan.after.actors, fields.id: new})
 
 
-def _insert(plan: EditPlan, fields: Any, sources: EditSources) -> None:
-    asset, world = sources.asset(fields.asset), plan.after
+def _insert(plan: EditPlan, fields: Any) -> None:
+    asset, world = plan.open_asset(fields.asset), plan.after
     label = fields.class_ or asset.label
     numbered = (f"{label}-new{i}" for i in range(1, len(world.actors) + 2))
     name = fields.id or next(name for name in numbered if name not in world.actors)
@@ -329,12 +281,7 @@ def _insert(plan: EditPlan, fields: Any, sources: EditSources) -> None:
         motion = paths.along_points(points, height, ground, _floor(world))
     else:
         motion = _near(world, fields.near, height, ground)
-    sun = None
-    if fields.sun is not None:
-        azimuth, elevation = math.radians(fields.sun.azimuth_deg), math.radians(fields.sun.elevation_deg)
-        flat = math.cos(elevation)
-        sun = np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)])
-    plan.inserted[name] = Insertion(asset, fields.shadow, fields.match_light, sun)
+    plan.inserted[name] = Insertion(asset, fields.shadow, fields.match_light)
     plan.after = replace(world, actors={**world.actors, name: Actor(label, asset.size_m, motion)})
 
 
@@ -371,56 +318,7 @@ def _near(world: EditWorld, fields: Any, height: float, ground: HeightMap | None
     return paths.along_points(points, height, ground, _floor(world))
 
 
-def _background(plan: EditPlan, fields: Any, sources: EditSources) -> None:
-    world = plan.after
-    if world.ego is None or world.ground is None:
-        raise InputError("where the other street belongs is not known", remedy="give --scene, of a scene with classes")
-    if plan.background is not None:
-        raise InputError("there is another background already", got=fields.run)
-    other = sources.background(fields.run)
-    pose = place_background(world, other)
-    new = HeightMap.from_points(geometry.transform_points(pose, other.ground_xyz))
-    if "objects" not in fields.keep:
-        for name in list(world.actors):
-            _take_away(plan, name)
-    standing = [name for name, actor in plan.after.actors.items() if name in plan.before.actors and not actor.moves]
-    for name in standing:  # it belongs to the street that is gone
-        _take_away(plan, name)
-    again = functools.partial(paths.regrounded, old=world.ground, new=new)
-    for name in list(plan.after.actors):
-        _change(plan, name, again)
-    _change(plan, EGO, again)
-    plan.background, plan.match_objects = (other, pose), fields.match_light
-    plan.after = replace(plan.after, ground=new)
-    plan.notes += _seams(plan.after, new)
-
-
-def place_background(world: EditWorld, other: Background) -> np.ndarray:
-    """world_from_other f64[4, 4]: both vehicles begin at the same place and drive the same way; heights agree along the
-    path of ours."""
-    if world.ego is None or world.ground is None:
-        raise InputError("where the other street belongs is not known", remedy="give --scene")
-    # without pitch and roll
-    level = lambda pose: geometry.yaw_matrix(geometry.yaw_of(pose), pose[:3, 3])
-    pose = level(world.ego.poses[0]) @ geometry.invert(level(other.ego.poses[0]))
-    xy = world.ego.poses[:, :2, 3]
-    there = HeightMap.from_points(geometry.transform_points(pose, other.ground_xyz))
-    pose[2, 3] += float(np.nan_to_num(np.nanmedian(np.append(world.ground.height(xy) - there.height(xy), np.nan))))
-    return pose
-
-
-def _seams(world: EditWorld, ground: HeightMap) -> list[dict[str, Any]]:
-    """Paths that leave the known ground of the other street."""
-    motions = {name: actor.motion for name, actor in world.actors.items()}
-    motions |= {} if world.ego is None else {EGO: world.ego}
-    shares = {name: float(np.isnan(ground.height(motion.poses[:, :2, 3])).mean()) for name, motion in motions.items()}
-    off = {name: round(share, 3) for name, share in shares.items() if share > 0.05}
-    text = ", ".join(f"{name} ({share:.0%})" for name, share in off.items())
-    text = f"part of a path is off the other street's ground: {text}"
-    return [{"kind": "off the ground", "ids": list(off), "shares": off, "text": text}] if off else []
-
-
-_VERBS: Final[dict[str, Callable[[EditPlan, Any, EditSources], None]]] = {
+_VERBS: Final[dict[str, Callable[[EditPlan, Any], None]]] = {
     "remove": _remove,
     "move": _move,
     "stop": _stop,
@@ -429,9 +327,8 @@ _VERBS: Final[dict[str, Callable[[EditPlan, Any, EditSources], None]]] = {
     "path": _path,
     "replace": _replace,
     "insert": _insert,
-    "background": _background,
-    "sky": lambda plan, fields, _: setattr(plan, "sky", fields),
-    "erase": lambda plan, fields, _: plan.erased.append(fields),
+    "sky": lambda plan, fields: setattr(plan, "sky", fields),
+    "erase": lambda plan, fields: plan.erased.append(fields),
 }
 
 
@@ -567,7 +464,7 @@ def shown_anew(plan: EditPlan, views_before: Sequence[View], views_after: Sequen
     `ANOTHER_SIDE_RAD` away, because their path or that of the vehicle has changed."""
     found = set()
     for name in plan.before.actors if plan.moves_ego else plan.changes:
-        if name not in plan.before.actors or name not in plan.after.actors:
+        if name not in plan.after.actors or name in plan.inserted:
             continue
         asked = sides_seen(plan.after.actors[name], views_after)
         seen = sides_seen(plan.before.actors[name], views_before)

@@ -13,7 +13,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
 
 from mudg import native
 from mudg.base import log, memory
@@ -28,10 +32,12 @@ from mudg.core import trajectory
 from mudg.core.pictures import panels_of, side_by_side
 from mudg.core.raster.rasterize import drawing_device
 from mudg.core.shutter import readout_of
-from mudg.diffusion.synthesize import JobInputs
-from mudg.editing import harmonised
-from mudg.editing.apply import FACT, Drawer, EditedDrive, carry_out, in_weather, scene_seen_by, weather_of
-from mudg.editing.harmonised import EditedSources, RepairedViews
+from mudg.diffusion import views as loading
+from mudg.diffusion.published import is_published
+from mudg.diffusion.settings import SynthesizeConfig
+from mudg.diffusion.synthesize import JobInputs, view_maker
+from mudg.diffusion.views import ViewMaker
+from mudg.editing.apply import FACT, Drawer, carry_out, in_weather, scene_seen_by, weather_of
 from mudg.editing.script import EditScript, conditions_of
 from mudg.editing.settings import RenderConfig
 from mudg.formats.exporters.video import write_mp4
@@ -41,7 +47,6 @@ from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import raster_of
 from mudg.gaussians.storage import RADIANCE, kind_of
 from mudg.gaussians.views import resized_view
-from mudg.scene.clouds import read_fused
 from mudg.scene.observations import ObservationWriter, read_observations
 from mudg.scene.read import read_scene
 
@@ -50,38 +55,33 @@ VIEW_BYTES: Final = 4 * (3 + 1 + 1 + len(CLASSES))
 AHEAD_PIXELS: Final = 1_000_000
 """Larger views are drawn one at a time by all threads: less memory."""
 VIDEO_FPS: Final = 10.0
-Edited = tuple[Scene, SceneModel, EditedDrive | None]
-"""Scene and fit as they are rendered, and what an edit script did to them (None: there is none)."""
+REPAIR_STEPS: Final = 2
+"""Denoising steps of repairs."""
+Edited = tuple[Scene, SceneModel]
+"""Scene and fit as they are rendered."""
+SHARE_PER_M: Final = 1.0
+SHARES: Final = 0.5, 2.0
+"""Repairs: a generated view counts as much as its confidence times its metres from the recorded path, with these
+bounds, beside 1 for the render."""
 
 
 def prepare(
-    config: RenderConfig,
-    scene: Path,
-    model: Path,
-    script: EditScript | None,
-    fused: Path | None,
-    path: Path | None = None,
+    config: RenderConfig, scene: Path, model: Path, script: EditScript | None, path: Path | None = None
 ) -> Edited | None:
-    """Carry out the edit script, if there is one: what cannot be done is told before anything is written. ``fused``:
-    fused clouds of the scene, for ``config.harmonize``. ``path``: as of ``trajectories``."""
+    """Carry out the edit script, if there is one: what cannot be done is told before anything is written. ``path``: as
+    of ``trajectories``."""
     if path is not None:
         trajectories(read_scene(scene), config, path)
-    radiance = kind_of(model) == RADIANCE
-    if radiance and (config.remove_tracks or script is not None):
-        what = "a radiance field has no objects to leave out or to edit"
-        raise UsageError(what, where=str(model), remedy="leave --remove-tracks and --edits out")
-    choose_device(config.device, "render") if radiance else drawing_device(config.device, "render", config.raster)
-    edited = None
-    if script is not None or (config.repair and not radiance):
-        edited = _edited(scene, model, script, fused if config.harmonize.on else None)
-    if config.repair:
-        if edited is None:
-            what, expected = "a radiance field cannot be repaired", "Gaussians made by fit"
-            raise UsageError(what, where="--repair", expected=expected, got=str(model), remedy="leave it out")
-        harmonised.check_as_recorded(edited[1], "--repair")
-    if edited is not None and config.harmonize.on:
-        lengths = {one.name: len(one) for one in trajectories(edited[0], config, path)}
-        harmonised.check_paths(config.harmonize, lengths)
+    if kind_of(model) == RADIANCE:
+        if script is not None or config.repair:
+            what = "a radiance field has no objects to edit, and cannot be repaired"
+            raise UsageError(what, where=str(model), remedy="leave --edits and --repair out")
+        choose_device(config.device, "render")
+        return None
+    drawing_device(config.device, "render", config.raster)
+    edited = None if script is None and not config.repair else _scene_and_fit(scene, model, script)
+    if edited is not None and config.repair:
+        check_as_recorded(edited[1], "--repair")
     return edited
 
 
@@ -99,7 +99,7 @@ def write_views(
     summary. An interrupted run continues with the next missing view. ``scene``: gives cameras, times and the path of
     the vehicle. ``model``: folder made by fit. ``edited``: what ``prepare`` made of them. ``path``: as of
     ``trajectories``. ``fused``: fused clouds of the scene, for ``config.repair``."""
-    repaired, out = None, work.path
+    out = work.path
     if kind_of(model) == RADIANCE:
         device = choose_device(config.device, "render")
         loaded, (field, budget) = read_scene(scene), load_field(model)
@@ -107,14 +107,14 @@ def write_views(
         draw = functools.partial(observe, field.to(device), budget=budget, source=source)
     else:
         device = drawing_device(config.device, "render", config.raster)
-        loaded, fitted, drive = edited or _edited(scene, model, None)
-        draw, source = _scene_drawer(config, fitted.to(device), loaded)
-        if config.repair:
-            inputs = JobInputs(scene, cast("Path", fused), model)
-            mixer, plain = harmonised.RenderMixer(inputs, config.harmonize, config.device), draw
-            draw = lambda view: mixer(view, plain(view))
-        if config.harmonize.on and drive is not None:
-            draw = repaired = _repaired(config, drive, fitted, scene, model, draw)
+        loaded, fitted = edited or _scene_and_fit(scene, model, None)
+        fitted = fitted.to(device)
+        source, raster = str(fitted.facts.get("method", "fit")), raster_of(fitted, config.raster)
+        if config.repair and fused is not None:  # of a global shutter, which is all that the diffusion model knows
+            mixer = RenderMixer(JobInputs(scene, fused, model), config.repair_model, config.device)
+            draw = lambda view: mixer(view, render_view(fitted, view, raster, source))
+        else:
+            draw = lambda view: render_view(fitted, view, raster, source, readout_of(loaded, view))
         conditions = conditions_of(fitted.facts.get(FACT, {}).get("script", ()))
         if conditions is not None:
             draw = in_weather(draw, weather_of(draw, conditions, loaded))
@@ -122,7 +122,7 @@ def write_views(
     largest = max((view.camera for path in paths for view in path.views), key=lambda one: one.width * one.height)
     asked = f"a view of {largest.width} x {largest.height} pixels"
     memory.require(largest.width * largest.height * VIEW_BYTES, asked, "smaller views (--width-px)")
-    threads = 1 if repaired or config.repair or device.type != "cpu" else native.threads()
+    threads = 1 if config.repair or device.type != "cpu" else native.threads()
     with (
         log.task(f"render {source}", sum(len(path) for path in paths)) as bar,
         memory_of(device, "render"),
@@ -130,8 +130,6 @@ def write_views(
     ):
         videos = list[Future[None]]()
         for path in paths:
-            if repaired:
-                repaired.follow(path)
             _render_trajectory(draw, threads, path, out / path.name, source, bar)
             if config.video:
                 videos.append(encoder.submit(_write_video, out / path.name, out / f"{path.name}.mp4"))
@@ -140,42 +138,14 @@ def write_views(
     return {"trajectories": [path.name for path in paths], "views": sum(len(path) for path in paths)}
 
 
-def _edited(
-    scene: Path, model: Path, script: EditScript | None, fused: Path | None = None
-) -> tuple[Scene, SceneModel, EditedDrive | None]:
-    """The scene, with the vehicle on the path that the fit asks for, and the fit; both edited if there is a script; and
-    what it did."""
-    fitted = load_model(Path(model))
-    loaded = scene_seen_by(read_scene(Path(scene)), fitted.facts)
+def _scene_and_fit(scene: Path, model: Path, script: EditScript | None) -> Edited:
+    """The scene, with the vehicle on the path that the fit asks for, and the fit; both edited if there is a script."""
+    fitted = load_model(model)
+    loaded = scene_seen_by(read_scene(scene), fitted.facts)
     if script is None:
-        return loaded, fitted, None
-    drive = carry_out(script, fitted, loaded, None if fused is None else read_fused(Path(fused)))
-    return drive.scene or loaded, drive.model(fitted), drive
-
-
-def _repaired(
-    config: RenderConfig, drive: EditedDrive, fitted: SceneModel, scene: Path, model: Path, draw: Drawer
-) -> RepairedViews:
-    """What draws views of an edited fit with the touched pixels repaired; ``scene`` and ``model``: folders, as they are
-    without the edits."""
-    before = load_model(model)
-    recorded = scene_seen_by(read_scene(scene), before.facts)
-    usual, _ = _scene_drawer(config, before.to(fitted.device), recorded)
-    sources = EditedSources.of(drive, fitted, recorded)
-    camera = trajectories(recorded, config)[0].views[0].camera
-    repair = harmonised.Harmoniser(sources, config.harmonize, (camera.width, camera.height), config.device)
-    return RepairedViews(repair, lambda view: (usual(view), draw(view)))
-
-
-def _scene_drawer(config: RenderConfig, fitted: SceneModel, scene: Scene) -> tuple[Drawer, str]:
-    """What draws the views of a scene of Gaussians, and its name. Rolling shutters of recorded views are followed, but
-    for repairs, which know global ones alone."""
-    if config.remove_tracks:
-        fitted = fitted.without_nodes(config.remove_tracks)
-    source, raster = str(fitted.facts.get("method", "fit")), raster_of(fitted, config.raster)
-    still = config.repair or config.harmonize.on
-    rolls = lambda view: None if still else readout_of(scene, view)
-    return lambda view: render_view(fitted, view, raster, source, rolls(view)), source
+        return loaded, fitted
+    drive = carry_out(script, fitted, loaded)
+    return drive.scene or loaded, drive.model(fitted)
 
 
 def trajectories(scene: Scene, config: RenderConfig, path: Path | None = None) -> tuple[Trajectory, ...]:
@@ -194,17 +164,14 @@ def trajectories(scene: Scene, config: RenderConfig, path: Path | None = None) -
         for camera in cameras:
             paths += [trajectory.at_shift(scene, camera, shift_m) for shift_m in config.shifts_m]
             paths += [trajectory.named(scene, camera, name) for name in config.paths]
-    optics = lambda path, view: _optics(view if path.origin == "recorded" else _still(view), config)
+    optics = lambda path, view: _optics(view, config, rolls=path.origin == "recorded")
     return tuple(Trajectory(one.name, tuple(optics(one, view) for view in one.views), one.origin) for one in paths)
 
 
-def _still(view: View) -> View:
-    """A view whose camera has a global shutter."""
-    return replace(view, camera=replace(view.camera, readout_s=0.0, shutter="global"))
-
-
-def _optics(view: View, config: RenderConfig) -> View:
-    """A view with the field of view and the width that are asked for."""
+def _optics(view: View, config: RenderConfig, rolls: bool) -> View:
+    """A view with the field of view and the width that are asked for; its shutter is a global one unless it rolls."""
+    if not rolls:
+        view = replace(view, camera=replace(view.camera, readout_s=0.0, shutter="global"))
     if config.fov_deg:
         focal = view.camera.width / 2 / math.tan(math.radians(config.fov_deg) / 2)
         view = replace(view, camera=replace(view.camera, fx=focal, fy=focal * view.camera.fy / view.camera.fx))
@@ -243,3 +210,73 @@ def _write_video(observations: Path, path: Path) -> None:
         return
     views = read_observations(observations)
     write_mp4(path, (side_by_side(panels_of(views[index])) for index in range(len(views))), VIDEO_FPS)
+
+
+# -- repairs ---
+
+
+def check_as_recorded(fitted: SceneModel, where: str) -> None:
+    """UsageError if the Gaussians are of an edited drive: photographs may still show what was removed."""
+    if FACT in fitted.facts:
+        what = "only a fit of the drive as it was recorded can be repaired"
+        got, expected = "Gaussians of an edited drive", "Gaussians made by fit"
+        raise UsageError(what, where=where, expected=expected, got=got, remedy="leave it out")
+
+
+class RenderMixer:
+    """Views of a fit, each mixed with what the diffusion model makes of it.
+
+    The model makes the view once more, from the fused points, the photographs and the render, and says how sure it is.
+    What it makes of a view does not depend on other views: in windows of a path they come out the same to 58 dB.
+    Near the recorded path the render counts for more, since photographs of the same places made it; away from there
+    the generated view does (`SHARE_PER_M`).
+
+    Args:
+        inputs: folders of the scene, its clouds and the fit.
+
+    Raises:
+        UsageError: a published-type model, which makes clips of many frames from noise, or one that uses no renders.
+    """
+
+    def __init__(self, inputs: JobInputs, model: str = "embedded", device: str = "auto") -> None:
+        if is_published(model):
+            what, expected = "a published-type model uses no renders and cannot repair them", "a small model"
+            raise UsageError(what, where="--repair-model", expected=expected, got=model)
+        config = SynthesizeConfig(model=model, steps=REPAIR_STEPS, device=device, processes=1)
+        self._settings = loading.check_config(config, fitted=True)
+        self._inputs, self._model = inputs, loading.load_any(self._settings)
+        self._maker: tuple[tuple[int, int], ViewMaker] | None = None
+        recorded = read_scene(inputs.scene)
+        self._paths = [
+            np.array([frame.view.world_from_cam[:3, 3] for frame in recorded.frames_of(name)])
+            for name in recorded.cameras
+        ]
+
+    def __call__(self, view: View, render: Observation) -> Observation:
+        """The view, from its render, which has its depth."""
+        size = view.camera.width, view.camera.height
+        if self._maker is None or self._maker[0] != size:
+            self._maker = size, view_maker(self._settings, self._inputs, [view], self._model, None)
+        off_m = min(off_path_m(view.world_from_cam[:3, 3], path) for path in self._paths)
+        share = min(max(SHARE_PER_M * off_m, SHARES[0]), SHARES[1])
+        return mixed(render, self._maker[1].make([view], 0, None)[2][0], share)
+
+
+def off_path_m(place: NDArray[np.float64], path: NDArray[np.float64]) -> float:
+    """Metres from a place f64[3] to a path f64[N,3] of straight pieces."""
+    along = np.diff(path, axis=0, append=path[-1:])
+    at = ((place - path) * along).sum(1) / np.maximum((along**2).sum(1), 1e-12)
+    return float(np.linalg.norm(place - path - at.clip(0, 1)[:, None] * along, axis=1).min())
+
+
+def mixed(render: Observation, generated: Observation, share: float) -> Observation:
+    """The mean of a render and of the generated view with ``share`` times its confidence as weight, colour and depth;
+    depth that only one of them has is taken from it. Classes and confidence are the render's."""
+    weight = share * generated.confidence * generated.mask
+    mean = lambda a, b: (a + weight * b) / (1 + weight)
+    depth = render.depth
+    if depth is not None and generated.depth is not None:
+        known = torch.isfinite(depth)
+        depth = torch.where(known & torch.isfinite(generated.depth), mean(depth, generated.depth), depth)
+        depth = torch.where(known, depth, generated.depth)
+    return replace(render, rgb=mean(render.rgb, generated.rgb).clamp(0, 1), depth=depth)

@@ -8,10 +8,10 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, Any, Final, Self
 
 import yaml
-from pydantic import AfterValidator, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from mudg.base import store
 from mudg.base.errors import InputError, nearest, short
@@ -84,10 +84,16 @@ class RemoveEdit(StrictRecord):
         return self
 
 
-class MoveEdit(StrictRecord):
-    """Displace an object in its own frame, for good or from a moment on."""
+class DisplacingEdit(StrictRecord):
+    """What edits say after which somebody is not where they were recorded."""
 
     id: Name
+    close_street: bool | None = None
+
+
+class MoveEdit(DisplacingEdit):
+    """Displace an object in its own frame, for good or from a moment on."""
+
     along_m: Number = 0.0
     left_m: Number = 0.0
     up_m: Number = 0.0
@@ -95,41 +101,30 @@ class MoveEdit(StrictRecord):
     from_s: Number | None = None
     ramp_s: NotNegative = 1.0
     ground: bool = True
-    close_street: bool | None = None
-    close_sides: bool = True
 
 
-class StopEdit(StrictRecord):
+class StopEdit(DisplacingEdit):
     """Brake evenly, and stand from then on."""
 
-    id: Name
     at_s: Number
     brake_m_s2: Annotated[float, Field(gt=0, le=12)] = 4.0
-    close_street: bool | None = None
-    close_sides: bool = True
 
 
-class SpeedEdit(StrictRecord):
+class SpeedEdit(DisplacingEdit):
     """Drive the same path faster or slower."""
 
-    id: Name
     factor: Annotated[float, Field(gt=0, le=5)]
     from_s: Number | None = None
-    close_street: bool | None = None
-    close_sides: bool = True
 
 
-class LaneChangeEdit(StrictRecord):
+class LaneChangeEdit(DisplacingEdit):
     """Change lanes, smoothly."""
 
-    id: Name
     left_m: Number
     start_s: Number
     duration_s: Positive
     most_lateral_m_s2: Positive = 4.0
     ground: bool = True
-    close_street: bool | None = None
-    close_sides: bool = True
 
 
 def _path_points(points: list[list[float]]) -> list[list[float]]:
@@ -145,24 +140,11 @@ def _path_points(points: list[list[float]]) -> list[list[float]]:
     return points
 
 
-Points = Annotated[list[list[Number]], Field(min_length=1), AfterValidator(checked_by(_path_points))]
-
-
-class PathEdit(StrictRecord):
+class PathEdit(DisplacingEdit):
     """Drive another path: points [t, x, y, yaw_deg] or [t, x, y] in the world."""
 
-    id: Name
-    points: Points
+    points: Annotated[list[list[Number]], Field(min_length=2), after(_path_points)]
     ground: bool = True
-    close_street: bool | None = None
-    close_sides: bool = True
-
-    @model_validator(mode="after")
-    @checked_by
-    def _drives(self) -> Self:
-        if len(self.points) < 2:
-            raise InputError("a path needs two points", where="points", got=str(self.points))
-        return self
 
 
 class ReplaceEdit(StrictRecord):
@@ -183,24 +165,16 @@ class PlaceNear(StrictRecord):
     yaw_deg: Number = 0.0
 
 
-class SunPlace(StrictRecord):
-    """Where the recorded sun stands: degrees counter-clockwise from world x, and above the horizon."""
-
-    azimuth_deg: Annotated[float, Field(ge=-360, le=360)]
-    elevation_deg: Annotated[float, Field(ge=10, le=90)]
-
-
 class InsertEdit(StrictRecord):
-    """Add an object, on a ``path`` or ``near`` something; with ``sun``, its shadow lies where that casts it."""
+    """Add an object, on a ``path`` or ``near`` something."""
 
     asset: AssetSource
     id: ActorName | None = None
     class_: Name | None = Field(default=None, alias="class")
-    path: Points | None = None
+    path: Annotated[list[list[Number]], Field(min_length=1), after(_path_points)] | None = None
     near: PlaceNear | None = None
     ground: bool = True
     shadow: Share = 0.6
-    sun: SunPlace | None = None
     match_light: bool = True
 
     @model_validator(mode="after")
@@ -210,22 +184,6 @@ class InsertEdit(StrictRecord):
             got = "both" if self.path else "neither"
             raise InputError("an object to insert needs one place", expected="path or near", got=got)
         return self
-
-
-def _with_ego(keep: list[str]) -> list[str]:
-    if "ego" not in keep:
-        raise InputError("the vehicle keeps its own path", expected="[objects, ego] or [ego]", got=str(keep))
-    return keep
-
-
-class BackgroundEdit(StrictRecord):
-    """Another street around the vehicle and the moving objects of this one: that of a folder of ``mudg run``."""
-
-    run: Name
-    keep: Annotated[list[Literal["objects", "ego"]], Field(min_length=1), after(_with_ego)] = Field(
-        default_factory=lambda: ["objects", "ego"]
-    )
-    match_light: bool = True
 
 
 class SkyEdit(StrictRecord):
@@ -255,7 +213,7 @@ class KeptBox(StrictRecord):
 class EraseEdit(StrictRecord):
     """Take parts of the street away, objects apart: what lies in ``balls``, and what lies outside the box ``keep``."""
 
-    balls: Annotated[list[list[Number]], Field(min_length=1), AfterValidator(checked_by(_balls))] | None = None
+    balls: Annotated[list[list[Number]], Field(min_length=1), after(_balls)] | None = None
     keep: KeptBox | None = None
 
     @model_validator(mode="after")
@@ -275,7 +233,6 @@ VERBS: Final[dict[str, type[StrictRecord]]] = {
     "path": PathEdit,
     "replace": ReplaceEdit,
     "insert": InsertEdit,
-    "background": BackgroundEdit,
     "sky": SkyEdit,
     "erase": EraseEdit,
     "weather": WeatherSettings,
@@ -336,10 +293,6 @@ class EditScript:
                     raise InputError(what, where=where, got=got, remedy=remedy) from problem
         text = store.json_text(_with_contents(self.canonical(), contents), indent=None)
         return hashlib.sha256(text.encode()).hexdigest()
-
-    def conditions(self) -> dict[str, Any]:
-        """The last settings of weather, light and season: records by verb. They change pictures, not geometry."""
-        return {edit.verb: edit.settings for edit in self.edits if edit.verb in CONDITIONS}
 
     def text(self) -> str:
         """The script as YAML with all defaults and with absolute paths."""

@@ -6,15 +6,12 @@ from typing import Literal
 
 from mudg.base.config import setting, settings
 from mudg.base.devices import DeviceName
-from mudg.diffusion.settings import HarmonizeConfig
 
 
 @settings
 class EditConfig:
     """Change a drive as an edit script says."""
 
-    harmonize: HarmonizeConfig = setting(default_factory=HarmonizeConfig)
-    """Of a whole run: let the diffusion model repair what the edits touch in its images."""
     raster: Literal["auto", "cpu", "torch", "gsplat"] = "auto"
     """Rasteriser backend. auto picks the fastest one available and prints its name."""
     device: DeviceName = "auto"
@@ -36,8 +33,6 @@ class RenderConfig:
     """Image width in pixels (0 = as recorded); the height follows."""
     fov_deg: float = setting(default=0.0, ge=0, lt=170)
     """Horizontal field of view in degrees (0 = the camera's own)."""
-    remove_tracks: tuple[str, ...] = ()
-    """Ids of tracked objects to leave out, as listed in the scene."""
     lidar: str = ""
     """Also simulate the log's LiDAR sweeps at every shift: a sensor of the scene, pandar128, at128, hdl64, vlp16, or a
     JSON file of beams (docs/simulator.md). Empty = none."""
@@ -48,10 +43,10 @@ class RenderConfig:
     """Also write one MP4 video per trajectory."""
     repair: bool = False
     """Let the diffusion model make every view once more from its render, and mix both by its confidence and by the
-    distance from the recorded path. Better off the path, slower: half a second a view. --harmonize.model names the
-    model (docs/edit/repair.md)."""
-    harmonize: HarmonizeConfig = setting(default_factory=HarmonizeConfig)
-    """With an edit script: let the diffusion model repair what the edits touch."""
+    distance from the recorded path. Better off the path, slower: half a second a view (docs/edit/repair.md)."""
+    repair_model: str = "embedded"
+    """Diffusion model of --repair: "embedded" or "embedded-tiny", both shipped with the package, or a folder written by
+    learn."""
     raster: Literal["auto", "cpu", "torch", "gsplat"] = "auto"
     """Rasteriser backend. auto picks the fastest one available and prints its name."""
     device: DeviceName = "auto"

@@ -30,7 +30,7 @@ from mudg.core import harmonics
 from mudg.core.edit import HeightMap
 from mudg.core.harmonics import C0
 from mudg.core.table import Table
-from mudg.editing.apply import IMPORTED, carry_out, ground_of, write_asset
+from mudg.editing.apply import carry_out, ground_of, write_asset
 from mudg.editing.model import Asset, classes_of_rows, lowest_points
 from mudg.editing.runs import RunParts, find_run
 from mudg.editing.script import EditScript
@@ -205,7 +205,7 @@ def model_of_cloud(cloud: SplatCloud, name: str) -> SceneModel:
     tensors = {key: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for key, value in columns.items()}
     table = Table(tensors, {"node": torch.zeros(len(cloud), dtype=torch.int32)})
     drawing = {DRAWING: {"antialias": True}} if cloud.antialias else {}
-    facts = {"method": IMPORTED, "source": name, **drawing}
+    facts = {"method": "imported", "source": name, **drawing}
     return SceneModel(table, (StaticNode(),), None, known, cloud.degree, facts)
 
 

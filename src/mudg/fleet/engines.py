@@ -18,11 +18,10 @@ from typing import Any, Final
 
 from mudg.base import log, store
 from mudg.base.errors import ResourceError, UsageError
-from mudg.fleet.child import Stop
 from mudg.fleet.plan import Entry
 from mudg.fleet.records import Ended
 from mudg.fleet.settings import BatchConfig
-from mudg.fleet.work import LOST, Job, run_scene
+from mudg.fleet.work import LOST, Job, Stop, run_scene
 
 Tell = Callable[[Ended], None]
 _LOST_NODES: Final = 20
@@ -60,8 +59,6 @@ class LocalRun:
                 except KeyboardInterrupt:
                     self.stop.ask()
                 raise
-            finally:
-                self.job.inputs.clear()
 
     def wait(self) -> None:
         """Wait until no step runs."""
@@ -118,6 +115,8 @@ def _ray_task(job: Job, entry: Entry) -> list[Ended]:
 
 # Slurm --------------------------------------------------------------------------------------------
 
+_OWN_OPTIONS: Final = set("array job-name signal requeue no-requeue open-mode output error cpus-per-task".split())
+
 
 class SlurmTask:
     """The scenes of one task of an array job. Told that its time ends, it writes checkpoints, and submitit puts it back
@@ -155,11 +154,18 @@ def submit_to_slurm(job: Job, entries: Sequence[Entry], batch: BatchConfig) -> t
     except ImportError as error:
         what, remedy = "the package submitit is not installed", "pip install 'mudg[slurm]'"
         raise ResourceError(what, where="--engine slurm", remedy=remedy) from error
-    local, given = job.folder.own.local, dict(_option(text) for text in batch.slurm_options)
+    given: dict[str, str | bool] = {}
+    for text in batch.slurm_options:
+        name, equals, value = text.partition("=")
+        if not name or name.startswith("-") or any(letter in text for letter in "\n\r") or name in _OWN_OPTIONS:
+            what, got = "not an option for the array job", text[:80]
+            expected = "NAME or NAME=VALUE without dashes, other than " + ", ".join(sorted(_OWN_OPTIONS))
+            raise UsageError(what, where="--slurm-options", got=got, expected=expected)
+        given[name] = value if equals else True
     if "time" not in given:
         what, expected = "Slurm needs to know how long a task may run", "time=4:00:00 among them"
         raise UsageError(what, where="--slurm-options", expected=expected)
-    folder = local / "slurm" if local is not None else Path.cwd() / "mudg-batch-slurm"
+    folder = job.folder.own / "slurm"
     store.make_folder(folder)
     folder.chmod(0o700)  # tasks are pickles that nobody else may write
     count = max(1, min(batch.jobs or 1, len(entries)))
@@ -180,14 +186,3 @@ def submit_to_slurm(job: Job, entries: Sequence[Entry], batch: BatchConfig) -> t
         what, remedy = "Slurm refused, or is not on this machine", "run this on a login node, or take another --engine"
         raise ResourceError(what, where="sbatch", got=str(error).strip()[:500], remedy=remedy) from error
     return str(tasks[0].job_id).partition("_")[0], folder
-
-
-def _option(text: str) -> tuple[str, str | bool]:
-    name, separator, value = text.partition("=")
-    if not name or name.startswith("-") or any(letter in text for letter in "\n\r") or name in _OWN_OPTIONS:
-        expected = "NAME or NAME=VALUE without dashes, other than " + ", ".join(sorted(_OWN_OPTIONS))
-        raise UsageError("not an option for the array job", where="--slurm-options", got=text[:80], expected=expected)
-    return name, value if separator else True
-
-
-_OWN_OPTIONS: Final = set("array job-name signal requeue no-requeue open-mode output error cpus-per-task".split())

@@ -18,7 +18,6 @@ from typing import Any, Final
 from mudg.base import store
 from mudg.base.config import without_devices
 from mudg.base.errors import InputError, UsageError
-from mudg.base.location import Location
 from mudg.base.versions import version
 from mudg.scene.schema import NAME_PATTERN
 
@@ -29,7 +28,6 @@ _LEFT_OUT: Final = re.compile(rf"{BOOKKEEPING}|\..*")
 SHARD_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
     ("SLURM_ARRAY_TASK_ID", "SLURM_ARRAY_TASK_COUNT", "SLURM_ARRAY_TASK_MIN"),
     ("JOB_COMPLETION_INDEX", "", ""),
-    ("SKYPILOT_JOB_RANK", "SKYPILOT_NUM_JOBS", ""),
     ("SKYPILOT_NODE_RANK", "SKYPILOT_NUM_NODES", ""),
     ("AWS_BATCH_JOB_ARRAY_INDEX", "AWS_BATCH_JOB_ARRAY_SIZE", ""),
 )
@@ -45,32 +43,32 @@ class Entry:
     settings: Mapping[str, str] = field(default_factory=dict)
 
 
-def read_list(listed: Path | str, settings: Sequence[str] = ()) -> list[Entry]:
+def read_list(listed: Path, settings: Sequence[str] = ()) -> list[Entry]:
     """Entries of a list file, or one for each entry of a folder (but for what an earlier run over a list wrote there).
     Relative sources count from the list's folder. settings: those that a line may give. InputError: missing, empty,
     malformed, or two lines that would write one folder."""
-    place = Location.of(listed)
-    if place.local is not None and place.local.is_dir():
-        names = sorted(path.name for path in place.local.iterdir() if not _LEFT_OUT.fullmatch(path.name))
-        lines, folder = [(str(place.local / name), shlex.quote(name)) for name in names], place.text
+    if listed.is_dir():
+        names = sorted(path.name for path in listed.iterdir() if not _LEFT_OUT.fullmatch(path.name))
+        lines, folder = [(str(listed / name), shlex.quote(name)) for name in names], listed
     else:
-        text = place.load().decode("utf-8", "replace")
-        lines = [(f"{place}: line {index + 1}", line) for index, line in enumerate(text.splitlines())]
-        folder = place.text.rpartition("/")[0] if place.local is None else str(place.local.parent)
-    entries = [entry for where, line in lines if (entry := _entry(line, where, folder, settings)) is not None]
-    if not entries:
-        raise InputError("the list is empty", where=str(place), expected="one source per line")
-    sources: dict[str, str] = {}
-    for entry in entries:
-        if entry.name in sources:
+        text = store.read_bytes(listed).decode("utf-8", "replace")
+        lines = [(f"{listed}: line {number}", line) for number, line in enumerate(text.splitlines(), 1)]
+        folder = listed.parent
+    entries: dict[str, Entry] = {}
+    for where, line in lines:
+        entry = _entry(line, where, folder, settings)
+        if entry is None:
+            continue
+        if (other := entries.setdefault(entry.name, entry)) is not entry:
             what = "two entries would write the same folder"
             remedy = f"give one of them another name: SOURCE name={entry.name}-2"
-            raise InputError(what, where=str(place), got=f"{sources[entry.name]} and {entry.source}", remedy=remedy)
-        sources[entry.name] = entry.source
-    return entries
+            raise InputError(what, where=str(listed), got=f"{other.source} and {entry.source}", remedy=remedy)
+    if not entries:
+        raise InputError("the list is empty", where=str(listed), expected="one source per line")
+    return list(entries.values())
 
 
-def _entry(line: str, where: str, folder: str, settings: Sequence[str]) -> Entry | None:
+def _entry(line: str, where: str, folder: Path, settings: Sequence[str]) -> Entry | None:
     try:
         words = shlex.split(line, comments=True)
     except ValueError as error:
@@ -85,27 +83,19 @@ def _entry(line: str, where: str, folder: str, settings: Sequence[str]) -> Entry
             remedy = "put quotes around a path with spaces"
             raise InputError("unknown setting in the line", where=where, got=got, expected=expected, remedy=remedy)
         given[key] = os.path.abspath(value) if key in ("poses", "boxes") and os.path.exists(value) else value
-    source = words[0] if words[0] == CITY else _below(folder, words[0])
+    refuse_address(words[0], where)
+    source = CITY if words[0] == CITY else os.path.abspath(folder / Path(words[0]).expanduser())
     name = given.pop("name", "") or Path(source).name
     if not NAME_PATTERN.fullmatch(name) or name == BOOKKEEPING:
         raise InputError("name cannot be a folder name", where=where, got=name[:80], remedy="add name=NAME to the line")
     return Entry(name, source, given)
 
 
-def _below(folder: str, source: str) -> str:
-    """A source of a list in this folder; both may be addresses."""
-    if "://" in source:
-        return Location.of(source).text
-    if "://" in folder and not source.startswith(("/", "~")):
-        return f"{folder}/{source}"
-    return os.path.abspath(Path("" if "://" in folder else folder) / Path(source).expanduser())
-
-
-def files_read(entries: Sequence[Entry], listed: Path | None) -> dict[str, Path | str | None]:
-    """What scenes of a list read on this machine, by names for messages, and the list, where it is a file."""
-    local = (entry for entry in entries if entry.source != CITY and "://" not in entry.source)
-    sources: dict[str, Path | str | None] = {f"source of {entry.name}": entry.source for entry in local}
-    return sources | {"list": listed if listed is not None and listed.is_file() else None}
+def refuse_address(text: str, where: str) -> None:
+    """UsageError for an address: many machines work in the folders of a batch at the same time."""
+    if "://" in text:
+        what, remedy = "a batch works on folders", "mount the store as one, or give the address to mudg run"
+        raise UsageError(what, where=where, got=text.partition("://")[0] + "://...", remedy=remedy)
 
 
 def shard_of(name: str, count: int) -> int:
@@ -118,29 +108,20 @@ def parse_shard(text: str, environment: Mapping[str, str] = os.environ) -> tuple
     empty text. UsageError: not of this form, or the environment does not say it."""
     if not text:
         return 0, 1
-    first, _, count = text.partition("/")
-    if first == "env":
-        first, count = _numbered(count, environment)
-    if not first.isdecimal() or not count.isdecimal() or not int(first) < int(count):
-        what, got = "invalid shard", text if "env" not in text else f"{text}: {first or '?'}/{count or '?'}"
+    index, _, count = text.partition("/")
+    if index == "env":
+        named = next((names for names in SHARD_VARIABLES if environment.get(names[0])), None)
+        if named is None:
+            expected = f"one of {', '.join(names[0] for names in SHARD_VARIABLES)} in the environment"
+            raise UsageError("no scheduler has numbered this task", where="--shard env", expected=expected)
+        index, total, lowest = (environment.get(name, "") for name in named)
+        count = count or total
+        if index.isdecimal() and lowest.isdecimal():
+            index = str(int(index) - int(lowest))
+    if not index.isdecimal() or not count.isdecimal() or not int(index) < int(count):
+        what, got = "invalid shard", f"{text}: {index or '?'}/{count or '?'}"
         raise UsageError(what, where="--shard", expected="i/n with i from 0 to n-1, e.g. 0/4; or env, env/n", got=got)
-    return int(first), int(count)
-
-
-def _numbered(count: str, environment: Mapping[str, str]) -> tuple[str, str]:
-    for index_name, count_name, lowest_name in SHARD_VARIABLES:
-        index = environment.get(index_name, "")
-        if index:
-            lowest = environment.get(lowest_name, "") or "0"
-            index = str(int(index) - int(lowest)) if index.isdecimal() and lowest.isdecimal() else index
-            return index, count or environment.get(count_name, "")
-    expected = f"one of {', '.join(names[0] for names in SHARD_VARIABLES)} in the environment"
-    raise UsageError("no scheduler has numbered this task", where="--shard env", expected=expected)
-
-
-def shard(entries: Sequence[Entry], part: tuple[int, int]) -> list[Entry]:
-    """Entries of the i-th of n shards."""
-    return [entry for entry in entries if shard_of(entry.name, part[1]) == part[0]]
+    return int(index), int(count)
 
 
 # steps --------------------------------------------------------------------------------------------
@@ -149,9 +130,6 @@ RULES_VERSION: Final = 2
 """Counts up when keys or commands change their meaning: results of older batches are then made again."""
 OF_A_LINE: Final = ("format", "frames", "cameras", "sequence", "poses", "boxes", "seed")
 """Settings of ingest that a line of the list may give; seed is that of a generated city."""
-REVISION: Final = "revision"
-"""Setting of a line that only changes the key: another content at the same address."""
-
 _PLACEHOLDER: Final = re.compile(r"\{(\w+)\}")
 COMMAND: Final = "command"
 """Name of the step that is a program of the user's own."""
@@ -167,21 +145,17 @@ class BatchStage:
     needs: tuple[str, ...] = ()
     settings: Mapping[str, Any] = field(default_factory=dict)
 
-    @property
-    def is_own(self) -> bool:
-        """Whether it is a program of the user's own."""
-        return self.name == COMMAND
-
 
 @dataclass(frozen=True)
 class Unit:
-    """A step of a scene: what is claimed, done and recorded."""
+    """A step of a scene: what is done and recorded."""
 
     entry: Entry
     stage: BatchStage
     key: str
+    """Content key: of the log's identity, settings, version and the keys of what is read."""
     needs: Mapping[str, str]
-    """Step -> key of the results it reads."""
+    """Step -> folder below the output, of the results it reads."""
 
     @property
     def place(self) -> str:
@@ -207,19 +181,14 @@ class BatchPlan:
 
     def units(self, entry: Entry) -> Iterator[Unit]:
         """The steps of a scene, in order."""
-        keys: dict[str, str] = {}
+        made: dict[str, Unit] = {}
         for stage in self.stages:
-            needs = {name: keys[name] for name in stage.needs}
-            unit = Unit(entry, stage, _key(stage, entry, needs), needs)
-            keys[stage.name] = unit.key
-            yield unit
-
-
-def _key(stage: BatchStage, entry: Entry, needs: Mapping[str, str]) -> str:
-    """Content key: of the log's identity, settings, version and the keys of what is read."""
-    values = [RULES_VERSION, version(), stage.name, list(stage.words), without_devices(stage.settings)]
-    values += [entry.name, entry.source, dict(entry.settings), dict(needs)]
-    return hashlib.sha256(store.json_text(values, indent=None).encode()).hexdigest()[:32]
+            needs = {name: made[name] for name in stage.needs}
+            values = [RULES_VERSION, version(), stage.name, list(stage.words), without_devices(stage.settings)]
+            values += [entry.name, entry.source, dict(entry.settings), {name: one.key for name, one in needs.items()}]
+            key = hashlib.sha256(store.json_text(values, indent=None).encode()).hexdigest()[:32]
+            made[stage.name] = Unit(entry, stage, key, {name: one.place for name, one in needs.items()})
+            yield made[stage.name]
 
 
 def plan_of(
@@ -260,22 +229,17 @@ def plan_of(
 def command_of(unit: Unit, places: Mapping[str, str], out: str, config: str) -> list[str]:
     """The command line of a step of a scene. places: ``source`` and steps -> where they lie. out: folder to write.
     config: file of its settings, if it has any."""
-    filled = {**places, "out": out, "name": unit.entry.name}
+    filled, name = {**places, "out": out, "name": unit.entry.name}, unit.stage.name
     words = [_PLACEHOLDER.sub(lambda match: filled.get(match[1], match[0]), word) for word in unit.stage.words]
-    if unit.stage.is_own:
+    if name == COMMAND:
         return words
-    groups = {"ingest": "", "run": "ingest."}
-    own = list(line_words(unit.entry.settings, groups[unit.stage.name])) if unit.stage.name in groups else []
-    given = ["--out", out, "--quiet", *(["--config", config] if config else [])]
-    return [sys.executable, "-m", "mudg", *words, *given, *own]
-
-
-def line_words(settings: Mapping[str, str], group: str = "") -> Iterator[str]:
-    """Flags for the settings of a line of the list. group: what their names begin with: ``ingest.`` in the chain."""
-    for name, value in settings.items():
-        if name == "cameras":
-            yield from (f"--{group}cameras", *value.split(","))
-        elif name == "seed":
-            yield f"--{group}city.seed={value}"
-        elif name in OF_A_LINE:
-            yield f"--{group}{name}={value}"
+    words = [sys.executable, "-m", "mudg", *words, "--out", out, "--quiet", *(["--config", config] if config else [])]
+    if name not in ("ingest", "run"):
+        return words
+    group = "ingest." if name == "run" else ""
+    for setting, value in unit.entry.settings.items():
+        if setting == "cameras":
+            words += [f"--{group}cameras", *value.split(",")]
+        else:
+            words.append(f"--{group}{'city.' if setting == 'seed' else ''}{setting}={value}")
+    return words

@@ -7,7 +7,7 @@ OUT/_batch/plan.json                steps, commands, settings, version
           done/<key>.json           a result is one from this record on; written last
           failed/<key>.json         why a step has no result
           logs/<key>.txt            the end of what a failed step said
-          work/ partial/            unfinished results
+          work/                     unfinished results
 """
 
 from __future__ import annotations
@@ -22,33 +22,28 @@ import subprocess
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Final, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import Field
 
 from mudg.base import store
 from mudg.base.config import differences
 from mudg.base.errors import InputError, UsageError
-from mudg.base.location import Location
 from mudg.base.processes import process_alive
-from mudg.base.records import first_problem
+from mudg.base.records import ForeignRecord, parse_record
 from mudg.fleet.plan import BOOKKEEPING, BatchPlan, Entry
 from mudg.scene.schema import NAME_PATTERN
 
-Kind = TypeVar("Kind", bound=BaseModel)
+Kind = TypeVar("Kind", bound=ForeignRecord)
 Amount = Annotated[float, Field(ge=0, le=1e15, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0, le=10**15)]
 Name = Annotated[str, Field(pattern=f"^{NAME_PATTERN.pattern}$")]
 """Becomes a part of a path."""
-_LISTED: Final = TypeAdapter(list[tuple[Name, str, dict[str, str]]])
 _OWNER: Final = re.compile(r"owner(-\d+-of-\d+)?\.json")
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(strict=True, extra="ignore")
-
-
-class Ended(_Record):
+class Ended(ForeignRecord):
     """How a step of a scene ended: done or failed, which is put on record; or stopped, or lost by its engine. lost_s:
     processor seconds of attempts without a result."""
 
@@ -70,13 +65,13 @@ class Ended(_Record):
     peak_bytes: Count | None = None
 
 
-class Owner(_Record):
+class Owner(ForeignRecord):
     """Who drives a batch, or one shard of it. job: number of the Slurm job that does."""
 
     host: str
     process: Annotated[int, Field(ge=0, lt=2**31)]
     since: Amount
-    shard: tuple[Count, Count] = (0, 1)
+    shard: Annotated[tuple[Count, Count], Field(strict=False)] = (0, 1)
     job: Annotated[str, Field(pattern=r"^\d*$")] = ""
 
     def is_alive(self) -> bool | None:
@@ -95,22 +90,25 @@ class Owner(_Record):
         return f"{what} on {self.host.split(' ')[0]} since {since}"
 
 
-class _Named(_Record):
+class _Named(ForeignRecord):
     name: Name
 
 
-class _PlanRecord(_Record):
+class _SceneRows(ForeignRecord):
+    scenes: list[Annotated[tuple[Name, str, dict[str, str]], Field(strict=False)]]
+
+
+class _PlanRecord(ForeignRecord):
     stages: Annotated[list[_Named], Field(min_length=1)]
 
 
-def _checked(kind: type[Kind], content: bytes, where: str, remedy: str) -> Kind:
+def _checked(kind: type[Kind], value: object, where: str, remedy: str) -> Kind:
     """A record, if it is one of this kind; InputError names file and field."""
     try:
-        return kind.model_validate_json(store.json_text(store.parse_json(content, where), indent=None))
-    except ValidationError as error:
-        problem = first_problem(error, f"{where}: ")
-        fields = {**problem.fields, "remedy": remedy}
-        raise InputError(f"a record of the batch is damaged: {problem.what}", **fields) from error
+        return parse_record(kind, value, f"{where}: ")
+    except InputError as error:
+        fields = {**error.fields, "remedy": remedy}
+        raise InputError(f"a record of the batch is damaged: {error.what}", **fields) from error
 
 
 def this_host() -> str:
@@ -134,39 +132,33 @@ def slurm_tasks_left(job: str) -> int:
 class BatchFolder:
     """The output of a batch."""
 
-    out: Location
+    out: Path
 
     @property
-    def own(self) -> Location:
+    def own(self) -> Path:
         """Folder of the batch's own records."""
         return self.out / BOOKKEEPING
 
-    def record(self, kind: Literal["done", "failed"], key: str) -> Location:
+    def record(self, kind: Literal["done", "failed"], key: str) -> Path:
         """Record of a step that is done or has failed."""
         return self.own / kind / f"{key}.json"
 
-    def log(self, key: str) -> Location:
+    def log(self, key: str) -> Path:
         """The end of what a failed step said."""
         return self.own / "logs" / f"{key}.txt"
 
-    def partial(self, key: str) -> Location:
-        """An unfinished result, put here by a worker that was asked to stop."""
-        return self.own / "partial" / key
-
     def keys(self, kind: Literal["done", "failed"]) -> set[str]:
         """Keys on record, from one listing."""
-        return {name.removesuffix(".json") for name in (self.own / kind).names()}
+        return {name.removesuffix(".json") for name in _names(self.own / kind)}
 
     def records(self, kind: Literal["done", "failed"]) -> Iterator[Ended]:
         """All records of a kind. InputError: one is damaged."""
-        folder = self.own / kind
-        for name, content in folder.load_below(folder.names()).items():
-            yield _checked(Ended, content, f"{folder}/{name}", "remove it: the step is done again")
+        for path, content in _contents(self.own / kind, _names(self.own / kind)):
+            yield _checked(Ended, store.parse_json(content, str(path)), str(path), "remove it: the step is done again")
 
     def end(self, kind: Literal["done", "failed"], ended: Ended) -> None:
         """Put the end of a step on record."""
-        content = json.dumps({"schema": 1, **ended.model_dump()}, ensure_ascii=False, allow_nan=False)
-        self.record(kind, ended.key).save(content.encode())
+        store.write_json(self.record(kind, ended.key), {"schema": 1, **ended.model_dump()})
 
     # plan and list --------------------------------------------------------------------------------
 
@@ -174,56 +166,50 @@ class BatchFolder:
         """Put plan and list on record, or check that they are the same. UsageError: the folder holds a batch of other
         steps or settings, or something else."""
         file, record = self.own / "plan.json", json.loads(store.json_text(plan.record()))
-        names = [name for name in self.out.names() if not name.startswith(".")] if self.out.local is not None else []
+        names = _names(self.out)
         if names and BOOKKEEPING not in names:  # another shard may begin at the same moment
             what, remedy = "the output holds files of something else", "choose an empty --out"
             raise UsageError(what, where=str(self.out), remedy=remedy)
-        if not file.save((store.json_text(record) + "\n").encode(), only_if_absent=True):
-            before = store.parse_json(file.load(), str(file))
+        if not store.create_once(file, (store.json_text(record) + "\n").encode()):
+            before = store.read_json(file)
             if before != record:
                 what = "the output holds a batch of other steps or settings"
                 got = "; ".join(differences(before, record)[:8])
                 raise UsageError(what, where=str(self.out), got=got, remedy="choose another --out")
         values = [[one.name, one.source, dict(one.settings)] for one in sorted(entries, key=lambda one: one.name)]
         content = json.dumps(values, ensure_ascii=False).encode()
-        listed = self.own / f"list.{hashlib.sha256(content).hexdigest()[:12]}.json"
-        if not listed.exists():
-            listed.save(content)
+        store.create_once(self.own / f"list.{hashlib.sha256(content).hexdigest()[:12]}.json", content)
 
     def stages(self) -> list[str]:
         """Names of the steps. InputError: no batch is here, or its record is damaged."""
         file = self.own / "plan.json"
         if not file.exists():
             raise InputError("no batch is here", where=str(self.out), expected="the --out of a mudg batch run")
-        plan = _checked(_PlanRecord, file.load(), str(file), "begin the batch again in another folder")
+        plan = _checked(_PlanRecord, store.read_json(file), str(file), "begin the batch again in another folder")
         return [stage.name for stage in plan.stages]
 
     def scenes(self) -> list[str]:
         """Names of the scenes of all lists that were ever given. InputError: a list is damaged."""
         scenes: set[str] = set()
-        for name in self.own.names():
-            if name.startswith("list."):
-                where = str(self.own / name)
-                try:
-                    rows = _LISTED.validate_python(store.parse_json((self.own / name).load(), where))
-                    scenes.update(row[0] for row in rows)
-                except ValidationError as error:
-                    raise first_problem(error, f"{where}: ") from error
+        for file in (self.own / name for name in _names(self.own) if name.startswith("list.")):
+            remedy = "remove it, and give the list again"
+            listed = _checked(_SceneRows, {"scenes": store.read_json(file)}, str(file), remedy)
+            scenes.update(row[0] for row in listed.scenes)
         return sorted(scenes)
 
     # drivers --------------------------------------------------------------------------------------
 
     def owners(self) -> dict[str, Owner]:
         """Drivers on record, by the names of their files. InputError: a record is damaged."""
-        names = [name for name in self.own.names() if _OWNER.fullmatch(name)]
-        remedy = "remove it, if no driver of this batch runs"
-        contents = self.own.load_below(names).items()
-        return {name: _checked(Owner, content, f"{self.own}/{name}", remedy) for name, content in contents}
+        names, remedy = list(filter(_OWNER.fullmatch, _names(self.own))), "remove it, if no driver of this batch runs"
+        contents = _contents(self.own, names)
+        parsed = ((path, store.parse_json(content, str(path))) for path, content in contents)
+        return {path.name: _checked(Owner, value, str(path), remedy) for path, value in parsed}
 
     @contextlib.contextmanager
     def owned(
         self, shard: tuple[int, int] = (0, 1), *, numbered: bool = False, take_over: bool = False
-    ) -> Iterator[Location]:
+    ) -> Iterator[Path]:
         """Drive the batch, or one shard of it, alone. Yields the owner's record, which is removed at the end unless
         somebody changed it. numbered: a scheduler numbered this task, and runs every number once: what an earlier one
         left is taken over. take_over: from any other driver. UsageError: another driver works on it, or may do so on
@@ -239,19 +225,30 @@ class BatchFolder:
                     continue
                 alive = other.is_alive()
                 if alive is False or take_over or (numbered and other_name == name):
-                    (self.own / other_name).remove()
+                    store.remove(self.own / other_name)
                     continue
-                if mine.exists() and mine.load() == content:
-                    mine.remove()
+                if mine.exists() and store.read_bytes(mine) == content:
+                    store.remove(mine)
                 what = "another driver works on this batch" if alive else "another machine may still drive this batch"
                 remedy = "wait for it, or stop it" if alive else "if it is gone, add --take-over"
                 raise UsageError(what, where=str(self.own / other_name), got=str(other), remedy=remedy)
-            if not mine.save(content, only_if_absent=True) and mine.load() != content:
+            if not store.create_once(mine, content) and store.read_bytes(mine) != content:
                 what, remedy = "another driver works on this batch", "wait for it, or stop it"
                 raise UsageError(what, where=str(mine), remedy=remedy)
         try:
             yield mine
         finally:
             with contextlib.suppress(InputError):
-                if mine.load() == content:
-                    mine.remove()
+                if store.read_bytes(mine) == content:
+                    store.remove(mine)
+
+
+def _names(folder: Path) -> list[str]:
+    """Names in a folder, sorted, without those that are being written; none where it is not there."""
+    return sorted(name for name in os.listdir(folder) if not name.startswith(".")) if folder.is_dir() else []
+
+
+def _contents(folder: Path, names: Sequence[str]) -> Iterator[tuple[Path, bytes]]:
+    for name in names:
+        with contextlib.suppress(InputError):  # removed meanwhile
+            yield folder / name, store.read_bytes(folder / name)

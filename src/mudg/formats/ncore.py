@@ -36,9 +36,9 @@ ABOUT: Final = "mudg"
 """Key of what this program notes about a recording."""
 SWEEP_TIME: Final = "sweep_timestamp_us"
 """Key of the moment of a sweep, of which the format knows only begin and end."""
-POINT_CLASSES: Final = "train_ids"
 MICRO: Final = 1_000_000
-_EULER: Final = "xyz"  # small letters: about fixed axes
+EULER: Final = "xyz"
+"""Axes about which a box is turned; small letters: fixed ones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,17 +70,6 @@ def close(reader: Any) -> None:
             files.close()
 
 
-def euler_of(rotation: Matrix) -> tuple[float, float, float]:
-    """The three angles in radians of a box's rotation f64[3, 3]."""
-    x, y, z = Rotation.from_matrix(rotation).as_euler(_EULER)
-    return float(x), float(y), float(z)
-
-
-def rotation_of(euler_rad: tuple[float, float, float]) -> Matrix:
-    """The rotation f64[3, 3] of a box's three angles."""
-    return Rotation.from_euler(_EULER, euler_rad).as_matrix()
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseKeys:
     """A frame's poses over time. ``times_us``: i64[K], increasing, at least two. poses: f64[K, 4, 4], rigid."""
@@ -103,27 +92,18 @@ class PoseKeys:
         """With keys at both ends of a span of time, where it reaches beyond: the frame goes on as it did between its
         two nearest keys, for no longer than these lie apart, and then stands."""
         times, poses = [*self.times_us.tolist()], [*self.poses]
-        if start_us < times[0]:
-            poses.insert(
-                0, _beyond(times[1] - times[0], poses[1], poses[0], times[0] - start_us) if len(times) > 1 else poses[0]
-            )
-            times.insert(0, start_us)
-        if end_us > times[-1]:
-            poses.append(
-                _beyond(times[-1] - times[-2], poses[-2], poses[-1], end_us - times[-1])
-                if len(times) > 1
-                else poses[-1]
-            )
-            times.append(end_us)
+        for at, end, near, far in ((0, start_us, 0, 1), (len(times) + 1, end_us, -1, -2)):
+            if not times[0] <= end <= times[-1]:
+                pose = poses[near]
+                if len(times) > 1:
+                    share = min(abs((end - times[near]) / (times[near] - times[far])), 1.0)
+                    here, before = (Rotation.from_matrix(poses[n][:3, :3]) for n in (near, far))
+                    turn = Rotation.from_rotvec(share * (here * before.inv()).as_rotvec()) * here
+                    place = pose[:3, 3] + share * (pose[:3, 3] - poses[far][:3, 3])
+                    pose = from_rotation_translation(turn.as_matrix(), place)
+                times.insert(at, end)
+                poses.insert(at, pose)
         return PoseKeys(np.array(times, np.int64), np.stack(poses))
-
-
-def _beyond(step_us: int, before: Matrix, last: Matrix, beyond_us: int) -> Matrix:
-    """Where a frame is some time after its last key."""
-    share = min(beyond_us / step_us, 1.0)
-    turn = Rotation.from_matrix(last[:3, :3]) * Rotation.from_matrix(before[:3, :3]).inv()
-    rotation = Rotation.from_rotvec(share * turn.as_rotvec()) * Rotation.from_matrix(last[:3, :3])
-    return from_rotation_translation(rotation.as_matrix(), last[:3, 3] + share * (last[:3, 3] - before[:3, 3]))
 
 
 # shutters -----------------------------------------------------------------------------------------

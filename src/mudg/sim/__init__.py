@@ -8,8 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mudg.sim.cockpit import Cockpit
-    from mudg.sim.drive import Car, Controls, Drive
+    from mudg.sim.drive import Car, Cockpit, Controls, Drive
     from mudg.sim.env import Env
     from mudg.sim.lidar import BeamTable, LidarReply, LidarRequest
     from mudg.sim.optics import Fisheye, FTheta, Pinhole
@@ -42,6 +41,6 @@ def __getattr__(name: str) -> Any:
         from mudg.sim import env
 
         return env.Env
-    from mudg.sim import cockpit, drive, lidar, optics, session
+    from mudg.sim import drive, lidar, optics, session
 
-    return next(vars(home)[name] for home in (session, lidar, optics, drive, cockpit) if name in vars(home))
+    return next(vars(home)[name] for home in (session, lidar, optics, drive) if name in vars(home))

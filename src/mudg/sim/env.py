@@ -19,8 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from mudg.base.errors import UsageError
 from mudg.base.palette import UNLABELLED
 from mudg.base.types import Scene
-from mudg.sim.cockpit import Cockpit
-from mudg.sim.drive import Controls, Drive, Traffic
+from mudg.sim.drive import Cockpit, Controls, Drive, Traffic
 from mudg.sim.session import CameraReply, Layer, Session
 
 LEAST: Final = (-8.0, -0.8)

@@ -10,18 +10,28 @@ sampled from pinhole views.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
-from mudg.base import geometry, seeds
+from mudg.base import geometry, log, seeds, store
 from mudg.base.errors import UsageError
 from mudg.base.palette import UNLABELLED
-from mudg.base.types import SweepPoints, View
+from mudg.base.records import Number, StrictRecord, parse_record
+from mudg.base.types import Scene, Sweep, SweepPoints, View
 from mudg.base.weather_settings import WeatherSettings
-from mudg.core.weather.lidar import SOFT, sweep_in_weather
+from mudg.core.trajectory import ego_left_world, trajectory_name
+from mudg.core.weather.air import SOFT, sweep_in_weather
+from mudg.editing.script import EditScript
+from mudg.editing.settings import RenderConfig
+from mudg.scene.beams import Beams, beams_of, with_silent
+from mudg.scene.read import read_scene
+from mudg.scene.sweep_sets import INDEX, SimulatedSweep, SweepSet, write_index
 from mudg.sim.optics import faces_of, nearest, surface
 from mudg.sim.returns import LogReturns
 from mudg.sim.session import Instant, Session
@@ -91,6 +101,50 @@ class BeamTable:
         )
         ring = np.tile(np.arange(len(elevations), dtype=np.uint16), columns)
         return cls(away.reshape(-1, 3), ring, np.repeat(share, len(elevations)), range_m)
+
+
+def forward(
+    elevations_deg: NDArray[np.float64], field_deg: float, step_deg: float, range_m: tuple[float, float]
+) -> BeamTable:
+    """A LiDAR that sweeps a field ahead of it from left to right."""
+    turn = BeamTable.spinning(elevations_deg, step_deg, range_m)
+    inside = np.abs(np.degrees(np.arctan2(turn.directions[:, 1], turn.directions[:, 0]))) <= field_deg / 2
+    if not inside.any():
+        what, expected = "the field of view is narrower than a step", f"at least {step_deg:g} degrees"
+        raise UsageError(what, where="field_deg", expected=expected, got=f"{field_deg:g}")
+    share = turn.share[inside]
+    share = (share - share.min()) / max(float(np.ptp(share)), 1e-9)
+    return BeamTable(turn.directions[inside], turn.ring[inside], share, range_m)
+
+
+HDL64: Final = np.concatenate([np.linspace(-24.33, -8.83, 32), np.linspace(-8.33, 2.0, 32)])
+TABLES: Final[dict[str, Callable[[], BeamTable]]] = {
+    "pandar128": lambda: BeamTable.spinning(np.linspace(-25.0, 15.0, 128), 0.2, (0.3, 200.0)),
+    "at128": lambda: forward(np.linspace(-12.7, 12.7, 128), 120.0, 0.1, (0.5, 200.0)),
+    "hdl64": lambda: BeamTable.spinning(HDL64, 0.17, (0.9, 120.0)),
+    "vlp16": lambda: BeamTable.spinning(np.linspace(-15.0, 15.0, 16), 0.2, (0.5, 100.0)),
+}
+"""Name -> beams. Rows of pandar128 and at128 are evenly spread here."""
+
+
+class TableFile(StrictRecord):
+    """A turning sensor, or one that sweeps a field ahead of it."""
+
+    elevations_deg: Annotated[list[Number], Field(min_length=1, max_length=512)]
+    azimuth_step_deg: Number
+    range_m: Annotated[list[Number], Field(min_length=2, max_length=2)] = [0.5, 120.0]
+    field_deg: Annotated[Number, Field(gt=0)] = 360.0
+    direction: Literal["clockwise", "anticlockwise"] = "clockwise"
+
+
+def read_table(path: Path) -> BeamTable:
+    """The table in a JSON file (docs/simulator.md). InputError: no such file, or fields that make no sense. UsageError:
+    numbers that no sensor has."""
+    found = parse_record(TableFile, store.read_json(path), str(path))
+    elevations, limits = np.array(found.elevations_deg), (found.range_m[0], found.range_m[1])
+    if found.field_deg < 360:
+        return forward(elevations, found.field_deg, found.azimuth_step_deg, limits)
+    return BeamTable.spinning(elevations, found.azimuth_step_deg, limits, found.direction == "clockwise")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -252,3 +306,118 @@ def _carried(points: NDArray[np.float32], share: Floats, start: Instant, end: In
         pose = geometry.interpolate_pose(start.world_from_sensor, end.world_from_sensor, float(share[own[0]]))
         carried[own] = geometry.transform_points(end_from_world @ pose, points[own])
     return carried
+
+
+# -- sweeps of a whole log: ``mudg render --lidar`` ---
+#
+# OUT/lidar/<sensor>_recorded/, OUT/lidar/<sensor>_shift+3.0/   see ``scene/sweep_sets.py``
+Place = tuple[BeamTable, Instant, Instant]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WantedSweeps:
+    """What is to be written: the sensor whose mounting and times count, and a table of beams; None: its own beams."""
+
+    sensor: str
+    beams: BeamTable | None
+    name: str
+
+
+def wanted_sweeps(name: str, scene: Scene) -> WantedSweeps:
+    """What ``--lidar`` asks for: a sensor of the scene, the name of a table, or a JSON file. UsageError: none of them,
+    or a scene without sweeps. InputError: a malformed file."""
+    sensors = list(dict.fromkeys(sweep.sensor for sweep in scene.sweeps))
+    if not sensors:
+        what, remedy = "the log has no LiDAR sweeps to take poses and times from", "leave --lidar out"
+        raise UsageError(what, where="--lidar", got=name, remedy=remedy)
+    if name in sensors:
+        return WantedSweeps(name, None, name)
+    if name in TABLES:
+        return WantedSweeps(sensors[0], TABLES[name](), name)
+    if name.endswith(".json"):
+        return WantedSweeps(sensors[0], read_table(Path(name)), Path(name).stem)
+    expected = f"a sensor of the scene ({', '.join(sensors)}), {', '.join(TABLES)}, or a JSON file of beams"
+    raise UsageError("no such LiDAR", where="--lidar", expected=expected, got=name)
+
+
+MountedLidar = tuple[WantedSweeps, BeamTable, NDArray[np.float64]]
+
+
+def mounted(scene: Scene, lidar: str) -> MountedLidar:
+    """A LiDAR by name: what is wanted, its beams, and vehicle-from-LiDAR f64[4, 4], of the first sweep of the sensor
+    for which the log has a pose of the vehicle. UsageError: no such LiDAR, or no pose of the vehicle."""
+    wanted = wanted_sweeps(lidar, scene)
+    for sweep in (one for one in scene.sweeps if one.sensor == wanted.sensor):
+        ego = scene.ego.pose_at(sweep.time_s)
+        if ego is not None:
+            beams = own_table(beams_of(scene, sweep)) if wanted.beams is None else wanted.beams
+            return wanted, beams, geometry.invert(ego) @ sweep.world_from_lidar
+    what = "a LiDAR needs the poses of the vehicle at its sweeps"
+    raise UsageError(what, where="--lidar", got=f"none for {wanted.sensor}", remedy="leave --lidar out")
+
+
+def simulate_log(config: RenderConfig, scene: Path, model: Path, script: EditScript | None, out: Path) -> list[str]:
+    """``write_sweeps`` of a fitted scene on disk, edited if there is a script."""
+    return write_sweeps(config, scene, Session(model, script, scene, config.device), out)
+
+
+def write_sweeps(config: RenderConfig, scene: Path, session: Session, out: Path) -> list[str]:
+    """Simulate every sweep of the log ``scene`` at every shift; returns names of the trajectories. Sweeps that an
+    interrupted run wrote are kept."""
+    loaded = read_scene(scene)
+    wanted = wanted_sweeps(config.lidar, loaded)
+    sweeps = [sweep for sweep in loaded.sweeps if sweep.sensor == wanted.sensor]
+    names = []
+    with log.task("render LiDAR", len(sweeps) * len(config.shifts_m)) as bar:
+        for shift_m in config.shifts_m:
+            name = trajectory_name(wanted.name, shift_m or None)
+            folder, records = out / "lidar" / name, []
+            for number, sweep in enumerate(sweeps):
+                beams, start, end = _place(loaded, sweep, shift_m, wanted.beams)
+                file = folder / f"{number:06d}.safetensors"
+                if not file.is_file():
+                    reply = session.render([LidarRequest(beams=beams, start=start, end=end, like=wanted.sensor)])[0]
+                    store.write_safetensors(file, _arrays(beams, reply))
+                poses = (start.world_from_sensor, end.world_from_sensor, start.time_s, end.time_s)
+                records.append(SimulatedSweep(sweep.id, wanted.beams is None, *poses, file.name))
+                bar.advance()
+            if not (folder / INDEX).is_file():
+                write_index(SweepSet(folder, name, wanted.sensor, shift_m, tuple(records)))
+            names.append(name)
+    return names
+
+
+def _place(scene: Scene, sweep: Sweep, shift_m: float, table: BeamTable | None) -> Place:
+    """Beams, start and end of a sweep that is taken where a recorded one was, moved to the left."""
+    own = beams_of(scene, sweep)
+    moved = np.zeros(3)
+    if shift_m:
+        first, last = float(scene.ego.times_s[0]), float(scene.ego.times_s[-1])
+        ego = scene.ego.pose_at(min(max(sweep.time_s, first), last))
+        moved = shift_m * ego_left_world(sweep.world_from_lidar if ego is None else ego)
+    poses = [pose.copy() for pose in (own.start, own.end)]
+    for pose in poses:
+        pose[:3, 3] += moved
+    table = own_table(own) if table is None else table
+    return table, Instant(own.start_s, poses[0]), Instant(own.end_s, poses[1])
+
+
+def own_table(beams: Beams) -> BeamTable:
+    """The beams of a recorded sweep, those that returned nothing included."""
+    full, reach = with_silent(beams), float(beams.range_m.max(initial=100.0))
+    return BeamTable(full.directions, np.zeros(len(full), np.uint16), full.share, (0.0, 1.05 * reach))
+
+
+def _arrays(beams: BeamTable, reply: LidarReply) -> dict[str, Any]:
+    return {
+        "xyz": reply.xyz,
+        "intensity": reply.intensity.astype(np.float32),
+        "dt_s": reply.dt_s,
+        "classes": reply.classes,
+        "ring": reply.ring,
+        "beam": reply.beam.astype(np.int64),
+        "directions": beams.directions.astype(np.float32),
+        "share": beams.share.astype(np.float32),
+        "range_m": reply.surface_m,
+        "facing": reply.facing,
+    }

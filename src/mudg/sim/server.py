@@ -28,11 +28,10 @@ from mudg.base import geometry, log
 from mudg.base.errors import MudgError, ResourceError
 from mudg.base.versions import version
 from mudg.sim import wire
-from mudg.sim.lidar import BeamTable, LidarRequest
+from mudg.sim.lidar import TABLES, BeamTable, LidarRequest
 from mudg.sim.optics import Fisheye, FTheta, Optics, Pinhole
 from mudg.sim.session import CameraRequest, Instant, Session
 from mudg.sim.settings import ServeConfig
-from mudg.sim.tables import TABLES
 from mudg.sim.wire import matrix_of, pose_of
 from mudg.viewer.server import is_loopback, token_for
 

@@ -22,10 +22,9 @@ from mudg.base.palette import UNLABELLED
 from mudg.base.types import Camera, Gaussians, Observation, Scene, Shutter, View
 from mudg.core.pictures import to_bytes
 from mudg.core.raster.rasterize import MAX_EXTRA_CHANNELS, drawing_device, rasterize
-from mudg.diffusion.settings import HarmonizeConfig
 from mudg.diffusion.synthesize import JobInputs
 from mudg.editing.apply import carry_out
-from mudg.editing.harmonised import RenderMixer, check_as_recorded
+from mudg.editing.render import RenderMixer, check_as_recorded
 from mudg.editing.runs import find_run, scene_at
 from mudg.editing.script import EditScript, read_edits
 from mudg.gaussians.model import SceneModel, compose
@@ -200,7 +199,7 @@ class Session:
 
     Raises:
         InputError: no fitted scene, or edits that cannot be carried out. ResourceError: no such device. UsageError:
-            repairs without the clouds of a run, or with edits.
+            repairs without the clouds of a run, or of an edited one.
     """
 
     def __init__(
@@ -211,13 +210,18 @@ class Session:
         device: str = "auto",
         repair: bool = False,
     ) -> None:
-        self._mixer = _mixer_of(run, edits, device) if repair else None
-        if not isinstance(run, SceneModel):
-            parts = find_run(Path(run))
+        parts = None if isinstance(run, SceneModel) else find_run(Path(run))
+        self._mixer = None
+        if repair:
+            if parts is None or parts.scene is None or parts.fused is None or edits is not None:
+                what, expected = "pictures cannot be repaired here", "the folder of a finished mudg run, without edits"
+                raise UsageError(what, where="repair", expected=expected)
+            self._mixer = RenderMixer(JobInputs(parts.scene, parts.fused, parts.model), device=device)
+        if parts is not None:
             scene = scene if scene is not None else parts.scene
             run = load_model(parts.model)
-            if repair:
-                check_as_recorded(run, "repair")
+        if repair:
+            check_as_recorded(run, "repair")
         if isinstance(scene, str | Path):
             scene = read_scene(scene_at(Path(scene)))
         self._gone = None
@@ -487,15 +491,6 @@ class Canvas:
         self.certainty[place] = nearest(_certainty(seen), face.uv)
         if planes.instances is not None:
             self.instances[place] = nearest(planes.instances, face.uv)
-
-
-def _mixer_of(run: str | Path | SceneModel, edits: object, device: str) -> RenderMixer:
-    """What repairs pictures of a run's best fit."""
-    parts = None if isinstance(run, SceneModel) or edits is not None else find_run(Path(run))
-    if parts is None or parts.scene is None or parts.fused is None:
-        what, expected = "pictures cannot be repaired here", "the folder of a finished mudg run, without edits"
-        raise UsageError(what, where="repair", expected=expected)
-    return RenderMixer(JobInputs(parts.scene, parts.fused, parts.model), HarmonizeConfig(), device)
 
 
 def _repaired(mixer: RenderMixer, view: View, rendered: RenderedCondition) -> RenderedCondition:

@@ -30,25 +30,20 @@ class BatchRun(Step):
             "mudg batch run --list logs.txt --out /shared/runs --engine slurm --jobs 500 --slurm-options time=4:00:00"
             " --config recipe.yaml"
         ),
-        (
-            "mudg batch run --list s3://data/logs.txt --out s3://data/runs --engine ray --ray-address auto --cpus 4"
-            " --gpus 1"
-        ),
+        "mudg batch run --list logs.txt --out /shared/runs --engine ray --ray-address auto --cpus 4 --gpus 1",
     )
     smaller = "fewer --jobs, or smaller images (--set ingest.resolution=960)"
     short = ("stages", "command", "engine", "jobs", "cpus", "gpus")
-    list: Annotated[str, Flag("FILE|URL")]
-    """File with one source per line (SOURCE [name=NAME] ...), or a folder of sources. Sources may be addresses."""
-    out: Annotated[str, Flag("FOLDER|URL")]
-    """Folder, or address in an object store (s3://bucket/runs), for results and records."""
+    list: Annotated[str, Flag("FILE")]
+    """File with one source per line (SOURCE [name=NAME] ...), or a folder of sources."""
+    out: Annotated[str, Flag()]
+    """Folder for results and records; all machines that work on the batch must see it."""
     config: Annotated[Path | None, Flag("FILE.yaml")] = None
     """Settings of the steps: a file of mudg run."""
     preset: PresetName = "default"
     """Settings of the steps to start from, as for mudg run."""
     set: Annotated[tuple[str, ...], Flag("STEP.NAME=VALUE ...")] = ()
     """Settings of the steps, over those of --config, as fit.iterations=500 device=cpu."""
-    scratch: Path | None = None
-    """Folder for unfinished results and fetched inputs (not given: in --out if that is a folder, else the system's)."""
     dry_run: bool = False
     """Only say what there is to do."""
     shard: Annotated[str, Flag("I/N")] = ""
@@ -69,9 +64,8 @@ class BatchRun(Step):
         from mudg.steps import batching
 
         settings = batching.settings_of(self.preset, self.config, self.set)
-        how: dict[str, Any] = {"scratch": self.scratch, "take_over": self.take_over, "dry": self.dry_run}
-        how |= {"shard_text": self.shard, "wait": self.wait}
-        return batching.run(self.list, self.out, self.settings, settings, stage_lines(), **how)
+        how: dict[str, Any] = {"shard_text": self.shard, "wait": self.wait, "take_over": self.take_over}
+        return batching.run(self.list, self.out, self.settings, settings, stage_lines(), **how, dry=self.dry_run)
 
 
 def stage_lines() -> dict[str, tuple[str, ...]]:
@@ -99,7 +93,7 @@ class BatchProgress(Step):
     verb_name = "batch status"
     examples = ("mudg batch status runs",)
     out: Annotated[str, OUT]
-    """Folder or address of a batch."""
+    """Folder of a batch."""
 
     def act(self) -> dict[str, Any]:
         from mudg.steps import batching
@@ -113,7 +107,7 @@ class BatchRetry(Step):
     verb_name = "batch retry"
     examples = ("mudg batch retry runs --reason 5,137",)
     out: Annotated[str, OUT]
-    """Folder or address of a batch."""
+    """Folder of a batch."""
     reason: str = ""
     """Only these exit codes or reasons, with commas, e.g. 5,137 (empty = all)."""
 

@@ -15,28 +15,26 @@ from typing import Any
 
 from mudg import native
 from mudg.base import config as configuration
-from mudg.base import log
+from mudg.base import log, store
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.base.location import Location
 from mudg.base.plain_yaml import parse_yaml
 from mudg.base.run_folder import refuse_overlap
 from mudg.fleet import engines, status
-from mudg.fleet.child import Stop
 from mudg.fleet.plan import (
+    CITY,
     COMMAND,
     OF_A_LINE,
-    REVISION,
     BatchPlan,
     Entry,
-    files_read,
     parse_shard,
     plan_of,
     read_list,
-    shard,
+    refuse_address,
+    shard_of,
 )
 from mudg.fleet.records import BatchFolder, Ended, slurm_tasks_left
 from mudg.fleet.settings import BatchConfig
-from mudg.fleet.work import DONE, STOPPED, Job, is_open
+from mudg.fleet.work import DONE, STOPPED, Job, Stop, is_open
 from mudg.steps.settings import PresetName, RunConfig, run_preset
 
 _POLL_S = 10.0
@@ -57,30 +55,29 @@ def run(
     *,
     shard_text: str = "",
     wait: bool = False,
-    scratch: Path | None = None,
     take_over: bool = False,
     dry: bool = False,
 ) -> dict[str, Any]:
-    """Run the steps of a batch, or submit the tasks that do. listed, out: paths or addresses. settings, lines: of the
-    steps, and their words (``plan_of``). shard_text: ``i/n``, ``env`` or ``env/n``, or empty. wait: for the end of an
-    array job. dry: only say what there is to do.
+    """Run the steps of a batch, or submit the tasks that do. settings, lines: of the steps, and their words
+    (``plan_of``). shard_text: ``i/n``, ``env`` or ``env/n``, or empty. wait: for the end of an array job. dry: only say
+    what there is to do.
 
     Returns counts, ``text``, and ``exit_code``: 0, or 10 plus the number of failed steps of this call (at most 99).
     UsageError: settings that contradict each other, or an output of another batch or driver. InputError: a bad list.
     KeyboardInterrupt: asked to stop; running steps have written checkpoints.
     """
-    scenes = read_list(listed, (*OF_A_LINE, REVISION))
-    part = parse_shard(shard_text)
+    refuse_address(listed, "--list")
+    refuse_address(out, "--out")
+    scenes, part = read_list(Path(listed), OF_A_LINE), parse_shard(shard_text)
     if shard_text and batch.engine != "local":
         raise UsageError("the engine itself shares out the list", where="--shard", got=f"--engine {batch.engine}")
-    plan, folder = plan_for(batch, settings, lines), BatchFolder(Location.of(out))
-    if folder.out.local is not None:
-        folder = BatchFolder(Location.of(folder.out.local.absolute()))
-    if folder.out.local is not None:
-        refuse_overlap(folder.out.local, files_read(scenes, Location.of(listed).local))
+    plan, folder = plan_for(batch, settings, lines), BatchFolder(Path(out).absolute())
+    sources = {f"source of {entry.name}": entry.source for entry in scenes if entry.source != CITY}
+    refuse_overlap(folder.out, sources | {"list": listed if Path(listed).is_file() else None})
     if not dry:
         folder.begin(plan, scenes)
-    done, failed, ours = folder.keys("done"), folder.keys("failed"), shard(scenes, part)
+    done, failed = folder.keys("done"), folder.keys("failed")
+    ours = [entry for entry in scenes if shard_of(entry.name, part[1]) == part[0]]
     entries = [entry for entry in ours if is_open(plan, entry, done, failed)]
     if dry:
         keys = [unit.key for entry in ours for unit in plan.units(entry)]
@@ -90,14 +87,15 @@ def run(
         text = f"{len(ours)} scenes: {' -> '.join(stage.name for stage in plan.stages)}"
         text += f"\n{counts[DONE]} steps done, {counts['failed']} failed, {left} to do"
         return {**counts, "left": left, "text": text}
-    unfinished = None if scratch is None else scratch.absolute()
-    job = Job(folder, plan, max(1, round(batch.cpus)), batch.grace_s, unfinished)
+    job = Job(folder, plan, max(1, round(batch.cpus)), batch.grace_s)
     with folder.owned(part, numbered=shard_text.startswith("env"), take_over=take_over) as owner:
         if batch.engine == "slurm" and entries:
             number, messages = engines.submit_to_slurm(job, entries, batch)
             me = next(one for one in folder.owners().values() if one.process == os.getpid())
-            owner.save(me.model_copy(update={"job": number}).model_dump_json().encode())
-            return _submitted(folder, plan, entries, number, messages, wait)
+            store.atomic_write(owner, me.model_copy(update={"job": number}).model_dump_json().encode())
+            text = f"job {number}; its messages: {messages}\nmudg batch status {folder.out}"
+            result = {"job": number, "out": str(folder.out), "text": text}
+            return {**result, "exit_code": _awaited(job, entries, number)} if wait else result
         counts = _run(job, entries, batch)
     text = ", ".join(f"{count} {state}" for state, count in sorted(counts.items())) or "nothing was left to do here"
     text, code = f"{text}\nmudg batch status {folder.out}", exit_code(counts.total() - counts[DONE])
@@ -126,21 +124,15 @@ def _run(job: Job, entries: Sequence[Entry], batch: BatchConfig) -> Counter[str]
     return counts
 
 
-def _submitted(
-    folder: BatchFolder, plan: BatchPlan, entries: Sequence[Entry], number: str, messages: Path, wait: bool
-) -> dict[str, Any]:
-    text = f"job {number}; its messages: {messages}\nmudg batch status {folder.out}"
-    result = {"job": number, "out": str(folder.out), "text": text}
-    if not wait:
-        return result
+def _awaited(job: Job, entries: Sequence[Entry], number: str) -> int:
+    """Wait for the end of an array job; returns the exit code of what it left undone."""
     try:
         while slurm_tasks_left(number):
             time.sleep(_POLL_S)
     except OSError as error:
         raise ResourceError("Slurm does not answer", where="squeue", got=str(error)) from error
-    done = folder.keys("done")
-    left = sum(any(unit.key not in done for unit in plan.units(entry)) for entry in entries)
-    return {**result, "exit_code": exit_code(left)}
+    done = job.folder.keys("done")
+    return exit_code(sum(any(unit.key not in done for unit in job.plan.units(entry)) for entry in entries))
 
 
 def plan_for(batch: BatchConfig, settings: RunConfig, lines: Mapping[str, Sequence[str]]) -> BatchPlan:
@@ -163,8 +155,8 @@ def _with_absolute_paths(values: Any) -> Any:
 
 def show_status(out: str) -> dict[str, Any]:
     """How far a batch is, what has failed and what it took."""
-    state = status.read_status(BatchFolder(Location.of(out)))
-    return {**state.record(), "text": status.text_of(state)}
+    state = status.read_status(BatchFolder(Path(out)))
+    return {**state, "text": status.text_of(state)}
 
 
 def settings_of(preset: PresetName, config: Path | None, given: Sequence[str]) -> RunConfig:
@@ -183,14 +175,14 @@ def settings_of(preset: PresetName, config: Path | None, given: Sequence[str]) -
 def retry(out: str, reason: str = "") -> dict[str, Any]:
     """Forget failures, so that the next ``mudg batch run`` tries them again. reason: exit codes with commas (empty:
     all). InputError: no batch is here, or nothing failed for this reason. UsageError: not a list of exit codes."""
-    folder, words = BatchFolder(Location.of(out)), reason.replace(",", " ").split()
+    folder, words = BatchFolder(Path(out)), reason.replace(",", " ").split()
     if not all(word.isdecimal() for word in words):
         raise UsageError("unknown reason", where="--reason", got=reason, expected="exit codes with commas, as 5,137")
     folder.stages()
     failures = list(folder.records("failed"))
     chosen = [one for one in failures if not words or one.code in map(int, words)]
     for one in chosen:
-        folder.record("failed", one.key).remove()
+        store.remove(folder.record("failed", one.key))
     if words and not chosen:
         expected = ", ".join(sorted({str(one.code) for one in failures})) or "no failures at all"
         raise InputError("nothing failed for this reason", where=str(folder.out), got=reason, expected=expected)

@@ -26,13 +26,13 @@ class Edit(Output):
         "mudg edit runs/mudg_s edits.yaml --scene scenes/city --fused runs/fused --out runs/edited",
     )
     result = "edited"
-    version = 3
+    version = 4
     files = (
-        *("edits.yaml", "edit.json", "lidar.json", *MODEL_FILES, *below("fit/*", MODEL_FILES)),
+        *("edits.yaml", "edit.json", *MODEL_FILES, *below("fit/*", MODEL_FILES)),
         *below("scene", (*SCENE_FILES, "manifest.json")),
         *below("fuse", ("static.safetensors", "objects/*.safetensors", "fuse.json")),
     )
-    short = ("device", "harmonize.on", "harmonize.model", "harmonize.steps")
+    short = ("device",)
     source: Annotated[Path, RUN]
     """Gaussian scene written by fit, or folder of a finished mudg run."""
     script: Annotated[Path, Flag("EDITS.yaml", "first")]
@@ -68,14 +68,11 @@ class Edit(Output):
 
     def prepare(self, inputs: dict[str, str]) -> Make:
         from mudg.core.raster.rasterize import drawing_device
-        from mudg.editing.edit import PlannedEdit
+        from mudg.editing.edit import prepared
         from mudg.editing.script import read_edits
 
         drawing_device(self.settings.device, "render", self.settings.raster)
-        planned = PlannedEdit.of(self.settings, read_edits(self.script), self.run_parts())
-        if planned.parts.whole and planned.drive.plan.weather_of_beams is not None:
-            inputs["weather of beams"] = "fog, rain"  # another result than before sweeps showed them
-        return partial(planned.write, self.settings)
+        return prepared(self.settings, read_edits(self.script), self.run_parts())
 
 
 class AssetExport(Result):

@@ -248,7 +248,6 @@ def edit(
     scene: str | Path | None = None,
     fused: str | Path | None = None,
     config: str | Path | None = None,
-    harmonize: Mapping[str, Any] = ...,
     raster: Literal['auto', 'cpu', 'torch', 'gsplat'] = 'auto',
     device: str = 'auto',
 ) -> Any:
@@ -262,7 +261,6 @@ def edit(
         scene: Scene directory that a Gaussian scene was fitted to. With it, the vehicle's path and parked objects can be edited. A run has its own.
         fused: Point clouds written by fuse, for the height of the ground (not given: the Gaussians give it). A run has its own.
         config: YAML file of settings, read before those given here.
-        harmonize: Of a whole run: let the diffusion model repair what the edits touch in its images.
         raster: Rasteriser backend. auto picks the fastest one available and prints its name.
         device: Device: auto (CUDA if there is one), cpu, cuda, cuda:N.
     """
@@ -285,7 +283,7 @@ def export(
     """Write a fitted scene for other programs: PLY, SPZ, glTF, USD, SOG; cameras for nerfstudio and COLMAP.
 
     Args:
-        format: Gaussians: ply, alpasim, spz, glb, usda, usdz, compressed-ply, sog, splat. Cameras: nerfstudio, colmap. The log over time: mcap, ros2, rerun, ncore.
+        format: Gaussians: ply, alpasim, spz, glb, usda, usdz, compressed-ply, sog, splat. Cameras: nerfstudio, colmap. The log over time: mcap, ros2, ncore.
         source: Gaussian scene written by fit, or folder of a finished mudg run; for cameras also a scene directory.
         out: File to write, with the suffix of the format; for cameras, ros2 and ncore, folder to write.
         scene: Scene directory that a Gaussian scene was fitted to. A run has its own.
@@ -460,7 +458,6 @@ def ingest(
     poses: str = '',
     boxes: str = '',
     skip_missing: bool = False,
-    bridge_gaps: bool = False,
     untwist: Literal['auto', 'yes', 'no'] = 'auto',
     city: Mapping[str, Any] = ...,
 ) -> Any:
@@ -482,7 +479,6 @@ def ingest(
         poses: File (or folder of GPS/IMU packets) with vehicle poses (empty = search in the log).
         boxes: File with tracked boxes (empty = search in the log).
         skip_missing: Skip frames with a missing image, scan or vehicle pose instead of refusing the log.
-        bridge_gaps: Bridge gaps between vehicle poses with curves instead of refusing the frames in them.
         untwist: Compensate LiDAR scans for the vehicle's motion during a sweep (auto = if the dataset's scans need it).
         city:
     """
@@ -573,12 +569,11 @@ def render(
     paths: tuple[str, ...] = (),
     width_px: int = 0,
     fov_deg: float = 0.0,
-    remove_tracks: tuple[str, ...] = (),
     lidar: str = '',
     layers: tuple[Literal['instances', 'normals', 'motion', 'distance', 'confidence'], ...] = (),
     video: bool = True,
     repair: bool = False,
-    harmonize: Mapping[str, Any] = ...,
+    repair_model: str = 'embedded',
     raster: Literal['auto', 'cpu', 'torch', 'gsplat'] = 'auto',
     device: str = 'auto',
 ) -> Any:
@@ -590,7 +585,7 @@ def render(
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         edits: Edit script (docs/edit.md) to carry out before rendering.
-        fused: Point clouds written by fuse; for --harmonize.on, and for --repair (there, not given: those of the run at SCENE).
+        fused: Point clouds written by fuse, for --repair (not given: those of the run at SCENE).
         path: Camera path to draw in place of the shifts: poses in the format of TUM or KITTI (.txt), or nerfstudio's transforms.json, on the scene's clock and in its world. It has the optics of the first camera.
         config: YAML file of settings, read before those given here.
         cameras: Cameras to render (empty = the first camera). A name that the scene lacks is an error.
@@ -598,12 +593,11 @@ def render(
         paths: Further paths by name. up+1: raised by 1 m. lane+0.1: a lane change, 0.1 m further to the left with every frame. speed+0.1: 0.1 m further ahead with every frame. A minus means down, right, slower.
         width_px: Image width in pixels (0 = as recorded); the height follows.
         fov_deg: Horizontal field of view in degrees (0 = the camera's own).
-        remove_tracks: Ids of tracked objects to leave out, as listed in the scene.
         lidar: Also simulate the log's LiDAR sweeps at every shift: a sensor of the scene, pandar128, at128, hdl64, vlp16, or a JSON file of beams (docs/simulator.md). Empty = none.
         layers: Also write these layers of every view, with its boxes and its trust: ids of objects, normals of surfaces, optical flow to the next view in pixels, distance along the ray in metres, and how certain a pixel is (docs/datasets.md).
         video: Also write one MP4 video per trajectory.
-        repair: Let the diffusion model make every view once more from its render, and mix both by its confidence and by the distance from the recorded path. Better off the path, slower: half a second a view. --harmonize.model names the model (docs/edit/repair.md).
-        harmonize: With an edit script: let the diffusion model repair what the edits touch.
+        repair: Let the diffusion model make every view once more from its render, and mix both by its confidence and by the distance from the recorded path. Better off the path, slower: half a second a view (docs/edit/repair.md).
+        repair_model: Diffusion model of --repair: "embedded" or "embedded-tiny", both shipped with the package, or a folder written by learn.
         raster: Rasteriser backend. auto picks the fastest one available and prints its name.
         device: Device: auto (CUDA if there is one), cpu, cuda, cuda:N.
     """

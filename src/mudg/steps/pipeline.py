@@ -20,7 +20,6 @@ from mudg.base.records import ForeignRecord, Number, parse_record
 from mudg.base.run_folder import is_temporary, locked, refuse_overlap
 from mudg.base.versions import environment, version
 from mudg.diffusion.settings import SynthesizeConfig
-from mudg.fleet.status import duration_text
 from mudg.gaussians.settings import FitConfig
 from mudg.steps.engine import Output
 from mudg.steps.fit import Fit
@@ -84,17 +83,13 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
 
 
 def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: bool) -> dict[str, Any]:
-    """The chain, alone in its folder."""
     from mudg.viewer import report as run_report
 
     ledger, page = _Ledger.open(out, config, str(source), overwrite), out / "report.html"
-    log.info(f"report: {page} (open it now: it grows while the run goes on)")
     config = with_device(config)
     try:
         scene = _prepare_scene(config, source, out, ledger, overwrite)
-        steps = steps_of(config, scene, out, overwrite)
-        ledger.ahead = [*steps, "viewer", "report"]
-        for name, step in steps.items():
+        for name, step in steps_of(config, scene, out, overwrite).items():
             ledger.timed(name, step.out, step.run)
         # what the page is made of: the scores (which name the views), the settings and the program
         made_of = (store.sha256_file(out / name) for name in (f"score/{store.MANIFEST}", "run.yaml"))
@@ -231,8 +226,10 @@ def _closing_text(out: Path, source: str, report: Path, ledger: _Ledger) -> str:
 
     form = "  {:<26}{:8.1f} s{:11.1f} s{:>12}{:>12}"
     rows = [
-        form.format(name, seconds, processor_s, in_words(peak) if peak else "", in_words(size))
-        for name, (seconds, processor_s, peak, size) in ledger.rows().items()
+        form.format(
+            name, of.seconds, of.processor_s, in_words(of.peak_bytes or 0) if of.peak_bytes else "", in_words(size)
+        )
+        for name, (of, size) in ledger.rows().items()
     ]
     head = f"  {'step':<26}{'time':>10}{'processor':>13}{'memory':>12}{'written':>12}"
     total = f"  {'total':<26}{sum(ledger.seconds().values()):8.1f} s"
@@ -269,11 +266,7 @@ class _Ledger:
         self._asked = dict(asked)
         self._steps: dict[str, dict[str, Any]] = dict(before.get("steps", {}))
         self._report = dict(before.get("report", {}))
-        self._now = ""
-        """The step that runs."""
         self.digests: dict[str, str] = {}
-        self.ahead: list[str] = []
-        """Names of the steps on a labelled scene, once they are known."""
 
     @classmethod
     def open(cls, out: Path, config: RunConfig, source: str, overwrite: bool) -> _Ledger:
@@ -283,15 +276,13 @@ class _Ledger:
         known = out / "run.json"
         if known.is_file():
             before = cls._read(known)
-            if configuration.without_devices(before["asked"]) == asked:
-                pass
-            elif overwrite:
-                before = {}
-            else:
+            same = configuration.without_devices(before["asked"]) == asked
+            if not same and not overwrite:
                 differences = configuration.differences(before["asked"], asked)[:8]
                 what, remedy = "the output folder holds a run with other settings", "add --overwrite to replace it"
                 got = "; ".join(differences) or "another program version"
                 raise UsageError(what, where=str(out), got=got, remedy=f"choose another --out, or {remedy}")
+            before = before if same else {}
         ledger = cls(out, asked, before)
         ledger.save("running")
         store.write_text(out / "run.yaml", configuration.dump_yaml(config))
@@ -338,51 +329,32 @@ class _Ledger:
         self._steps["report"]["written_bytes"] = folder_bytes(page)
         self.save("complete")
 
-    def has_done(self, step: str) -> bool:
-        """Whether a step has ended before."""
-        return self._steps.get(step, {}).get("state") == "complete"
-
     def _standing(self, name: str) -> str:
-        """A step, which of how many it is, and about how long the rest takes, by what the finished steps took."""
-        if name not in self.ahead:
+        """A step on a labelled scene, which of how many it is, and about how long the rest takes, by what the finished
+        ones took."""
+        if name not in PERCENT_OF_A_RUN:
             return name
-        standing = f"{name}, step {self.ahead.index(name) + 1} of {len(self.ahead)}"
-        spent, done = self.seconds(), [step for step in self.ahead if self.has_done(step)]
-        share = sum(PERCENT_OF_A_RUN[step] for step in done) / 100
-        if share < FORECAST_FROM:
-            return standing
-        left_s = sum(spent[step] for step in done) * (1 / share - 1)
-        return f"{standing}, about {duration_text(left_s)} left" if left_s >= 60 else standing
-
-    def _show(self, state: str) -> None:
-        """Write the page of the unfinished run, but not over a report."""
-        from mudg.viewer.report import PROGRESS, progress_page
-
-        page = self._out / "report.html"
-        if page.is_file() and PROGRESS not in store.read_text(page):
-            return
-        names, spent = dict.fromkeys((*self._steps, self._now, *self.ahead)), self.seconds()
-        of = lambda name: "done" if self.has_done(name) else state if name == self._now else ""
-        steps = [(name, of(name), spent.get(name, 0.0)) for name in names if name]
-        store.write_text(page, progress_page(self._out, steps, state, self._standing(self._now).capitalize()))
+        standing = f"{name}, step {list(PERCENT_OF_A_RUN).index(name) + 1} of {len(PERCENT_OF_A_RUN)}"
+        done = [step for step in PERCENT_OF_A_RUN if self._steps.get(step, {}).get("state") == "complete"]
+        share, spent = sum(PERCENT_OF_A_RUN[step] for step in done) / 100, self.seconds()
+        left_min = sum(spent[step] for step in done) * (1 / max(share, FORECAST_FROM) - 1) / 60
+        return f"{standing}, about {left_min:.0f} min left" if share >= FORECAST_FROM and left_min >= 1 else standing
 
     def timed(self, name: str, result: Path, run: Callable[[], Any]) -> Any:
         """Do one step, which makes a folder or file, and add its seconds, also when it is interrupted; a reused result
         adds none. The next step begins with the memory that this one took given back."""
         from mudg.core.raster.cpu import release_memory
 
-        finished = self.has_done(name) and result.exists()
+        known = self._steps.get(name, {})
+        finished = known.get("state") == "complete" and result.exists()
         meter, state = Meter(), "interrupted"
         log.info(f"== {self._standing(name)}")
-        self._now = name
-        self.save("running")
         try:
             made = run()
             release_memory()
             state = "complete"
         finally:
-            spent, known = meter.stop(), self._steps.get(name, {})
-            earlier = Usage.of_record(known)
+            spent, earlier = meter.stop(), Usage.of_record(known)
             if not (finished and state == "complete" and spent.seconds < earlier.seconds):
                 spent = spent if finished else earlier.then(spent)
                 self._steps[name] = {"state": state, **spent.record(), "written_bytes": folder_bytes(result)}
@@ -393,18 +365,12 @@ class _Ledger:
         """Seconds per step, in order."""
         return {name: float(entry["seconds"]) for name, entry in self._steps.items()}
 
-    def rows(self) -> dict[str, tuple[float, float, int | None, int]]:
-        """Seconds, processor seconds, most memory and bytes written per step, in order."""
-        spent = {name: Usage.of_record(entry) for name, entry in self._steps.items()}
-        return {
-            name: (of.seconds, of.processor_s, of.peak_bytes, int(self._steps[name].get("written_bytes", 0)))
-            for name, of in spent.items()
-        }
+    def rows(self) -> dict[str, tuple[Usage, int]]:
+        """What was taken and bytes written per step, in order."""
+        return {name: (Usage.of_record(of), int(of.get("written_bytes", 0))) for name, of in self._steps.items()}
 
     def save(self, state: str) -> None:
-        """Write OUT/run.json, and until the end the page of the unfinished run."""
+        """Write OUT/run.json."""
         record = {"schema": 1, "state": state, "asked": self._asked, "steps": self._steps, "digests": self.digests}
         record |= {"report": self._report, "environment": environment()}
         store.write_json(self._out / "run.json", store.with_check(record))
-        if state != "complete":
-            self._show(state)

@@ -32,10 +32,7 @@ class RenderViews(Output):
         3,
         ("*.mp4", *below("*", OBSERVATION_FILES), *below("lidar/*", SWEEP_FILES), *below("layers/*", LAYER_FILES)),
     )
-    short = (
-        *("cameras", "shifts_m", "paths", "width_px", "fov_deg", "lidar", "layers", "video", "remove_tracks", "device"),
-        *("repair", "harmonize.on", "harmonize.model"),
-    )
+    short = (*("cameras", "shifts_m", "paths", "width_px", "fov_deg", "lidar", "layers", "video", "device", "repair"),)
     scene: Annotated[Path, Flag("SCENE", "first", "scene")]
     """Scene directory that the Gaussian scene was fitted to, or folder of mudg run."""
     model: Annotated[Path | None, Flag("FOLDER", "second", "model")] = None
@@ -44,28 +41,19 @@ class RenderViews(Output):
     edits: Annotated[Path | None, FILE_YAML] = None
     """Edit script (docs/edit.md) to carry out before rendering."""
     fused: Annotated[Path | None, Flag("FOLDER", "", "fused")] = None
-    """Point clouds written by fuse; for --harmonize.on, and for --repair (there, not given: those of the run at
-    SCENE)."""
+    """Point clouds written by fuse, for --repair (not given: those of the run at SCENE)."""
     path: Annotated[Path | None, Flag("FILE")] = None
     """Camera path to draw in place of the shifts: poses in the format of TUM or KITTI (.txt), or nerfstudio's
     transforms.json, on the scene's clock and in its world. It has the optics of the first camera."""
     settings: RenderConfig
 
     def checked(self) -> Self:
-        if self.settings.harmonize.on and (self.edits is None or self.fused is None):
-            what = "harmonising repairs what an edit script touched, from the fused clouds"
-            got = f"no --{'edits' if self.edits is None else 'fused'}"
-            remedy = "give --edits and --fused, or leave it out"
-            raise UsageError(what, where="--harmonize.on", got=got, remedy=remedy)
-        if self.settings.repair and (self.edits is not None or self.settings.layers or self.settings.remove_tracks):
-            what, remedy = "views of the drive as it was fitted can be repaired", "with --edits, use --harmonize.on"
-            raise UsageError(what, where="--repair", got="--edits, --layers or --remove-tracks", remedy=remedy)
-        if self.settings.layers and (self.settings.harmonize.on or self.settings.remove_tracks):
-            what, remedy = "layers are drawn of what an edit script makes", "take objects out with --edits"
-            raise UsageError(what, where="--layers", got="--harmonize.on or --remove-tracks", remedy=remedy)
-        if self.path is not None and (self.settings.harmonize.on or self.settings.lidar):
-            what, remedy = "a path of your own is drawn without repairs and sweeps", "leave one of them out"
-            raise UsageError(what, where="--path", got="--harmonize.on or --lidar", remedy=remedy)
+        if self.settings.repair and (self.edits is not None or self.settings.layers):
+            what, remedy = "views of the drive as it was fitted can be repaired", "leave one of them out"
+            raise UsageError(what, where="--repair", got="--edits or --layers", remedy=remedy)
+        if self.path is not None and self.settings.lidar:
+            what, remedy = "a path of your own is drawn without sweeps", "leave one of them out"
+            raise UsageError(what, where="--path", got="--lidar", remedy=remedy)
         return self
 
     def required(self) -> tuple[str, ...]:
@@ -75,23 +63,23 @@ class RenderViews(Output):
         table = Path(self.settings.lidar) if self.settings.lidar.endswith(".json") else None
         files = {"edits": self.edits, "lidar": table, "path": self.path}
         read = self.digests({"scene": self.scene, "model": self.model, **files})
-        if not self.settings.harmonize.on and not self.settings.repair:
+        if not self.settings.repair:
             return read
         from mudg.diffusion.model_files import digest
 
-        return read | self.digests({"fused": self.fused}) | {"diffusion": digest(self.settings.harmonize.model)}
+        return read | self.digests({"fused": self.fused}) | {"diffusion": digest(self.settings.repair_model)}
 
     def prepare(self, inputs: dict[str, str]) -> Make:
         from mudg.editing import render
 
         model, script = cast("Path", self.model), script_of(self.edits)
-        edited = render.prepare(self.settings, self.scene, model, script, self.fused, self.path)
+        edited = render.prepare(self.settings, self.scene, model, script, self.path)
         views = partial(render.write_views, self.settings, self.scene, model, edited, path=self.path, fused=self.fused)
         if not self.settings.lidar and not self.settings.layers:
             return views
         from mudg.datasets import layers
         from mudg.scene.read import read_scene
-        from mudg.sim import sweeps
+        from mudg.sim import lidar as sweeps
 
         if self.settings.lidar:
             sweeps.wanted_sweeps(self.settings.lidar, read_scene(self.scene))

@@ -198,7 +198,6 @@ HOMES: Final[Mapping[str, str]] = {
     "ConvertConfig": "mudg.diffusion.settings",
     "DatasetConfig": "mudg.datasets.settings",
     "FuseConfig": "mudg.scene.settings",
-    "HarmonizeConfig": "mudg.diffusion.settings",
     "IngestConfig": "mudg.formats.settings",
     "LearnConfig": "mudg.diffusion.settings",
     "FitConfig": "mudg.gaussians.settings",

@@ -1,10 +1,10 @@
-"""Exact frames and videos for the viewer page: what a browser asks for, checked, and drawn by the rasterizer."""
+"""Edits and exact frames for the viewer page: what a browser asks for, checked, and drawn by the rasterizer."""
 
 from __future__ import annotations
 
 import io
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -16,7 +16,7 @@ from PIL import Image
 from pydantic import Field
 
 from mudg.base import store
-from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.errors import InputError, UsageError
 from mudg.base.plain_yaml import LARGEST_BYTES
 from mudg.base.records import Number, StrictRecord, parse_record
 from mudg.base.types import Camera, FusedCloud, Scene, View
@@ -34,12 +34,11 @@ from mudg.editing.apply import (
     street_left,
     weather_of,
 )
-from mudg.editing.harmonised import RenderMixer
 from mudg.editing.model import motion_of
 from mudg.editing.plan import EditPlan
+from mudg.editing.render import RenderMixer
 from mudg.editing.runs import find_run
 from mudg.editing.script import EditScript, conditions_of, parse_edits, read_edits
-from mudg.formats.exporters.video import mp4_bytes
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import RigidNode, SkyNode
 from mudg.viewer.page import begin_of, key_rows
@@ -229,16 +228,12 @@ def place_for(run: Path, given: Path | None) -> Path:
 GROUND: Final = (0.43, 0.43, 0.42)
 """What free views show of uncovered ground; as in `assets/viewer/shaders.js`."""
 LAYERS: Final = ("color", "depth", "class")
-VIDEO_CRF: Final = 18
-"""x264's quality of videos; lower is better."""
-MOST_FRAMES: Final = 3000
-MOST_PIXELS: Final = 2**31
-"""Of all frames of a video together: it is held in memory until it is sent, in about a tenth as many bytes."""
 Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 
-class Wanted(StrictRecord):
-    """What all frames of a question have in common. ``edits``: a script."""
+class FrameRequest(StrictRecord):
+    """One frame, as ``assets/viewer/exact.js`` asks for it. ``edits``: a script. ``axes``: the camera's right, down and
+    ahead in the world."""
 
     scene: Annotated[int, Field(ge=0)]
     layer: Literal["color", "depth", "class"]
@@ -251,25 +246,9 @@ class Wanted(StrictRecord):
     fy: Annotated[Number, Field(gt=0)]
     cx: Number
     cy: Number
-
-
-class Moment(StrictRecord):
-    """When and from where. ``axes``: the camera's right, down and ahead in the world."""
-
     time_s: Number
     eye: Vector
     axes: Annotated[list[Vector], Field(min_length=3, max_length=3)]
-
-
-class FrameRequest(Wanted, Moment):
-    """One frame, as ``assets/viewer/exact.js`` asks for it."""
-
-
-class VideoRequest(Wanted):
-    """A video, as ``assets/viewer/exact.js`` asks for it: a frame per moment."""
-
-    fps: Annotated[Number, Field(ge=1, le=60)]
-    moments: Annotated[list[Moment], Field(min_length=1, max_length=MOST_FRAMES)]
 
 
 def over_ground(model: SceneModel) -> SceneModel:
@@ -303,85 +282,47 @@ class FrameSource:
         """The scenes with the script ``_edits`` carried out, on the device."""
         self._weather: dict[int, InWeather] = {}
         """Of the scenes that were asked for in colour, by their number."""
-        self._lock, self._filming = threading.Lock(), threading.Lock()
+        self._lock = threading.Lock()
 
     def png(self, asked: object) -> tuple[bytes, str]:
         """The frame of a ``FrameRequest`` as PNG. InputError: a camera that is none, or edits that cannot be carried
         out."""
         request, content = parse_record(FrameRequest, asked, "request"), io.BytesIO()
-        picture = self._picture(request, self._drawer(request), self._camera(request), request)
-        Image.fromarray(picture).save(content, "PNG", compress_level=1)
-        return content.getvalue(), "image/png"
-
-    def film(self, asked: object, send: Callable[[bytes], None]) -> None:
-        """Make the video of a ``VideoRequest`` and send it: after each frame a line of JSON with its number, then one
-        with the number of bytes, then the MP4 file. Frames that are asked for meanwhile are drawn in between.
-        InputError: as ``png``, or too many pixels. ResourceError: another video is being made. OSError: of ``send``;
-        nothing is left."""
-        request = parse_record(VideoRequest, asked, "request")
-        camera, count = self._camera(request), len(request.moments)
-        line = lambda **values: send(store.json_text(values, indent=None).encode() + b"\n")
-
-        def pictures() -> Iterator[NDArray[np.uint8]]:
-            draw = self._drawer(request)
-            for number, moment in enumerate(request.moments, 1):
-                yield self._picture(request, draw, camera, moment)
-                line(frame=number, frames=count)
-
-        if camera.width * camera.height * count > MOST_PIXELS:
-            expected = f"at most {MOST_PIXELS:,} pixels in all frames together"
-            got = f"{count} frames of {camera.width} x {camera.height}"
-            remedy = "start mudg view with a smaller --width-px, or use mudg render"
-            raise InputError("the video is too large", where="video", expected=expected, got=got, remedy=remedy)
-        if not self._filming.acquire(blocking=False):
-            remedy = "wait for it, or cancel it where it was asked for"
-            raise ResourceError("another video is being made", remedy=remedy)
-        try:
-            content = mp4_bytes(pictures(), request.fps, crf=VIDEO_CRF)
-        finally:
-            self._filming.release()
-        line(bytes=len(content))
-        send(content)
-
-    def _drawer(self, request: Wanted) -> Drawer:
-        """What draws the scene that is asked for, without what is hidden, in the weather and light of the script."""
-        with self._lock:
-            if self._edits != request.edits:
-                self._models = [model.to(self._device) for model in self._edited(request.edits)]
-                self._edits, self._weather = request.edits, {}
-            index = min(request.scene, len(self._models) - 1)
-            model = self._models[index]
-            gone = [name for name in request.hidden if name in model.node_names()]
-            seen = model if request.camera else over_ground(model)
-            draw = drawer(seen.without_nodes(gone) if gone else seen)
-            if self._mixers and request.layer != "class" and not gone and not request.edits.strip():
-                return lambda view: self._mixers[index](view, draw(view))
-            conditions = conditions_of(model.facts.get(FACT, {}).get("script", ()))
-            if conditions is None or request.layer != "color":
-                return draw
-            if index not in self._weather:
-                self._weather[index] = weather_of(drawer(model), conditions, self._scene)
-            return in_weather(draw, self._weather[index])
-
-    def _picture(self, request: Wanted, draw: Drawer, camera: Camera, moment: Moment) -> NDArray[np.uint8]:
-        pose = np.eye(4)
-        pose[:3, :3] = orthonormal(np.array(moment.axes, np.float64).T)
-        pose[:3, 3] = moment.eye
-        with self._lock:
-            seen = draw(View(camera, pose, float(moment.time_s)))
-            if request.layer == "depth" and seen.depth is not None:
-                return depth_colors(seen.depth[0].numpy(), NEAR_M, FAR_M)
-            if request.layer == "class" and seen.semantics is not None:
-                return class_colors(seen.semantics.numpy())
-            return to_bytes(seen.rgb)
-
-    def _camera(self, request: Wanted) -> Camera:
-        """The camera, not wider than allowed."""
         lens = (request.width, request.height, request.fx, request.fy, request.cx, request.cy)
         camera = Camera(request.camera or "free", *lens)
         if request.width > self._widest:
             camera = camera.resized(self._widest, max(1, round(request.height * self._widest / request.width)))
-        return camera
+        pose = np.eye(4)
+        pose[:3, :3] = orthonormal(np.array(request.axes, np.float64).T)
+        pose[:3, 3] = request.eye
+        with self._lock:
+            seen = self._drawer(request)(View(camera, pose, float(request.time_s)))
+        picture = to_bytes(seen.rgb)
+        if request.layer == "depth" and seen.depth is not None:
+            picture = depth_colors(seen.depth[0].numpy(), NEAR_M, FAR_M)
+        if request.layer == "class" and seen.semantics is not None:
+            picture = class_colors(seen.semantics.numpy())
+        Image.fromarray(picture).save(content, "PNG", compress_level=1)
+        return content.getvalue(), "image/png"
+
+    def _drawer(self, request: FrameRequest) -> Drawer:
+        """What draws the scene that is asked for, without what is hidden, in the weather and light of the script."""
+        if self._edits != request.edits:
+            self._models = [model.to(self._device) for model in self._edited(request.edits)]
+            self._edits, self._weather = request.edits, {}
+        index = min(request.scene, len(self._models) - 1)
+        model = self._models[index]
+        gone = [name for name in request.hidden if name in model.node_names()]
+        seen = model if request.camera else over_ground(model)
+        draw = drawer(seen.without_nodes(gone) if gone else seen)
+        if self._mixers and request.layer != "class" and not gone and not request.edits.strip():
+            return lambda view: self._mixers[index](view, draw(view))
+        conditions = conditions_of(model.facts.get(FACT, {}).get("script", ()))
+        if conditions is None or request.layer != "color":
+            return draw
+        if index not in self._weather:
+            self._weather[index] = weather_of(drawer(model), conditions, self._scene)
+        return in_weather(draw, self._weather[index])
 
 
 def orthonormal(axes: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -551,15 +551,6 @@ def panel_grid(
 PANEL_WIDTH: Final = 320
 BUDGET_BYTES: Final = 9 * 2**19
 """For all videos together, before base64; with the posters the page stays under 8 MB."""
-PROGRESS: Final = "mudg-unfinished-run"
-"""Marks the page of a run that has not ended."""
-SO_FAR: Final = (
-    ("Fit with diffusion: photograph, render, depth", f"{GUIDED}/preview/*.png"),
-    ("Fit without diffusion: photograph, render, depth", f"{PLAIN}/preview/*.png"),
-    ("The fused clouds from above", "fuse/top.png"),
-    ("The recording", "scene/contact_sheet.jpg"),
-)
-"""Pictures that steps leave, the newest first: title and place in the folder of a run."""
 VIEWER: Final = "viewer.html"
 VIEWER_FOLDER: Final = "viewer_page/index.html"
 SAME_TIME_S: Final = 1e-4
@@ -608,30 +599,6 @@ def write_page(out: Path, videos: Sequence[TrajectoryVideo]) -> Path:
         content = page(scores, ledger, text, videos, columns, viewer_address(out), out, fit_charts(out))
     store.write_text(out / "report.html", content)
     return out / "report.html"
-
-
-def progress_page(out: Path, steps: Sequence[tuple[str, str, float]], state: str, standing: str) -> str:
-    """The text of the page of a run that has not ended: its steps, and the pictures that they have left so far.
-    ``steps``: name, state and seconds of each. ``state``: of the run: ``running``, ``interrupted`` or ``failed``.
-    ``standing``: which step runs, in words."""
-    leads = {
-        "running": f"{standing}. This page renews itself.",
-        "interrupted": "The run was stopped. Repeat the same command to go on.",
-        "failed": "The run has failed; the terminal says why. Repeat the same command to go on where it ended.",
-    }
-    newest = [(title, max(out.glob(pattern), default=None)) for title, pattern in SO_FAR]
-    kinds = {".png": "image/png", ".jpg": "image/jpeg"}
-    return html.render(
-        "progress.html.j2",
-        title=f"{out.name}: mudg run",
-        kicker="mudg run",
-        heading=out.name,
-        lead=leads[state],
-        mark=PROGRESS,
-        running=state == "running",
-        steps=steps,
-        pictures=[(title, _data_uri(kinds[path.suffix], store.read_bytes(path))) for title, path in newest if path],
-    )
 
 
 def viewer_address(out: Path) -> str:

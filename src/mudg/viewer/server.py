@@ -22,7 +22,7 @@ import threading
 import time
 import webbrowser
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
@@ -47,22 +47,17 @@ _NO_ROOM: Final = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 _LENGTH: Final = re.compile(r"[0-9]{1,9}")
 Answer = Callable[[Any], tuple[bytes, str]]
 """From a JSON value to content and its type."""
-Stream = Callable[[Any, Callable[[bytes], None]], None]
-"""From a JSON value to content that is sent piece by piece while it is made. Sending raises OSError when nobody listens
-any more."""
 TYPES: Final = {"html": "text/html; charset=utf-8", "bin": "application/octet-stream"}
 
 
 @dataclass(frozen=True)
 class Site:
     """What is served. ``files``: name -> content; "" is the page. ``answers``: name -> what answers a POST with JSON
-    there: bytes and their type. ``streams``: the same for answers that take long. ``token``: secret that every request
-    must bring, in the address, a cookie or a header."""
+    there. ``token``: secret that every request must bring, in the address, a cookie or a header."""
 
     files: Mapping[str, bytes]
     answers: Mapping[str, Answer]
     token: str
-    streams: Mapping[str, Stream] = field(default_factory=dict)
 
 
 def token_for(host: str, token: str) -> str:
@@ -210,18 +205,17 @@ class SiteRequest(BaseHTTPRequestHandler):
         name = self._name()
         if name is None:
             return
-        answer, stream = self.site.answers.get(name), self.site.streams.get(name)
-        host = self.headers.get("Host")
+        answer, host = self.site.answers.get(name), self.headers.get("Host")
         if self.headers.get("Origin") not in (f"http://{host}", f"https://{host}"):
             self._answer(HTTPStatus.FORBIDDEN, b"a request from another page")
-        elif answer is None and stream is None:
+        elif answer is None:
             self._answer(HTTPStatus.NOT_FOUND, b"no such question")
         elif self.headers.get_content_type() != "application/json":
             self._answer(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, b"expected JSON")
         else:
-            self._answer_json(answer, stream)
+            self._answer_json(answer)
 
-    def _answer_json(self, answer: Answer | None, stream: Stream | None) -> None:
+    def _answer_json(self, answer: Answer) -> None:
         lengths = self.headers.get_all("Content-Length", [])
         if len(lengths) != 1 or not _LENGTH.fullmatch(lengths[0]) or "Transfer-Encoding" in self.headers:
             self._answer(HTTPStatus.BAD_REQUEST, b"the request does not say how long it is")
@@ -230,7 +224,6 @@ class SiteRequest(BaseHTTPRequestHandler):
         if length > MOST_BYTES:
             self._answer(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, b"the request is too large")
             return
-        sent: list[int] = []
         self.server.wait_for(self.connection, BODY_S)
         body = self.rfile.read(length)
         if len(body) < length:  # cut off
@@ -238,35 +231,15 @@ class SiteRequest(BaseHTTPRequestHandler):
             return
         self.server.wait_for(self.connection, math.inf)
         try:
-            asked = store.parse_json(body, "request")
-            if answer is not None:
-                self._answer(HTTPStatus.OK, *answer(asked))
-            elif stream is not None:
-                stream(asked, lambda content: self._send(content, sent))
+            self._answer(HTTPStatus.OK, *answer(store.parse_json(body, "request")))
         except (ConnectionError, TimeoutError):  # the page was closed, or wants it no more
             self.close_connection = True
         except Exception as error:
             told = failures.in_words(error)
             if told is None:
                 raise
-            if sent:  # a line of the stream
-                self.wfile.write(store.json_text({"problem": str(told)}, indent=None).encode() + b"\n")
-                return
             known = {InputError: HTTPStatus.BAD_REQUEST, ResourceError: HTTPStatus.SERVICE_UNAVAILABLE}
             self._answer(known.get(type(told), HTTPStatus.INTERNAL_SERVER_ERROR), str(told).encode())
-
-    def _send(self, content: bytes, sent: list[int]) -> None:
-        """A piece of a stream; the first one begins the answer, which ends with the connection."""
-        if not sent:
-            self.close_connection = True
-            self._head(HTTPStatus.OK, {"Content-Type": TYPES["bin"], "Connection": "close"})
-        sent.append(len(content))
-        self._write(content)
-
-    def _write(self, content: bytes) -> None:
-        """Send in pieces, each of which has its time."""
-        for begin in range(0, len(content), _PIECE):
-            self.wfile.write(content[begin : begin + _PIECE])
 
     def _name(self) -> str | None:
         """What is asked for; None if the request was refused: it cannot be read, or must not be answered."""
@@ -302,10 +275,6 @@ class SiteRequest(BaseHTTPRequestHandler):
         if status != HTTPStatus.OK:
             self.close_connection = True  # a body may be left unread
             named["Connection"] = "close"
-        self._head(status, named)
-        self._write(content)
-
-    def _head(self, status: HTTPStatus, named: Mapping[str, str]) -> None:
         self.send_response(status)
         for name, value in {
             **named,
@@ -317,6 +286,8 @@ class SiteRequest(BaseHTTPRequestHandler):
         }.items():
             self.send_header(name, value)
         self.end_headers()
+        for begin in range(0, len(content), _PIECE):  # each piece has its time
+            self.wfile.write(content[begin : begin + _PIECE])
 
     def log_message(self, format: str, *args: Any) -> None:
         """Nothing: a line per request would hide what matters."""

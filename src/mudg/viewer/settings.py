@@ -34,8 +34,6 @@ class ViewConfig(PageConfig):
     loopback address)."""
     browser: bool = True
     """Open the page in a browser where there is one."""
-    exact: bool = True
-    """Draw frames with the rasterizer when the camera rests."""
     repair: bool = False
     """Let the diffusion model make every exact frame once more, and mix both by its confidence: half a second a frame.
     For the drive as it was fitted; frames with edits, or with objects hidden, are as rendered."""

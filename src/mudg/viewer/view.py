@@ -20,10 +20,9 @@ from mudg.base.run_folder import ResultFile, refuse_overlap
 from mudg.base.types import FusedCloud, Scene
 from mudg.core.edit import HeightMap
 from mudg.core.raster.rasterize import drawing_device
-from mudg.diffusion.settings import HarmonizeConfig
 from mudg.diffusion.synthesize import JobInputs
 from mudg.editing.apply import SEED, ground_of
-from mudg.editing.harmonised import RenderMixer, check_as_recorded
+from mudg.editing.render import RenderMixer, check_as_recorded
 from mudg.editing.runs import RunParts, find_run
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.storage import load_model, model_of_scene
@@ -32,7 +31,7 @@ from mudg.scene.read import read_scene
 from mudg.viewer import page as pages
 from mudg.viewer.live import LAYERS, EditFiles, FrameSource, desk_for
 from mudg.viewer.page import CHUNK, ONE_FILE_BYTES, Packed, PageFile, ViewerPage
-from mudg.viewer.server import Answer, Site, SiteServer, Stream, open_server, show, token_for
+from mudg.viewer.server import Site, SiteServer, open_server, show, token_for
 from mudg.viewer.settings import PageConfig, ViewConfig
 
 PAGE_IMAGE_PX, LIVE_IMAGE_PX = 320, 640
@@ -275,13 +274,17 @@ def server_of(
     config: ViewConfig, run: Path, compare: Path | None, scene: Path | None, files: EditFiles | None = None
 ) -> tuple[SiteServer, Site]:
     """The server of a run's page, listening, and what it serves."""
-    token = token_for(config.host, config.token)
-    sources = find_sources(config, run, scene, compare)
-    shown = sources.read()
-    mixers = _mixers(config, sources, shown, run)
-    layers = list(LAYERS) if config.exact else []
+    token, sources = token_for(config.host, config.token), find_sources(config, run, scene, compare)
+    shown, mixers = sources.read(), list[RenderMixer]()
+    if config.repair:
+        if sources.cloud is None:
+            what, remedy = "exact frames are repaired from the clouds of a run", "give the folder of a run"
+            raise UsageError(what, where="--repair", got=str(run), remedy=remedy)
+        for (folder, _), (_, fitted) in zip(sources.fits, shown.fits, strict=True):
+            check_as_recorded(fitted, "--repair")
+            mixers.append(RenderMixer(JobInputs(sources.scene, sources.cloud, folder), device=config.device))
     desk = desk_for([model for _, model in shown.fits], shown.scene, shown.cloud, Path(run), files or EditFiles())
-    live = {"layers": layers, "token": token, "edits": desk.entries(), "place": desk.place.name, "run": desk.run}
+    live = {"layers": list(LAYERS), "token": token, "edits": desk.entries(), "place": desk.place.name, "run": desk.run}
     page, facts = replace(page_of(config, shown, live=live), effort=1), dict[str, Any]()  # nothing leaves this machine
     served = {file.url: file.content for file in page.files(facts)}
     size = sum(map(len, served.values()))
@@ -290,26 +293,7 @@ def server_of(
     report = Path(run) / "report.html"
     if report.is_file():
         served["report.html"] = store.read_bytes(report)
-    streams: dict[str, Stream] = {}
-    answers: dict[str, Answer] = {"edits": desk.answer}
-    if config.exact:
-        device = drawing_device(config.device, "view")
-        source = FrameSource(desk.edited, shown.scene, config.width_px, device, mixers)
-        answers["frame"], streams["video"] = source.png, source.film
-    site = Site(served, answers, token, streams)
+    device = drawing_device(config.device, "view")
+    source = FrameSource(desk.edited, shown.scene, config.width_px, device, mixers)
+    site = Site(served, {"edits": desk.answer, "frame": source.png}, token)
     return open_server(site, config.host, config.port), site
-
-
-def _mixers(config: ViewConfig, sources: ShownSources, shown: Shown, run: Path) -> list[RenderMixer]:
-    """What repairs exact frames of each fit. UsageError: no exact frames, no clouds, an edited drive."""
-    if not config.repair:
-        return []
-    if not config.exact:
-        raise UsageError("only exact frames are repaired", where="--repair", got="--no-exact", remedy="leave one out")
-    if sources.cloud is None:
-        what, remedy = "exact frames are repaired from the clouds of a run", "give the folder of a run"
-        raise UsageError(what, where="--repair", got=str(run), remedy=remedy)
-    for _, fitted in shown.fits:
-        check_as_recorded(fitted, "--repair")
-    inputs = [JobInputs(sources.scene, sources.cloud, folder) for folder, _ in sources.fits]
-    return [RenderMixer(each, HarmonizeConfig(), config.device) for each in inputs]

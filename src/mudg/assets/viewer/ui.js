@@ -5,7 +5,6 @@ import { LAYERS } from "mudg/shaders";
 import { clamp, project } from "mudg/math";
 import { trackColor } from "mudg/overlay";
 import { FOV_DEG } from "mudg/state";
-import { exactVideos } from "mudg/exact";
 import { withKey } from "mudg/path";
 import { recordVideo, saveEdits, saveFrames, saveLink, savePath, savePicture } from "mudg/share";
 
@@ -224,7 +223,6 @@ export class Controls {
     $("picture").onclick = () => savePicture(app, Number($("times").value));
     $("video").onclick = () => recordVideo(app, (text) => this.say(text));
     $("frames").onclick = () => saveFrames(app, (text) => this.say(text));
-    exactVideos(app, (text) => this.say(text));
     $("link").onclick = async () => this.say(await saveLink(app));
     $("help").onclick = () => $("keys").showModal();
     $("full").hidden = !document.fullscreenEnabled;

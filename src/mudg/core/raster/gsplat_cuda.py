@@ -1,32 +1,32 @@
 """Backend "gsplat": an adapter to the CUDA rasteriser of the same mathematics (gsplat >= 1.5.3). Importable without it.
 
-What differs: gsplat caps alpha at 0.999 whatever ``alpha_max`` says, calls a Gaussian visible whose rectangle reaches
-the image's border before its first pixel centre, and rounds radii up without our thousandth of a pixel. Everything else
-agrees to rounding. Colours are evaluated here with gsplat's spherical harmonics, and depths here, so that colours,
-features and depth go through one pass whose gradients are complete in every mode.
-"""
+What differs stands in docs/gsplat.md. Harmonics and depths are evaluated here, so that colours, features and depth go
+through one pass whose gradients are complete in every mode."""
 
 from __future__ import annotations
 
 import importlib
 import importlib.metadata
 import importlib.util
+import math
 import os
 import shutil
 import weakref
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import torch
 from torch import Tensor
 
 from mudg.base import log
 from mudg.base.errors import InputError, NumericsError, ResourceError
-from mudg.base.types import Gaussians, RasterTrace, Render
+from mudg.base.types import Camera, Gaussians, RasterTrace, Render
 from mudg.core.raster import torch_twin
-from mudg.core.raster.request import Request, harmonics
+
+if TYPE_CHECKING:
+    from mudg.core.raster.rasterize import RasterConfig
 
 # whether the package gsplat can be used here, and why not. Imports it only in ``load`` ------------
 
@@ -75,16 +75,14 @@ def nvcc() -> str | None:
 
 def _compiler_problem() -> str:
     """What is missing to compile the kernels: gsplat itself would only fail at the first picture."""
+    missing = ""
     if nvcc() is None:
-        return (
-            "its kernels are not compiled and there is no CUDA toolkit to compile them (nvcc was not found; set"
-            " CUDA_HOME)"
-        )
-    if shutil.which("ninja") is None and importlib.util.find_spec("ninja") is None:
-        return "its kernels are not compiled and ninja, which compiles them, is missing (pip install ninja)"
-    if not any(shutil.which(name) for name in (os.environ.get("CXX", "c++"), "g++", "clang++", "cl")):
-        return "its kernels are not compiled and there is no C++ compiler to compile them"
-    return ""
+        missing = "there is no CUDA toolkit to compile them (nvcc was not found; set CUDA_HOME)"
+    elif shutil.which("ninja") is None and importlib.util.find_spec("ninja") is None:
+        missing = "ninja, which compiles them, is missing (pip install ninja)"
+    elif not any(shutil.which(name) for name in (os.environ.get("CXX", "c++"), "g++", "clang++", "cl")):
+        missing = "there is no C++ compiler to compile them"
+    return missing and f"its kernels are not compiled and {missing}"
 
 
 def status() -> str:
@@ -122,61 +120,45 @@ _LARGEST_PX: Final = 1e9
 """Means and scales are held within these bounds: what lies beyond would overflow in gsplat's float32 and spread NaN."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Cameras:
-    """The views relative to ``origin`` [3]: viewmats [V, 4, 4] (cam from world), centers [V, 3], optical axes
-    ``forward`` [V, 3], intrinsics [V, 3, 3]."""
-
-    origin: Tensor
-    viewmats: Tensor
-    centers: Tensor
-    forward: Tensor
-    intrinsics: Tensor
-
-
-def render(request: Request) -> Render:
-    """Draw all views. See ``core.raster.rasterize``."""
-    if request.gaussians.means.dtype != torch.float32:
-        got = str(request.gaussians.means.dtype)
-        raise InputError("gsplat works on float32 tensors", where="gaussians.means", got=got)
-    if not len(request.gaussians):  # gsplat divides by their number
-        return torch_twin.render(replace(request, poses=(None,) * len(request.views)))
-    gsplat, g, cameras = load(), request.gaussians, _cameras(request)
-    if request.config.alpha_max != ALPHA_MAX:
-        log.info_once(f"rasterizer: gsplat caps alpha at {ALPHA_MAX}, not at {request.config.alpha_max}")
+def render(g: Gaussians, camera: Camera, world_from_cam: Tensor, config: RasterConfig, absgrad: bool) -> Render:
+    """Draw on the GPU. See ``core.raster.rasterize``."""
+    if g.means.dtype != torch.float32:
+        raise InputError("gsplat works on float32 tensors", where="gaussians.means", got=str(g.means.dtype))
+    if not len(g):  # gsplat divides by their number
+        return torch_twin.render(g, camera, world_from_cam, config, absgrad)
+    gsplat = load()
+    if config.alpha_max != ALPHA_MAX:
+        log.info_once(f"rasterizer: gsplat caps alpha at {ALPHA_MAX}, not at {config.alpha_max}")
     g, colorless = _finite(g)
+    # Poses are inverted in float64, places taken relative to the camera: float32 serves far from the world's origin
+    pose = world_from_cam.to(g.means.device, torch.float64)
+    origin = pose.detach()[:3, 3].to(g.means)
+    rotation, center = pose[:3, :3].T, pose[:3, 3] - origin.double()
+    rows = torch.cat([rotation, -(rotation @ center)[:, None]], 1)
+    viewmat = torch.cat([rows, pose.new_tensor([[0, 0, 0, 1.0]])]).to(g.means)
     image, alpha, meta = gsplat.rasterization(
-        **_splats(gsplat, request, g, cameras),
-        viewmats=cameras.viewmats,
-        Ks=cameras.intrinsics,
-        width=request.views[0].camera.width,
-        height=request.views[0].camera.height,
-        near_plane=request.config.near_m,
-        far_plane=request.config.far_m,
-        eps2d=request.config.blur_px2,
+        **_splats(gsplat, g, config.near_m / max(camera.fx, camera.fy), origin, center, pose[:3, 2]),
+        viewmats=viewmat[None],
+        Ks=torch.from_numpy(camera.matrix)[None].to(g.means),
+        width=camera.width,
+        height=camera.height,
+        near_plane=config.near_m,
+        far_plane=torch_twin.FAR_M,
+        eps2d=config.blur_px2,
         sh_degree=None,
         render_mode="RGB",
         packed=False,
-        rasterize_mode="antialiased" if request.config.antialias else "classic",
-        absgrad=request.absgrad,
+        rasterize_mode="antialiased" if config.antialias else "classic",
+        absgrad=absgrad,
     )
-    trace = _trace(meta, request)
+    trace = _trace(meta, absgrad)
     if colorless is not None and (trace.visible & colorless).any():
         raise NumericsError(
             "the colour or a feature of a Gaussian is not finite", where="gaussians.sh, gaussians.extra"
         )
-    planes, alpha = image.permute(0, 3, 1, 2), alpha.permute(0, 3, 1, 2)
-    features = 0 if g.extra is None else g.extra.shape[1]
-    color, extra, depth_sum = planes[:, :3], planes[:, 3 : 3 + features], planes[:, 3 + features : 4 + features]
-    if any(background is not None for background in request.backgrounds):
-        behind = torch.stack([color.new_zeros(3) if b is None else b.to(color) for b in request.backgrounds])
-        color = color + (1 - alpha) * behind[:, :, None, None]
-    depth = depth_sum / alpha.clamp_min(1e-10)
-    if request.batched:
-        return Render(rgb=color, depth=depth, alpha=alpha, extra=None if g.extra is None else extra, trace=trace)
-    return Render(
-        rgb=color[0], depth=depth[0], alpha=alpha[0], extra=None if g.extra is None else extra[0], trace=trace
-    )
+    planes, alpha = image[0].permute(2, 0, 1), alpha[0].permute(2, 0, 1)
+    depth = planes[-1:] / alpha.clamp_min(1e-10)
+    return Render(planes[:3], depth, alpha, None if g.extra is None else planes[3:-1], trace)
 
 
 def _finite(g: Gaussians) -> tuple[Gaussians, Tensor | None]:
@@ -196,49 +178,31 @@ def _finite(g: Gaussians) -> tuple[Gaussians, Tensor | None]:
     return replace(g, **clean), bad
 
 
-def _cameras(request: Request) -> _Cameras:
-    """Poses are inverted in float64 and taken relative to the first camera, so that float32 serves far from the world's
-    origin."""
-    like = request.gaussians.means
-    poses = torch.stack([request.pose(i).to(like.device, torch.float64) for i in range(len(request.views))])
-    origin = poses.detach().reshape(-1, 4, 4)[0, :3, 3].to(like.dtype)
-    rotation, centers = poses[..., :3, :3].transpose(-1, -2), poses[..., :3, 3] - origin.double()
-    last_row = poses.new_tensor([0, 0, 0, 1.0]).expand(*poses.shape[:-2], 1, 4)
-    viewmats = torch.cat([torch.cat([rotation, -rotation @ centers[..., None]], -1), last_row], -2).to(like.dtype)
-    intrinsics = torch.stack([torch.from_numpy(view.camera.matrix) for view in request.views]).to(like)
-    return _Cameras(origin, viewmats, centers.to(like.dtype), poses[..., :3, 2].to(like.dtype), intrinsics)
-
-
-def _splats(gsplat: Any, request: Request, g: Gaussians, cameras: _Cameras) -> dict[str, Tensor]:
-    """What gsplat receives of the Gaussians; colors [V, N, 3 + features + 1]: colour, features, depth."""
-    focal = max(max(view.camera.fx, view.camera.fy) for view in request.views)
-    means = (g.means - cameras.origin).clamp(-_FARTHEST_M, _FARTHEST_M)
-    scales = g.scales.clamp(_SMALLEST_M, _LARGEST_PX * request.config.near_m / focal)
+def _splats(
+    gsplat: Any, g: Gaussians, near_per_px: float, origin: Tensor, center: Tensor, forward: Tensor
+) -> dict[str, Tensor]:
+    """What gsplat receives of the Gaussians, relative to ``origin`` [3]; colors [1, N, 3 + features + 1]: colour,
+    features, depth. ``center`` f64[3] and ``forward`` f64[3]: the camera's place and axis."""
+    means = (g.means - origin).clamp(-_FARTHEST_M, _FARTHEST_M)
+    scales = g.scales.clamp(_SMALLEST_M, _LARGEST_PX * near_per_px)
     usable = g.quats.square().sum(1, keepdim=True) > 1e-24
     quats = torch.where(usable, g.quats, g.quats.new_tensor([1.0, 0, 0, 0]))
-    sh = harmonics(g)
-    channels = []
-    for center, forward in zip(cameras.centers, cameras.forward, strict=True):
-        offset = means - center
-        at_center = (offset == 0).all(1, keepdim=True)  # has no direction: gsplat would make NaN of it
-        direction = torch.where(at_center, forward.detach(), offset)
-        rgb = (gsplat.spherical_harmonics(request.sh_degree, direction, sh) + 0.5).clamp_min(0)
-        depth = offset @ forward[:, None]
-        channels.append(torch.cat([rgb, depth] if g.extra is None else [rgb, g.extra, depth], 1))
-    together = channels[0][None] if len(channels) == 1 else torch.stack(channels)
-    return {"means": means, "quats": quats, "scales": scales, "opacities": g.opacity, "colors": together}
+    sh, axis, offset = torch_twin.harmonics(g), forward.to(means), means - center.to(means)
+    at_center = (offset == 0).all(1, keepdim=True)  # has no direction: gsplat would make NaN of it
+    direction = torch.where(at_center, axis.detach(), offset)
+    rgb = (gsplat.spherical_harmonics(math.isqrt(sh.shape[1]) - 1, direction, sh) + 0.5).clamp_min(0)
+    channels = torch.cat([rgb, *([] if g.extra is None else [g.extra]), offset @ axis[:, None]], 1)
+    return {"means": means, "quats": quats, "scales": scales, "opacities": g.opacity, "colors": channels[None]}
 
 
-def _trace(meta: dict[str, Any], request: Request) -> RasterTrace:
+def _trace(meta: dict[str, Any], absgrad: bool) -> RasterTrace:
     """Trace whose means2d is a leaf: a hook copies the gradient of gsplat's own tensor to it. Rows that are not drawn
     are 0: gsplat leaves them uninitialised."""
-    means2d, radii = meta["means2d"], meta["radii"]
-    shaped = lambda tensor: tensor if request.batched else tensor[0]
-    size = shaped(radii)
+    means2d, size = meta["means2d"], meta["radii"][0]
     visible = (size > 0).all(-1)
-    leaf = torch.where(visible[..., None], shaped(means2d.detach()), 0).requires_grad_(means2d.requires_grad)
-    absolute = torch.zeros_like(leaf) if request.absgrad and means2d.requires_grad else None
-    trace = RasterTrace(leaf, torch.where(visible[..., None], size, 0).int(), visible, absolute)
+    leaf = torch.where(visible[:, None], means2d.detach()[0], 0).requires_grad_(means2d.requires_grad)
+    absolute = torch.zeros_like(leaf) if absgrad and means2d.requires_grad else None
+    trace = RasterTrace(leaf, torch.where(visible[:, None], size, 0).int(), visible, absolute)
     if not means2d.requires_grad:
         return trace
     # The trace owns gsplat's tensor and the hook knows the trace's only weakly: in a circle, both would outlive their
@@ -250,10 +214,10 @@ def _trace(meta: dict[str, Any], request: Request) -> RasterTrace:
         mine = reference()
         if mine is None:
             return
-        mine.grad = shaped(gradient) if mine.grad is None else mine.grad + shaped(gradient)
+        mine.grad = gradient[0] if mine.grad is None else mine.grad + gradient[0]
         if absolute is not None:
             # set by gsplat in its backward
-            absolute.add_(shaped(mine.drawn_by_gsplat.absgrad))  # type: ignore[attr-defined]
+            absolute.add_(mine.drawn_by_gsplat.absgrad[0])  # type: ignore[attr-defined]
 
     means2d.register_hook(keep)
     return trace

@@ -1,14 +1,14 @@
-"""Backend "torch": Gaussian splatting in plain differentiable torch. This file is the specification of all backends.
+"""Backend "torch": Gaussian splatting in plain differentiable torch. This file is the specification of all backends:
+any floating type, any device, gradients by autograd; slow, and what an installation without a compiler falls back to.
 
-Any floating type, any device, gradients by autograd. It goes tile by tile and keeps everything for the backward pass,
-so it is slow; it is what an installation without a compiler falls back to.
-
-Symbols follow Zwicker et al. 2001 (EWA splatting) and Kerbl et al. 2023: a Gaussian with mean mu, rotation R(q) and
-scales S has covariance R S S^T R^T; the camera maps it to the image with the Jacobian J of the projection.
+Elliptical weighted averaging of anisotropic Gaussians as in 3D Gaussian Splatting (Kerbl et al. 2023), with gsplat's
+conventions. Symbols follow Zwicker et al. 2001: a Gaussian with mean mu, rotation R(q) and scales S has covariance
+R S S^T R^T; the camera maps it to the image with the Jacobian J of the projection.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -16,9 +16,8 @@ import torch
 from torch import Tensor
 
 from mudg.base.errors import NumericsError
-from mudg.base.types import Camera, Gaussians, Render
+from mudg.base.types import Camera, Gaussians, RasterTrace, Render
 from mudg.core.harmonics import rotation_of_unit
-from mudg.core.raster.request import Drawn, Request, harmonics, joined, trace_leaves
 
 if TYPE_CHECKING:
     from mudg.core.raster.rasterize import RasterConfig
@@ -26,6 +25,8 @@ if TYPE_CHECKING:
 ALPHA_MIN: Final = 1.0 / 255.0
 STOP_TRANSMITTANCE: Final = 1e-4
 TILE: Final = 16
+FAR_M: Final = 1e10
+"""Nothing farther away is drawn, by any backend."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,37 +41,21 @@ class Splats:
     extents: Tensor
 
 
-def render(request: Request) -> Render:
+def render(g: Gaussians, camera: Camera, world_from_cam: Tensor, config: RasterConfig, absgrad: bool) -> Render:
     """Draw with torch operations. See ``core.raster.rasterize``."""
-    g = request.gaussians
     _refuse_not_finite(g)
-    tensors = (g.means, g.quats, g.scales, *request.poses)
-    keeps_graph = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
+    keeps_graph = torch.is_grad_enabled() and any(t.requires_grad for t in (g.means, g.quats, g.scales, world_from_cam))
     # The means are handed out as a leaf, so that their gradient is kept; a zero that carries it joins the graph.
-    means2d, probes = trace_leaves(request, g.means, keeps_graph)
-    absolute = torch.zeros_like(means2d) if request.absgrad and keeps_graph else None
-    drawn, shown = [], []
-    for index, probe in enumerate(probes):
-        table = None if absolute is None else absolute.view(len(probes), -1, 2)[index]
-        one, splats = _draw(request, index, probe, table)
-        drawn.append(one)
-        shown.append(torch.where(one.radii > 0, splats.means2d.detach(), 0))
-    means2d.detach().copy_(torch.stack(shown).view_as(means2d))
-    return joined(request, drawn, means2d, absolute)
-
-
-def _draw(request: Request, index: int, probe: Tensor, absolute: Tensor | None) -> tuple[Drawn, Splats]:
-    g, camera, config = request.gaussians, request.views[index].camera, request.config
-    pose, background = request.pose(index).to(g.means), request.backgrounds[index]
+    means2d = g.means.new_zeros(len(g), 2, requires_grad=keeps_graph)
+    absolute = torch.zeros_like(means2d) if absgrad and keeps_graph else None
+    pose, sh = world_from_cam.to(g.means), harmonics(g)
     splats = project(g, pose, camera, config)
-    sh = harmonics(g)
-    colors = sh_colors(sh, g.means - pose[:3, 3], request.sh_degree)
-    size = (camera.width, camera.height)
+    colors = sh_colors(sh, g.means - pose[:3, 3])
     with torch.no_grad():
-        touched = (splats.depth < config.far_m) & (splats.opacity >= ALPHA_MIN)
         low, high = splats.means2d - splats.extents, splats.means2d + splats.extents
-        limit = torch.tensor(size, device=low.device)
-        touched &= (splats.extents > 0).all(1) & (high >= 0.5).all(1) & (low <= limit - 0.5).all(1)
+        limit = torch.tensor((camera.width, camera.height), device=low.device)
+        touched = (splats.depth < FAR_M) & (splats.opacity >= ALPHA_MIN) & (splats.extents > 0).all(1)
+        touched &= (high >= 0.5).all(1) & (low <= limit - 0.5).all(1)
         order = torch.nonzero(touched)[:, 0]
         order = order[torch.argsort(splats.depth[order], stable=True)]
         radii = torch.where(touched[:, None], splats.extents.clamp(0, 1e9).ceil().clamp_min(1), 0).int()
@@ -79,12 +64,15 @@ def _draw(request: Request, index: int, probe: Tensor, absolute: Tensor | None) 
         raise NumericsError(
             "the colour or a feature of a Gaussian is not finite", where="gaussians.sh, gaussians.extra"
         )
-    blended, alpha = _blend_tiles(splats, probe, order, channels, absolute, size, config.alpha_max)
-    rgb, depth_sum, extra = blended[:3], blended[3:4], blended[4:]
-    if background is not None:
-        rgb = rgb + (1 - alpha) * background.to(rgb)[:, None, None]
-    depth = depth_sum / alpha.clamp_min(1e-10)
-    return Drawn(rgb, depth, alpha, None if g.extra is None else extra, radii), splats
+    blended, alpha = _blend_tiles(splats, means2d, order, channels, absolute, camera, config.alpha_max)
+    means2d.detach().copy_(torch.where(radii > 0, splats.means2d.detach(), 0))
+    depth, extra = blended[3:4] / alpha.clamp_min(1e-10), None if g.extra is None else blended[4:]
+    return Render(blended[:3], depth, alpha, extra, RasterTrace(means2d, radii, radii[:, 0] > 0, absolute))
+
+
+def harmonics(gaussians: Gaussians) -> Tensor:
+    """All spherical harmonics in one tensor, [N, K, 3]; a copy if they are kept in two."""
+    return gaussians.sh if gaussians.sh_rest is None else torch.cat([gaussians.sh, gaussians.sh_rest], 1)
 
 
 def project(g: Gaussians, world_from_cam: Tensor, camera: Camera, config: RasterConfig) -> Splats:
@@ -169,11 +157,11 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(basis, 1)
 
 
-def sh_colors(sh: Tensor, directions: Tensor, degree: int) -> Tensor:
+def sh_colors(sh: Tensor, directions: Tensor) -> Tensor:
     """Colours [N, 3] >= 0 of harmonics [N, K, 3] seen along directions [N, 3] (camera centre to mean, any length)."""
     unit = directions / (directions.square().sum(1, keepdim=True) + 1e-24).sqrt()
-    basis = sh_basis(unit, degree)
-    return ((basis[:, :, None] * sh[:, : basis.shape[1]]).sum(1) + 0.5).clamp_min(0)
+    basis = sh_basis(unit, math.isqrt(sh.shape[1]) - 1)
+    return ((basis[:, :, None] * sh).sum(1) + 0.5).clamp_min(0)
 
 
 def _blend_tiles(
@@ -182,11 +170,11 @@ def _blend_tiles(
     order: Tensor,
     channels: Tensor,
     absolute: Tensor | None,
-    size: tuple[int, int],
+    camera: Camera,
     alpha_max: float,
 ) -> tuple[Tensor, Tensor]:
     """Blend front to back. Returns accumulated channels [C, H, W] and alpha [1, H, W]."""
-    width, height = size
+    width, height = camera.width, camera.height
     means, conics, opacity = (splats.means2d + probe)[order], splats.conics[order], splats.opacity[order]
     low, high = (splats.means2d - splats.extents)[order].detach(), (splats.means2d + splats.extents)[order].detach()
     rows: list[Tensor] = []

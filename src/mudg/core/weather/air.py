@@ -1,15 +1,6 @@
-"""Falling rain and snow: size distributions, drops and flakes as particles of world cells, and what they cover in an
-image.
+"""Air: fog, falling rain and snow, in pictures and LiDAR sweeps, and the noise that patches of the ground follow.
 
-Every size falls with its own speed. Particles of one size stand still in a frame that falls with them; that frame is
-cut into cells, and a hash of the cell says how many particles it holds and where. So any camera at any time sees the
-same ones, without a simulation.
-
-Sources: Marshall and Palmer 1948 (drop sizes), Atlas et al. 1973 (fall speed), Gunn and Marshall 1958 (snow, melted
-diameters), Garg and Nayar 2007 (streaks: a drop covers a pixel for a share of the exposure and shows about 0.94 of the
-mean light of the upper hemisphere), Weber et al. 2015 (extinction of rain). Assumed: flakes have a tenth of the density
-of water, fall with 1.0 m/s and sway by 0.1 m.
-"""
+Sources and assumptions: docs/reference/weather.md."""
 
 from __future__ import annotations
 
@@ -20,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mudg.base import seeds
-from mudg.base.types import View
-from mudg.base.weather_settings import FogSettings
+from mudg.base import geometry, seeds
+from mudg.base.palette import UNLABELLED
+from mudg.base.types import SweepPoints, View
+from mudg.base.weather_settings import FogSettings, RainSettings, SnowSettings, WeatherSettings
 
 # noise --------------------------------------------------------------------------------------------
 # Hashes and value noise of world places: the same numbers for every camera and frame.
@@ -97,10 +89,8 @@ def smoothstep(low: float, high: float, v: Any) -> Any:
 
 
 # fog ----------------------------------------------------------------------------------------------
-# Fog and haze: Koschmieder's law in linear light, ``L = L0 t + A (1 - t)`` with transmittance t and airlight A.
-#
-# Extinction is 3.0 / visibility, as contrast falls to 5 % at the meteorological optical range. Distances are along the
-# ray, not camera z.
+# Koschmieder's law in linear light, ``L = L0 t + A (1 - t)`` with transmittance t and airlight A. Distances are along
+# the ray, not camera z.
 
 
 LEAST_SHARE = 0.05
@@ -112,38 +102,26 @@ def extinction(visibility_m: float) -> float:
     return 3.0 / visibility_m
 
 
-def optical_depth(range_m: Array, rise: Array, height_m: float, fog: FogSettings) -> Array:
-    """Optical depth f64[...] along rays.
+def way_below(range_m: Array, rise: Array, height_m: float, top_m: float) -> Array:
+    """Length f64[...] of the part of rays that runs below a height, metres.
 
     Args:
         range_m: distance along the ray, metres; infinite in the sky.
         rise: sine of the ray's elevation.
-        height_m: of the camera above the ground.
-        fog: density and its height.
+        height_m, top_m: of the camera, and of the limit, above the ground.
     """
-    beta = extinction(fog.visibility_m)
-    if fog.height_m > 0:
-        h = fog.height_m
-        with np.errstate(invalid="ignore", over="ignore"):
-            x = np.clip(range_m * rise / h, -60, 60)
-            x = np.where(np.isnan(x), 0, x)
-            path = np.where(np.abs(x) < 1e-6, range_m, -np.expm1(-x) * h / np.where(np.abs(rise) < 1e-12, 1e-12, rise))
-        return beta * np.exp(-height_m / h) * path
-    # uniform below the top: the part of the ray that runs there
     with np.errstate(divide="ignore", invalid="ignore"):
-        crossing = np.where(rise == 0, np.inf, (fog.top_m - height_m) / rise)
-        below = height_m < fog.top_m
-        inside = (
-            np.where(rise > 0, np.minimum(range_m, crossing), range_m)
-            if below
-            else np.where(rise < 0, np.maximum(range_m - crossing, 0), 0.0)
-        )
-    return beta * inside
+        crossing = np.where(rise == 0, np.inf, (top_m - height_m) / rise)
+        if height_m < top_m:
+            return np.where(rise > 0, np.minimum(range_m, crossing), range_m)
+        return np.where(rise < 0, np.maximum(range_m - crossing, 0), 0.0)
 
 
 def transmittance(range_m: Array, rise: Array, height_m: float, fog: FogSettings) -> Array:
-    """Share of the light of a surface that reaches the camera, f64[...] in [0, 1]."""
-    return np.exp(-np.minimum(optical_depth(range_m, rise, height_m, fog), 700.0))
+    """Share of the light of a surface that reaches the camera through fog, f64[...] in [0, 1]; arguments as of
+    ``way_below``."""
+    depth = extinction(fog.visibility_m) * way_below(range_m, rise, height_m, fog.top_m)
+    return np.exp(-np.minimum(depth, 700.0))
 
 
 def veiled(color: NDArray[np.floating], share: Array, airlight: Array) -> NDArray[np.float32]:
@@ -159,6 +137,9 @@ def unveiled(color: NDArray[np.floating], share: Array, airlight: Array) -> NDAr
 
 
 # particles ----------------------------------------------------------------------------------------
+# Every size falls with its own speed. Particles of one size stand still in a frame that falls with them; that frame is
+# cut into cells, and a hash of the cell says how many particles it holds and where. So any camera at any time sees the
+# same ones, without a simulation.
 
 
 DROP_LIGHT = 0.94
@@ -244,15 +225,6 @@ def _inside(view: View, xyz: Array, reach_m: float, margin_m: float) -> NDArray[
     return ok
 
 
-def _corners(view: View, reach_m: float) -> Array:
-    camera = view.camera
-    u = np.array([0, camera.width, 0, camera.width]) - camera.cx
-    v = np.array([0, 0, camera.height, camera.height]) - camera.cy
-    rays = np.stack([u / camera.fx, v / camera.fy, np.ones(4)], 1)
-    ends = np.concatenate([np.zeros((1, 3)), rays * reach_m, [[0, 0, reach_m]]])
-    return view.center_world + ends @ view.world_from_cam[:3, :3].T
-
-
 def places(size: ParticleSize, velocity: Array, view: View, reach_m: float, key: int) -> Array:
     """World places f64[N, 3] at ``view.time_s`` of the particles that stand in the view's pyramid within the reach, and
     a few beside it.
@@ -267,7 +239,10 @@ def places(size: ParticleSize, velocity: Array, view: View, reach_m: float, key:
     time_s = view.time_s
     cell = min(max((2.0 / size.density) ** (1 / 3), 0.25), 2.0)
     margin = cell + size.sway_m
-    corners = _corners(view, reach_m) - velocity * time_s
+    u, v = np.array([0, 1, 0, 1]) * view.camera.width, np.array([0, 0, 1, 1]) * view.camera.height
+    rays = np.stack([*geometry.pinhole_ray(view.camera.intrinsics, u, v), np.ones(4)], 1)
+    ends = np.concatenate([np.zeros((1, 3)), rays * reach_m, [[0, 0, reach_m]]])
+    corners = view.center_world + ends @ view.world_from_cam[:3, :3].T - velocity * time_s
     low, high = np.floor((corners.min(0) - margin) / cell), np.floor((corners.max(0) + margin) / cell)
     axes = [np.arange(int(a), int(b) + 1) for a, b in zip(low, high, strict=True)]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
@@ -311,11 +286,7 @@ def covered(view: View, depth: NDArray[np.floating], xyz: Array, velocity: Array
     ends = [middle - half, middle + half]
     kept = (ends[0][:, 2] > NEAREST_M) & (ends[1][:, 2] > NEAREST_M)
     start, end = ends[0][kept], ends[1][kept]
-
-    def pixel(p: Array) -> Array:
-        return np.stack([camera.fx * p[:, 0] / p[:, 2] + camera.cx, camera.fy * p[:, 1] / p[:, 2] + camera.cy], 1)
-
-    a, b = pixel(start), pixel(end)
+    a, b = (np.stack(geometry.pinhole(camera.intrinsics, *p.T), 1) for p in (start, end))
     width = camera.fx * diameter_m / middle[kept, 2]
     lengths = np.linalg.norm(b - a, axis=1)
     along = np.minimum(np.ceil(lengths / _STEP_PX).astype(np.int64) + 1, _MOST_STEPS)
@@ -352,24 +323,150 @@ def _splat(at: Array, mass: Array, z: Array, depth: NDArray[np.floating]) -> Arr
     return total.reshape(height, width)
 
 
-@dataclass(frozen=True, slots=True)
-class Falling:
-    """What falls: sizes, wind along x and y in m/s, how near it is drawn, and a name for the random numbers."""
-
-    sizes: list[ParticleSize]
-    wind_m_s: tuple[float, float]
-    reach_m: float
-    purpose: str
-
-
 def falling(
-    view: View, depth: NDArray[np.floating], fall: Falling, camera_velocity: tuple[float, float, float], seed: int
+    view: View,
+    depth: NDArray[np.floating],
+    sizes: list[ParticleSize],
+    fall: RainSettings | SnowSettings,
+    camera_velocity: tuple[float, float, float],
+    seed: int,
+    purpose: str,
 ) -> Array:
-    """Optical depth f64[H, W] of all particles of a kind within their reach, at ``view.time_s``."""
+    """Optical depth f64[H, W] of all particles of these sizes within the reach of ``fall``, carried by its wind, at
+    ``view.time_s``. ``purpose``: a name for their random numbers."""
     total = np.zeros(depth.shape)
-    for index, size in enumerate(fall.sizes):
+    for index, size in enumerate(sizes):
         velocity = np.array([*fall.wind_m_s, -size.fall_m_s])
-        xyz = places(size, velocity, view, fall.reach_m, seeds.key(seed, index, fall.purpose))
+        xyz = places(size, velocity, view, fall.reach_m, seeds.key(seed, index, purpose))
         xyz = xyz[np.linalg.norm(xyz - view.center_world, axis=1) < fall.reach_m]
         total += covered(view, depth, xyz, velocity - np.asarray(camera_velocity), size.diameter_m)
     return total
+
+
+# LiDAR --------------------------------------------------------------------------------------------
+# Fog (Hahner et al. 2021): the hard return of a surface falls by ``exp(-2 alpha r)``; droplets near the sensor return a
+# soft pulse; the stronger of the two is recorded. Rain (Goodin et al. 2019): power ``rho / r^2 exp(-0.02 R^0.6 r)`` and
+# range noise. Powers are relative: only ratios count, and the sensor's threshold is set by the range at which it still
+# sees a surface of 10 % reflectance in clear air.
+
+
+BACKSCATTER = 0.046
+"""Backscattered share per metre of fog, times the visibility in metres."""
+PULSE_M = 3.0
+"""Half-power pulse length as a distance: 20 ns of light, there and back."""
+SOFT_JITTER_M = 0.3
+CROSS_FROM_M, CROSS_TO_M = 0.9, 1.0
+"""The receiver sees nothing of the beam before the first distance, and all of it after the second."""
+THRESHOLD = 0.1 / math.pi / 90.0**2
+"""Least power that is detected, in units of ``reflectance / pi / r^2``: 10 % reflectance in clear air at 90 m."""
+LOST, HARD, SOFT = 0, 1, 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BeamReturns:
+    """A sweep in bad weather, for the same N beams.
+
+    Args:
+        range_m: f64[N]; of soft returns the place in the fog; where nothing returned the range that was given.
+        intensity: f64[N], received power against a white surface in clear air, times r^2: attenuated reflectance.
+        kind: u8[N]: 0 lost, 1 the surface, 2 fog.
+    """
+
+    range_m: Array
+    intensity: Array
+    kind: NDArray[np.uint8]
+
+
+def soft_response(visibility_m: float, reach_m: float = 60.0, step_m: float = 0.02) -> tuple[Array, Array]:
+    """Power of the fog alone by recorded distance, in the units of ``THRESHOLD``.
+
+    ``beta_b`` times the integral over r' of ``exp(-2 alpha r') / r'^2`` x crossover x pulse, by the midpoint rule; the
+    pulse is centred on the recorded distance and scaled so that a surface at r returns ``reflectance / pi / r^2``.
+
+    Returns:
+        Distances f64[M] in metres and powers f64[M].
+    """
+    alpha = math.log(20.0) / visibility_m
+    r = (np.arange(int(reach_m / step_m), dtype=np.float64) + 0.5) * step_m
+    density = np.exp(-2 * alpha * r) / r**2 * np.clip((r - CROSS_FROM_M) / (CROSS_TO_M - CROSS_FROM_M), 0, 1)
+    behind = (np.arange(int(2 * PULSE_M / step_m), dtype=np.float64) + 0.5) * step_m  # the front of the pulse
+    shape = np.where(behind <= 2 * PULSE_M, np.sin(math.pi * behind / (2 * PULSE_M)) ** 2, 0.0)
+    power = np.convolve(density, shape, mode="same") * step_m
+    return r, BACKSCATTER / visibility_m * power
+
+
+def in_fog(range_m: Array, reflectance: Array, visibility_m: float, seed: int) -> BeamReturns:
+    """A sweep in fog. Only beams that hit a surface are known: beams into the sky stay without return.
+
+    Args:
+        range_m: f64[N] to the surface, metres.
+        reflectance: f64[N] of the surface times the cosine of incidence, 0 to 1.
+        visibility_m: meteorological optical range.
+        seed: of the jitter of soft returns.
+    """
+    range_m, reflectance = np.asarray(range_m, np.float64), np.asarray(reflectance, np.float64)
+    alpha = math.log(20.0) / visibility_m
+    hard = reflectance / math.pi / range_m**2 * np.exp(-2 * alpha * range_m)
+    distances, powers = soft_response(visibility_m)
+    best = np.maximum.accumulate(powers)  # the strongest fog nearer than the surface
+    place = np.maximum.accumulate(np.where(powers >= best, np.arange(len(powers)), 0))
+    index = np.clip(np.searchsorted(distances, range_m) - 1, 0, len(distances) - 1)
+    soft = best[index]
+    kind = np.where(np.maximum(hard, soft) < THRESHOLD, LOST, np.where(soft > hard, SOFT, HARD)).astype(np.uint8)
+    jitter = seeds.numpy_rng(seed, len(range_m), "soft returns").normal(0, SOFT_JITTER_M, len(range_m))
+    near = np.clip(distances[place[index]] + jitter, np.minimum(CROSS_FROM_M, range_m), range_m)
+    shown = np.where(kind == SOFT, near, range_m)
+    power = np.where(kind == SOFT, soft, hard)
+    return BeamReturns(shown, np.where(kind == LOST, 0.0, power * math.pi * range_m**2), kind)
+
+
+def in_rain(range_m: Array, reflectance: Array, mm_h: float, seed: int) -> BeamReturns:
+    """A sweep in rain of a rate in mm/h: weaker and lost returns, and noise of the range. Arguments as of
+    ``in_fog``."""
+    range_m, reflectance = np.asarray(range_m, np.float64), np.asarray(reflectance, np.float64)
+    share = np.exp(-0.02 * mm_h**0.6 * range_m) if mm_h > 0 else np.ones_like(range_m)
+    kept = reflectance / math.pi / range_m**2 * share >= THRESHOLD
+    sigma = 0.02 * range_m * (1 - math.exp(-mm_h)) ** 2
+    noise = seeds.numpy_rng(seed, len(range_m), "rain range").normal(0, 1, len(range_m)) * sigma
+    return BeamReturns(
+        np.where(kept, np.maximum(range_m + noise, 0.1), range_m),
+        np.where(kept, reflectance * share, 0.0),
+        np.where(kept, HARD, LOST).astype(np.uint8),
+    )
+
+
+def sweep_in_weather(points: SweepPoints, weather: WeatherSettings, seed: int) -> tuple[SweepPoints, NDArray[np.uint8]]:
+    """A sweep as it would have been in fog and rain.
+
+    The recorded intensity is taken as reflectance times the cosine of incidence, 0 to 1: sensors whose intensity means
+    something else need it converted first. Snow in the air is not modelled.
+
+    Args:
+        points: in the LiDAR's frame, recorded in clear air.
+        weather: fog and rain of it.
+        seed: another for every sweep.
+
+    Returns:
+        The points that return, moved along their beams, and for each 1 = surface, 2 = fog, u8[N].
+    """
+    xyz = points.xyz.astype(np.float64)
+    distance = np.maximum(np.linalg.norm(xyz, axis=1), 1e-3)
+    beams = xyz / distance[:, None]
+    shown, intensity = distance, points.intensity.astype(np.float64)
+    kind = np.full(len(xyz), HARD, np.uint8)
+    if weather.fog is not None:
+        fog = in_fog(shown, intensity, weather.fog.visibility_m, seed)
+        shown, intensity, kind = fog.range_m, fog.intensity, fog.kind
+    if weather.rain is not None:
+        # fog that returned stands near the sensor and is recorded as it is
+        rain = in_rain(shown, intensity, weather.rain.mm_h, seed)
+        hard = kind == HARD
+        shown, intensity = np.where(hard, rain.range_m, shown), np.where(hard, rain.intensity, intensity)
+        kind = np.where(hard, rain.kind, kind).astype(np.uint8)
+    kept = kind != LOST
+    classes = (
+        None if points.classes is None else np.where(kind == SOFT, UNLABELLED, points.classes).astype(np.uint8)[kept]
+    )
+    moved = (beams * shown[:, None]).astype(np.float32)[kept]
+    result = SweepPoints(moved, np.clip(intensity, 0, 1).astype(np.float32)[kept], points.dt_s[kept], classes)
+    return result, kind[kept]

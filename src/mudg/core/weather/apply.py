@@ -10,14 +10,7 @@ from numpy.typing import NDArray
 
 from mudg.base.errors import InputError
 from mudg.base.types import View
-from mudg.base.weather_settings import (
-    Conditions,
-    FogSettings,
-    LightSettings,
-    RainSettings,
-    SnowSettings,
-    WeatherSettings,
-)
+from mudg.base.weather_settings import Conditions, LightSettings, WeatherSettings
 from mudg.core.weather import air, ground
 from mudg.core.weather import light as relight
 from mudg.core.weather.gbuffer import (
@@ -33,7 +26,6 @@ from mudg.core.weather.gbuffer import (
 )
 from mudg.core.weather.light import in_season
 
-Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 
@@ -61,7 +53,10 @@ def apply(
     light = surroundings if surroundings is not None else estimate_surroundings([(view, gbuffer)])
     weather = settings.weather
     if weather.recorded_visibility_m > 0:
-        gbuffer = _without_haze(gbuffer, view, weather.recorded_visibility_m, light)
+        # surfaces without the haze of the recording's day; the sky stays
+        share = np.exp(-air.extinction(weather.recorded_visibility_m) * euclidean_range(view, gbuffer.depth))
+        clear = air.unveiled(gbuffer.color, share, light.airlight)
+        gbuffer = replace(gbuffer, color=np.where(gbuffer.sky[..., None], gbuffer.color, clear).astype(np.float32))
     if settings.season is not None:
         gbuffer = in_season(gbuffer, view, settings.season, seed)
     if settings.light.time != "as_recorded":
@@ -70,18 +65,13 @@ def apply(
         color = ground.wet_ground(gbuffer, view, light, weather.wet, weather.puddles, seed)
         gbuffer = replace(gbuffer, color=color)
     if weather.snow is not None and weather.snow.cover > 0:
-        gbuffer = _snowed(gbuffer, view, light, weather.snow, seed)
+        cover = ground.snow_cover(gbuffer, view, weather.snow.cover, seed)[..., None]
+        white = ground.snow_light(gbuffer, light, relight.sunlit_of(gbuffer, light))
+        gbuffer = replace(gbuffer, color=(gbuffer.color + (white - gbuffer.color) * cover).astype(np.float32))
     color = _with_particles(_through_air(gbuffer, view, light, weather), gbuffer, view, light, weather, seed)
     if settings.light.time == "night":
         color = relight.glow(color)
     return (color * np.float32(2.0**settings.light.exposure_ev)).astype(np.float32)
-
-
-def _without_haze(gbuffer: GBuffer, view: View, visibility_m: float, light: Surroundings) -> GBuffer:
-    """Surfaces without the haze of the recording's day; the sky stays."""
-    share = np.exp(-air.extinction(visibility_m) * euclidean_range(view, gbuffer.depth))
-    clear = np.where(gbuffer.sky[..., None], gbuffer.color, air.unveiled(gbuffer.color, share, light.airlight))
-    return replace(gbuffer, color=clear.astype(np.float32))
 
 
 def _in_new_light(
@@ -96,17 +86,6 @@ def _in_new_light(
     return replace(gbuffer, color=color, sunlit=gbuffer.new_sunlit), target
 
 
-def _snowed(gbuffer: GBuffer, view: View, light: Surroundings, snow: SnowSettings, seed: int) -> GBuffer:
-    cover = ground.snow_cover(gbuffer, view, snow.cover, seed)
-    if light.path is not None and snow.tracks < 1:
-        road = gbuffer.ground
-        tracks = ground.wheel_tracks(world_points(view, gbuffer.depth)[road][:, :2], light.path)
-        cover[road] *= (1 - (1 - snow.tracks) * tracks).astype(np.float32)
-    white = ground.snow_light(gbuffer, light, relight.sunlit_of(gbuffer, light))
-    color = gbuffer.color + (white - gbuffer.color) * cover[..., None]
-    return replace(gbuffer, color=color.astype(np.float32))
-
-
 def _through_air(gbuffer: GBuffer, view: View, light: Surroundings, weather: WeatherSettings) -> Image:
     """Light behind fog, or the haze of the recording again, and the veil of distant rain and snow."""
     rays, length = world_rays(view)
@@ -117,8 +96,7 @@ def _through_air(gbuffer: GBuffer, view: View, light: Surroundings, weather: Wea
         share = air.transmittance(distance, rise, height, weather.fog)
     elif weather.recorded_visibility_m > 0:
         share = np.where(gbuffer.sky, 1.0, np.exp(-air.extinction(weather.recorded_visibility_m) * distance))
-    falling = FogSettings(top_m=1000.0)  # below the clouds
-    path = air.optical_depth(distance, rise, height, falling) / air.extinction(falling.visibility_m)
+    path = air.way_below(distance, rise, height, CLOUDS_M)
     for fall, extinction in ((weather.rain, air.rain_extinction), (weather.snow, air.snow_extinction)):
         if fall is not None and fall.mm_h > 0:  # level rays have no end
             share = share * np.exp(-extinction(fall.mm_h) * np.maximum(path - fall.reach_m, 0))
@@ -129,22 +107,21 @@ def _with_particles(
     color: Image, gbuffer: GBuffer, view: View, light: Surroundings, weather: WeatherSettings, seed: int
 ) -> Image:
     """Drops and flakes near the camera, one by one."""
-    kinds: list[tuple[RainSettings | SnowSettings, list[air.ParticleSize], Array, str]] = []
-    if weather.rain is not None and weather.rain.mm_h > 0:
-        kinds.append((weather.rain, air.rain_sizes(weather.rain.mm_h), air.DROP_LIGHT * light.ambient, "rain"))
-    if weather.snow is not None and weather.snow.mm_h > 0:
-        radiance = ground.SNOW_COLOR * (light.ambient + 0.25 * light.sun)
-        kinds.append((weather.snow, air.snow_sizes(weather.snow.mm_h), radiance, "flakes"))
-    for fall, sizes, radiance, purpose in kinds:
-        what = air.Falling(sizes, fall.wind_m_s, fall.reach_m, purpose)
-        depth = air.falling(view, gbuffer.depth, what, gbuffer.camera_velocity, seed)
-        color = air.veiled(color, np.exp(-depth), radiance)
+    rain, snow, velocity = weather.rain, weather.snow, gbuffer.camera_velocity
+    if rain is not None and rain.mm_h > 0:
+        depth = air.falling(view, gbuffer.depth, air.rain_sizes(rain.mm_h), rain, velocity, seed, "rain")
+        color = air.veiled(color, np.exp(-depth), air.DROP_LIGHT * light.ambient)
+    if snow is not None and snow.mm_h > 0:
+        depth = air.falling(view, gbuffer.depth, air.snow_sizes(snow.mm_h), snow, velocity, seed, "flakes")
+        color = air.veiled(color, np.exp(-depth), ground.SNOW_COLOR * (light.ambient + 0.25 * light.sun))
     return color
 
 
 # a whole drive: what all its frames share, and one call per image ---------------------------------
 
 
+CLOUDS_M = 1000.0
+"""Rain and snow fall below this height."""
 LEAST_POINTS = 2
 """Pixels that a cell of the height map needs, so that single wrong depths do not stand in the air."""
 CELL_M = 0.4
@@ -172,18 +149,14 @@ class DriveFacts:
     heights: OccluderMap | None = None
 
 
-def drive_facts(shown: Iterable[ShownView], path: NDArray[np.float64] | None = None) -> DriveFacts:
-    """Light and height map of a drive from some of its views; a few of each camera, spread over the drive, are enough.
-
-    Args:
-        shown: views with depth and classes. path: x, y, yaw of the recording vehicle f64[N, 3], for wheel tracks in
-            snow.
-    """
+def drive_facts(shown: Iterable[ShownView]) -> DriveFacts:
+    """Light and height map of a drive from some of its views with depth and classes; a few of each camera, spread over
+    the drive, are enough."""
     pairs = [(s.view, from_render(s.view, relight.srgb_decode(s.rgb), s.depth, s.classes)) for s in shown]
     if not pairs:
         raise InputError("light is estimated from views", where="shown", got="none")
     xyz = np.concatenate([world_points(view, buffer.depth)[~buffer.sky] for view, buffer in pairs])
-    around = replace(estimate_surroundings(pairs), path=path)
+    around = estimate_surroundings(pairs)
     return DriveFacts(around, OccluderMap.from_points(xyz, CELL_M, least=LEAST_POINTS) if len(xyz) else None)
 
 

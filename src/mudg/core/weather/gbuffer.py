@@ -228,13 +228,6 @@ def sky_share(openness: NDArray[np.floating]) -> NDArray[np.floating]:
     return 0.75 + 0.25 * openness
 
 
-def open_directions() -> Array:
-    """The nine directions f64[9, 3] whose free share is the openness: straight up, and eight at 60 degrees."""
-    turn = np.arange(8) * (np.pi / 4)
-    tilted = np.stack([0.5 * np.cos(turn), 0.5 * np.sin(turn), np.full(8, np.sqrt(0.75))], 1)
-    return np.concatenate([[[0.0, 0.0, 1.0]], tilted])
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class OccluderMap:
     """Largest height per cell of the ground plane. Things are solid down to the ground: below a bridge no sky is seen.
@@ -301,8 +294,11 @@ class OccluderMap:
         return open_
 
     def openness(self, xyz: Array) -> Plane:
-        """Free share of ``open_directions`` f32[N] at places [N, 3]."""
-        return np.mean([self.free(xyz, d) for d in open_directions()], axis=0).astype(np.float32)
+        """Free share f32[N] of nine directions at places [N, 3]: straight up, and eight at 60 degrees."""
+        turn = np.arange(8) * (np.pi / 4)
+        tilted = np.stack([0.5 * np.cos(turn), 0.5 * np.sin(turn), np.full(8, np.sqrt(0.75))], 1)
+        directions = np.concatenate([[[0.0, 0.0, 1.0]], tilted])
+        return np.mean([self.free(xyz, d) for d in directions], axis=0).astype(np.float32)
 
 
 def sun_visibility(gbuffer: GBuffer, view: View, heights: OccluderMap, direction: Array) -> Plane:
@@ -331,7 +327,6 @@ class Surroundings:
         sun_direction: f64[3] towards the sun.
         airlight: radiance of thick fog.
         ground_z_m: height of the road below the camera.
-        path: where the recording vehicle drove, f64[N, 3] x, y, yaw; None = no wheel tracks in the snow.
     """
 
     horizon: Array
@@ -341,7 +336,6 @@ class Surroundings:
     sun_direction: Array
     airlight: Array
     ground_z_m: float = 0.0
-    path: Array | None = None
 
 
 def _quantile_color(colors: Image, share: float, otherwise: Array) -> Array:

@@ -10,9 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.spatial import KDTree
 
-from mudg.base import seeds
+from mudg.base import geometry, seeds
 from mudg.base.palette import ID
 from mudg.base.types import View
 from mudg.core.weather.air import patch_threshold, patches, smoothstep
@@ -32,8 +31,6 @@ PUDDLE_M = 2.5
 SNOW_PATCH_M = 1.5
 SNOW_COLOR = np.array([0.98, 0.99, 1.02]) * 0.9
 TREE_COVER = 0.6
-WHEEL_OFFSET_M = 0.75
-WHEEL_HALF_M = 0.16
 _WET_IDS = (ID["road"], ID["sidewalk"])
 _BARE_IDS = (ID["sky"], ID["person"], ID["rider"])
 _LEVEL = 0.8
@@ -81,9 +78,9 @@ def screen_mirror(gbuffer: GBuffer, view: View, surroundings: Surroundings) -> I
     solid = np.where(gbuffer.ground, np.inf, gbuffer.depth)  # ground is not mirrored in ground
 
     def project(p: Array) -> tuple[Array, Array, Array]:
-        local = p @ turn
-        z = np.where(local[:, 2] > 1e-3, local[:, 2], np.nan)
-        return camera.fx * local[:, 0] / z + camera.cx, camera.fy * local[:, 1] / z + camera.cy, local[:, 2]
+        x, y, z = (p @ turn).T
+        u, v = geometry.pinhole(camera.intrinsics, x, y, np.where(z > 1e-3, z, np.nan))
+        return u, v, z
 
     def behind(rows: NDArray[np.intp], t: Array) -> tuple[NDArray[np.bool_], Array]:
         u, v, z = project(start[rows] + t[:, None] * direction[rows] - view.center_world)
@@ -104,29 +101,16 @@ def screen_mirror(gbuffer: GBuffer, view: View, surroundings: Surroundings) -> I
             past = behind(rows, middle)[0]
             low, high = np.where(past, low, middle), np.where(past, middle, high)
         hit[rows] = high
-    u, v, z = project(
-        np.where(np.isnan(hit)[:, None], direction, start + np.nan_to_num(hit)[:, None] * direction - view.center_world)
-    )
+    met = start + np.nan_to_num(hit)[:, None] * direction - view.center_world
+    u, v, z = project(np.where(np.isnan(hit)[:, None], direction, met))
     light = sky_light(surroundings, direction[:, 2])
     at = (np.clip(np.nan_to_num(v) - 0.5, 0, height - 1), np.clip(np.nan_to_num(u) - 0.5, 0, width - 1))
     shown = (z > 0) & ~gbuffer.ground[at[0].astype(np.int64), at[1].astype(np.int64)]
     for channel in range(3):
-        seen = ndimage.map_coordinates(
-            gbuffer.color[..., channel], (at[0][shown], at[1][shown]), order=1, mode="nearest"
-        )
-        light[shown, channel] = seen
+        plane, places = gbuffer.color[..., channel], (at[0][shown], at[1][shown])
+        light[shown, channel] = ndimage.map_coordinates(plane, places, order=1, mode="nearest")
     mirror[wet] = light
     return mirror
-
-
-def _upward_blur(mirror: Image, where: NDArray[np.bool_], focal_px: float) -> Image:
-    """The mirror image as a film of water shows it: blurred along the columns, little across. Only pixels of ``where``
-    count."""
-    sigma = 2 * FILM_TILT * focal_px
-    blur = (sigma, 0.15 * sigma)
-    weight = ndimage.gaussian_filter(where.astype(np.float32), blur)
-    sums = [ndimage.gaussian_filter(np.where(where, mirror[..., c], 0), blur) for c in range(3)]
-    return (np.stack(sums, -1) / np.maximum(weight, 1e-6)[..., None]).astype(np.float32)
 
 
 def wet_ground(
@@ -149,7 +133,11 @@ def wet_ground(
     share = fresnel(-rays[..., 2] / length)
     film = (wet - water) * FILM_GLOSS * share * ground
     pool = water * share * ground
-    blurred = _upward_blur(mirror, ground, view.camera.fy)
+    # a film blurs along the columns, little across; only pixels of the ground count
+    blur = (2 * FILM_TILT * view.camera.fy, 0.3 * FILM_TILT * view.camera.fy)
+    weight = np.maximum(ndimage.gaussian_filter(ground.astype(np.float32), blur), 1e-6)[..., None]
+    sums = [ndimage.gaussian_filter(np.where(ground, mirror[..., c], 0), blur) for c in range(3)]
+    blurred = (np.stack(sums, -1) / weight).astype(np.float32)
     dark = np.where(ground, 1 - wet * (1 - WET_DARKENING), 1.0)
     light = gbuffer.color * (dark * (1 - film - pool))[..., None] + blurred * film[..., None] + mirror * pool[..., None]
     return light.astype(np.float32)
@@ -170,23 +158,6 @@ def snow_weight(
     level = patch_threshold(cover, noise)
     patch = smoothstep(level - 0.06, level + 0.06, patches(xyz[..., 0], xyz[..., 1], SNOW_PATCH_M, noise))
     return smoothstep(0.3, 0.8, normal[..., 2]) * smoothstep(0.2, 0.7, openness) * patch
-
-
-def wheel_tracks(xy: Array, path: Array) -> Array:
-    """1 at places [..., 2] where the two wheels of a vehicle went whose centre followed a path [N, 3] of x, y, yaw; 0
-    elsewhere."""
-    steps = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1)
-    along = np.concatenate([[0.0], np.cumsum(steps)])
-    at = np.arange(0, along[-1] + 0.1, 0.1)
-    x, y, yaw = (
-        np.interp(at, along, path[:, 0]),
-        np.interp(at, along, path[:, 1]),
-        np.interp(at, along, np.unwrap(path[:, 2])),
-    )
-    left = np.stack([-np.sin(yaw), np.cos(yaw)], 1)
-    wheels = np.concatenate([np.stack([x, y], 1) + side * WHEEL_OFFSET_M * left for side in (-1, 1)])
-    distance, _ = KDTree(wheels).query(xy.reshape(-1, 2))
-    return (distance.reshape(xy.shape[:-1]) < WHEEL_HALF_M).astype(np.float64)
 
 
 def snow_cover(gbuffer: GBuffer, view: View, cover: float, seed: int) -> Plane:

@@ -221,15 +221,7 @@ def target_light(recorded: Surroundings, settings: LightSettings) -> Surrounding
 
     def light(scale: float, sky: tuple[Array, Array, Array], sun: Array, direction: Array) -> Surroundings:
         horizon, zenith, ambient = (scale * part for part in sky)
-        return replace(
-            recorded,
-            horizon=horizon,
-            zenith=zenith,
-            ambient=ambient,
-            sun=scale * sun,
-            sun_direction=direction,
-            airlight=0.9 * horizon,
-        )
+        return Surroundings(horizon, zenith, ambient, scale * sun, direction, 0.9 * horizon, recorded.ground_z_m)
 
     if settings.time == "overcast":
         grey = np.array([0.97, 1.0, 1.04])
@@ -269,16 +261,6 @@ def headlight(xyz: Array, normal: NDArray[np.floating], vehicle: Array) -> Array
     return total[:, None] * BEAM_COLOR
 
 
-def vehicle_lights(view: View, ground_z_m: float) -> Array:
-    """Where the headlights are when only a forward camera is known: below it, 0.65 m above the road, along its axis."""
-    forward = view.world_from_cam[:3, 2] * np.array([1.0, 1.0, 0.0])
-    x = forward / max(float(np.linalg.norm(forward)), 1e-6)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([x, np.cross([0.0, 0.0, 1.0], x), [0.0, 0.0, 1.0]], 1)
-    pose[:3, 3] = (*(view.center_world + 1.0 * x)[:2], ground_z_m + 0.65)
-    return pose
-
-
 def relit(
     gbuffer: GBuffer, view: View, recorded: Surroundings, target: Surroundings, point_lights: Array | None = None
 ) -> Image:
@@ -309,11 +291,16 @@ def relit(
 
 
 def headlights(gbuffer: GBuffer, view: View, ground_z_m: float) -> Array:
-    """Irradiance over pi f64[H, W, 3] of the recording vehicle's headlights; nothing casts shadows."""
+    """Irradiance over pi f64[H, W, 3] of the headlights of a vehicle whose forward camera this is: below it, 0.65 m
+    above the road, along its axis. Nothing casts shadows."""
+    forward = view.world_from_cam[:3, 2] * np.array([1.0, 1.0, 0.0])
+    x = forward / max(float(np.linalg.norm(forward)), 1e-6)
+    vehicle = np.eye(4)
+    vehicle[:3, :3] = np.stack([x, np.cross([0.0, 0.0, 1.0], x), [0.0, 0.0, 1.0]], 1)
+    vehicle[:3, 3] = (*(view.center_world + 1.0 * x)[:2], ground_z_m + 0.65)
     out = np.zeros(gbuffer.color.shape)
     solid = ~gbuffer.sky
-    xyz, normal = world_points(view, gbuffer.depth)[solid], gbuffer.normal[solid]
-    out[solid] += headlight(xyz, normal, vehicle_lights(view, ground_z_m))
+    out[solid] += headlight(world_points(view, gbuffer.depth)[solid], gbuffer.normal[solid], vehicle)
     # single normals at kerbs are wrong now and then, and a headlight shows every one
     calm = ndimage.median_filter(out, (3, 3, 1))
     return np.where(gbuffer.ground[..., None], calm, out)

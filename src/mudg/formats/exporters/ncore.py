@@ -17,27 +17,27 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from mudg.base import geometry, log, store
+from mudg.base import log, store
 from mudg.base.errors import InputError
+from mudg.base.geometry import from_rotation_translation, invert
 from mudg.base.types import Camera, Frame, Scene, Sweep, Track
 from mudg.base.versions import version
 from mudg.formats.exporters.messages import LogRecords, picture_format
 from mudg.formats.ncore import (
     ABOUT,
     EGO_MASK,
+    EULER,
     INSTANCE,
     MARK,
     MICRO,
-    POINT_CLASSES,
     RIG,
     SWEEP_TIME,
     WORLD,
     Matrix,
     PoseKeys,
-    Times,
     close,
-    euler_of,
     package,
     shutter_type,
 )
@@ -83,8 +83,12 @@ class _WrittenLog:
             self._sweeps.setdefault(sweep.sensor, []).append(sweep)
         self._ids = sensor_ids(self._scene.cameras, self._sweeps)
         self._spans = {sweep.id: self._span(sweep) for sweep in self._scene.sweeps}
-        self._start_us, self._end_us = self._interval()
         ego = self._scene.ego
+        spans = [*self._spans.values(), *(self._shutter(frame) for frame in self._scene.frames)]
+        times = [time for span in spans for time in span] + [self._us(float(time)) for time in ego.times_s]
+        if min(times) < 0:
+            raise InputError("times of points reach more than a second before the log", where=self._scene.id)
+        self._start_us, self._end_us = min(times), max(max(times), min(times) + 1)
         self._rig = self._keys(ego.times_s, lambda time_s: ego.pose_at(time_s)).covering(self._start_us, self._end_us)
         self._mounts = records.mounts(FIXED_M)
         self._paths = {
@@ -96,9 +100,18 @@ class _WrittenLog:
     def write(self, folder: Path, name: str) -> list[Path]:
         """The files, in the order in which they take their place."""
         interval = self._package.transformations.HalfClosedInterval.from_start_end(self._start_us, self._end_us)
-        writer = self._package.v4.SequenceComponentGroupsWriter(folder, name, self._scene.id, interval, self._about())
+        source = self._scene.source
+        origin: dict[str, Any] = {"version": version(), "dataset": source.dataset, "licence": source.licence}
+        origin["clock_zero_us"] = self._zero_us
+        writer = self._package.v4.SequenceComponentGroupsWriter(folder, name, self._scene.id, interval, {ABOUT: origin})
         self._poses(writer)
-        self._calibration(writer)
+        intrinsics = writer.register_component_writer(self._package.v4.IntrinsicsComponent.Writer, INSTANCE)
+        masks = writer.register_component_writer(self._package.v4.MasksComponent.Writer, INSTANCE)
+        for camera, recorded in self._scene.cameras.items():
+            intrinsics.store_camera_intrinsics(
+                self._ids[f"camera/{camera}"], camera_model(self._package.data, recorded)
+            )
+            masks.store_camera_masks(self._ids[f"camera/{camera}"], _masks(self._scene, self._frames[camera]))
         with log.task("export", len(self._scene.frames) + len(self._scene.sweeps)) as bar:
             for camera, frames in self._frames.items():
                 component = writer.register_component_writer(
@@ -136,14 +149,8 @@ class _WrittenLog:
     def _span(self, sweep: Sweep) -> tuple[int, int]:
         """First and last microsecond of a sweep; its own moment lies between."""
         at, dt_s = self._us(sweep.time_s), self._log.points(sweep).dt_s
-        return (at, at) if not len(dt_s) else (at + min(0, _rounded(dt_s.min())), at + max(0, _rounded(dt_s.max())))
-
-    def _interval(self) -> tuple[int, int]:
-        spans = [*self._spans.values(), *(self._shutter(frame) for frame in self._scene.frames)]
-        times = [time for span in spans for time in span] + [self._us(float(time)) for time in self._scene.ego.times_s]
-        if not times or min(times) < 0:
-            raise InputError("times of points reach more than a second before the log", where=self._scene.id)
-        return min(times), max(max(times), min(times) + 1)
+        first, last = (round(float(late_s) * MICRO) for late_s in (dt_s.min(initial=0), dt_s.max(initial=0)))
+        return at + first, at + last
 
     # -- poses
 
@@ -166,42 +173,36 @@ class _WrittenLog:
         for end, near in ((self._start_us, order[0]), (self._end_us, order[-1])):
             if end not in found:
                 there, here = self._rig.at(np.array([end, near]))
-                found[end] = there @ geometry.invert(here) @ found[near]
+                found[end] = there @ invert(here) @ found[near]
         order = sorted(found)
         return PoseKeys(np.array(order, np.int64), np.stack([found[at] for at in order]))
-
-    def _sensor_at(self, sensor: str, times_us: Times) -> Matrix:
-        """World-from-sensor f64[N, 4, 4]."""
-        path = self._paths.get(sensor)
-        return self._rig.at(times_us) @ self._mounts[sensor] if path is None else path.at(times_us)
 
     def _poses(self, writer: Any) -> None:
         component = writer.register_component_writer(self._package.v4.PosesComponent.Writer, INSTANCE)
         component.store_dynamic_pose(RIG, WORLD, self._rig.poses, self._rig.times_us.astype(np.uint64))
         for sensor, name in self._ids.items():
             if sensor in self._mounts:
-                component.store_static_pose(name, RIG, _exact(self._mounts[sensor]))
+                mount = self._mounts[sensor]  # its last row must be 0 0 0 1 to the last bit
+                component.store_static_pose(name, RIG, from_rotation_translation(mount[:3, :3], mount[:3, 3]))
             else:
                 path = self._paths[sensor]
                 component.store_dynamic_pose(name, WORLD, path.poses, path.times_us.astype(np.uint64))
 
     # -- sensors
 
-    def _calibration(self, writer: Any) -> None:
-        intrinsics = writer.register_component_writer(self._package.v4.IntrinsicsComponent.Writer, INSTANCE)
-        masks = writer.register_component_writer(self._package.v4.MasksComponent.Writer, INSTANCE)
-        for name, camera in self._scene.cameras.items():
-            intrinsics.store_camera_intrinsics(self._ids[f"camera/{name}"], camera_model(self._package.data, camera))
-            masks.store_camera_masks(self._ids[f"camera/{name}"], _masks(self._scene, self._frames[name]))
-
     def _sweep(self, component: Any, sweep: Sweep) -> None:
         """Store the rays of a sweep."""
         points, at = self._log.points(sweep), self._us(sweep.time_s)
         times = at + np.round(points.dt_s.astype(np.float64) * MICRO).astype(np.int64)
-        raw = self._as_measured(sweep, points.xyz, times, at)
+        raw = points.xyz.astype(np.float64)  # in the sensor's frame at their own times
+        moments, which = np.unique(times, return_inverse=True)
+        if (moments != at).any():
+            path, sensor = self._paths.get(name := f"lidar/{sweep.sensor}"), self._rig.at(moments)
+            sensor = sensor @ self._mounts[name] if path is None else path.at(moments)
+            moved = np.linalg.inv(sensor) @ sweep.world_from_lidar
+            raw = np.einsum("nij,nj->ni", moved[which, :3, :3], raw) + moved[which, :3, 3]
         distance = np.linalg.norm(raw, axis=1)
         ray = np.where(distance[:, None] > 0, raw / np.maximum(distance, 1e-12)[:, None], [1.0, 0.0, 0.0])
-        classes = {} if points.classes is None else {POINT_CLASSES: points.classes}
         component.store_frame(
             ray.astype(np.float32),
             times.astype(np.uint64),
@@ -209,31 +210,23 @@ class _WrittenLog:
             distance.astype(np.float32)[None],
             points.intensity.clip(0, 1)[None],
             _unsigned(self._spans[sweep.id]),
-            classes,
+            {},
             {SWEEP_TIME: at},
         )
-
-    def _as_measured(self, sweep: Sweep, xyz: NDArray[np.float32], times: Times, at: int) -> NDArray[np.float64]:
-        """Points f64[N, 3] in the sensor's frame at their own times."""
-        moments, which = np.unique(times, return_inverse=True)
-        if not len(moments) or (len(moments) == 1 and moments[0] == at):
-            return xyz.astype(np.float64)
-        poses = self._sensor_at(f"lidar/{sweep.sensor}", moments)
-        moved = np.linalg.inv(poses) @ sweep.world_from_lidar
-        return np.einsum("nij,nj->ni", moved[which, :3, :3], xyz.astype(np.float64)) + moved[which, :3, 3]
 
     # -- objects
 
     def _boxes(self, writer: Any) -> None:
         source = self._package.data.LabelSource
         kind = source.EXTERNAL if self._scene.source.recipe is None else source.GT_SYNTHETIC
-        found = [self._box(track, at, pose, kind) for track in self._scene.tracks for at, pose in self._keys_of(track)]
+        data, found = self._package.data, []
+        for track in self._scene.tracks:
+            length, width, height = track.size_m.tolist()
+            for at, pose in self._keys_of(track):
+                (x, y, z), angles = pose[:3, 3].tolist(), Rotation.from_matrix(pose[:3, :3]).as_euler(EULER).tolist()
+                box = data.BBox3((x, y, z), (length, width, height), tuple(angles))
+                found.append(data.CuboidTrackObservation(track.id, track.label, at, WORLD, at, box, kind))
         writer.register_component_writer(self._package.v4.CuboidsComponent.Writer, INSTANCE).store_observations(found)
-
-    def _box(self, track: Track, at: int, pose: Matrix, source: Any) -> Any:
-        data, (x, y, z), size = self._package.data, pose[:3, 3].tolist(), track.size_m.tolist()
-        box = data.BBox3((x, y, z), (size[0], size[1], size[2]), euler_of(pose[:3, :3]))
-        return data.CuboidTrackObservation(track.id, track.label, at, WORLD, at, box, source)
 
     def _keys_of(self, track: Track) -> Iterator[tuple[int, Matrix]]:
         """Poses of an object at its keys within the recording, at its ends where it reaches beyond, and where keys lie
@@ -250,17 +243,6 @@ class _WrittenLog:
         times = sorted(set(times))
         poses = own.at(np.array(times)) if len(own.times_us) > 1 else own.poses
         yield from zip(times, poses, strict=True)
-
-    def _about(self) -> dict[str, Any]:
-        source = self._scene.source
-        return {
-            ABOUT: {
-                "version": version(),
-                "dataset": source.dataset,
-                "licence": source.licence,
-                "clock_zero_us": self._zero_us,
-            }
-        }
 
 
 def sensor_ids(cameras: Iterable[str], lidars: Iterable[str]) -> dict[str, str]:
@@ -312,15 +294,6 @@ def _in_order(records: list[Any], span: Any, sensor: str) -> list[Any]:
         got, remedy = f"{spans[at].tolist()} and {spans[at + 1].tolist()} us", f"leave sensor {sensor} out of the scene"
         raise InputError(what, where=ordered[at + 1].id, expected=expected, got=got, remedy=remedy)
     return ordered
-
-
-def _exact(pose: Matrix) -> Matrix:
-    """A pose whose last row is 0 0 0 1 to the last bit."""
-    return geometry.from_rotation_translation(pose[:3, :3], pose[:3, 3])
-
-
-def _rounded(seconds: Any) -> int:
-    return round(float(seconds) * MICRO)
 
 
 def _unsigned(span: tuple[int, int]) -> NDArray[np.uint64]:

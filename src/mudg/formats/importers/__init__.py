@@ -26,7 +26,7 @@ Recogniser = Callable[[Path], bool]
 
 _MODULES = {
     "kitti360": "kitti360",
-    "waymo": "waymo.importer",
+    "waymo": "waymo",
     "nuscenes": "nuscenes",
     "argoverse2": "argoverse2",
     "pandaset": "pandaset",

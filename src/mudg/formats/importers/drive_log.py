@@ -456,9 +456,6 @@ _ROW: Final = 17  # time, delay, size, pose
 _MIN_STEP_S: Final = 0.05
 _SAME_TIME_S: Final = 1e-4
 _NAMED: Final = 5
-Speeds = Callable[[NDArray[np.float64], Matrix, Sequence[NDArray[np.intp]]], Matrix]
-"""Times f64[n] at which an object was measured, its places f64[n, 3], the pieces of its track (indices) -> velocities
-f64[n, 3] m/s."""
 
 
 def box_size(length: Any, width: Any, height: Any, where: str) -> tuple[float, float, float]:
@@ -529,7 +526,7 @@ class BoxTracks:
         self._rows.setdefault(track, array("d")).extend(row)
 
     def tracks(
-        self, speeds: Speeds | None = None, images_s: Mapping[float, tuple[float, float]] | None = None
+        self, images_s: Mapping[float, tuple[float, float]] | None = None
     ) -> tuple[list[Track], list[str]]:
         """All tracks in the order of their first boxes, and notes.
 
@@ -537,7 +534,6 @@ class BoxTracks:
         its last moment. What may move is split where it is not seen for more than ``max_gap_s``: ``7``, ``7.1``, ...
 
         Args:
-            speeds: how velocities are found; None = from the neighbouring boxes of a piece.
             images_s: time of a box -> times of the first and last image that show the object, which a track reaches to.
 
         Raises:
@@ -573,7 +569,7 @@ class BoxTracks:
                 continue
             pieces = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(times) > self._max_gap_s) + 1)
             split += len(pieces) > 1
-            velocity = (speeds or neighbour_speeds)(times + rows[:, 1], poses[:, :3, 3], pieces)
+            velocity = _speeds(times + rows[:, 1], poses[:, :3, 3], pieces)
             poses[:, :3, 3] -= velocity * rows[:, 1:2]
             for part, piece in enumerate(pieces):
                 keys = times[piece], poses[piece]
@@ -612,7 +608,7 @@ def turned_back(tracks: Sequence[Track]) -> tuple[list[Track], list[str]]:
     return mended, [f"headings that flip by 180 degrees were turned back: {some}"] if names else []
 
 
-def neighbour_speeds(measured_s: NDArray[np.float64], places: Matrix, pieces: Sequence[NDArray[np.intp]]) -> Matrix:
+def _speeds(measured_s: NDArray[np.float64], places: Matrix, pieces: Sequence[NDArray[np.intp]]) -> Matrix:
     """Velocities of an object's boxes, f64[n, 3]: from the neighbours on both sides within each of the ``pieces`` of
     its track, or from the one there is."""
     velocity = np.zeros_like(places)

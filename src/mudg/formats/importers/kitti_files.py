@@ -464,16 +464,7 @@ def build_tracks(
             pose = velo_at(time_s + late_s)
         label, here = collected.label_of(box.label), f"{where}: track {name}, frame {box.frame}"
         collected.add(name, label, time_s, box.size_m, pose @ box.sensor_from_box, late_s=late_s, where=here)
-    found, notes = collected.tracks(_speeds)
+    found, notes = collected.tracks()
     if outside:
         notes.insert(0, f"{outside} boxes lie in frames that were not imported and were left out")
     return sorted(found, key=lambda track: [int(part) for part in track.id.split(".")]), notes
-
-
-def _speeds(measured_s: NDArray[np.float64], places: Matrix, pieces: Sequence[NDArray[np.intp]]) -> Matrix:
-    """Velocities f64[n, 3] by second-order differences within each piece of a track; 0 where it is one box."""
-    velocity = np.zeros_like(places)
-    for piece in pieces:
-        if len(piece) > 1:
-            velocity[piece] = np.gradient(places[piece], measured_s[piece], axis=0)
-    return velocity

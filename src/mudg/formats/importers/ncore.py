@@ -21,15 +21,15 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, TypeVar, get_args
+from typing import Any, Final, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from mudg.base import log, memory, store
 from mudg.base.errors import InputError, MudgError
 from mudg.base.geometry import all_rigid, from_rotation_translation
-from mudg.base.palette import CLASSES, UNLABELLED
 from mudg.base.types import Camera, EgoPath, Scene, Shutter, Source, SweepPoints, Track
 from mudg.formats.importers import common
 from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
@@ -38,22 +38,19 @@ from mudg.formats.importers.images import Lens
 from mudg.formats.ncore import (
     ABOUT,
     EGO_MASK,
+    EULER,
     INSTANCE,
     MARK,
     MICRO,
-    POINT_CLASSES,
     RIG,
     SWEEP_TIME,
     WORLD,
     Matrix,
-    PoseKeys,
     Times,
     close,
     package,
-    rotation_of,
 )
 from mudg.formats.unknown_fields import known, note_unknown, note_unknown_within
-from mudg.scene import motion
 
 # container ----------------------------------------------------------------------------------------
 #
@@ -137,31 +134,34 @@ def check_store(path: Path) -> None:
     Raises:
         InputError: so it is; nothing of the size that was promised has been allocated.
     """
-    members = _members_of_folder(path) if path.is_dir() else _members_of_tar(path)
+    if path.is_dir():
+        files = [store.regular(file) for file in sorted(path.rglob("*")) if not file.is_dir()]
+        members = {file.relative_to(path).as_posix(): _StoredMember(file, 0, file.stat().st_size) for file in files}
+    else:
+        members = _members_of_tar(path)
+    chunks: dict[str, dict[str, _StoredMember]] = {}
+    for name, member in members.items():
+        folder, _, last = name.rpartition("/")
+        if not last.startswith("."):
+            chunks.setdefault(folder, {})[last] = member
     where = f"{path}: {METADATA}"
     if METADATA not in members:
         what, expected = "NCore store has no metadata", "a store that was finished"
         raise InputError(what, where=where, expected=expected, remedy="was the program that wrote it stopped?")
     with common.record_fields("NCore metadata make no sense", where, "groups and arrays of zarr 2"):
         metadata = _cbor(_unpacked(members[METADATA].read(), where), where)["metadata"]
-        chunks = _chunk_sizes(members)
         groups = dict.fromkeys(name.partition("/")[0] for name in metadata if "/" in name)
         note_unknown("the stores of the recording", groups, COMPONENTS)
         for name, about in metadata.items():
             if name.endswith(".zarray"):
-                place = name.removesuffix(".zarray")
-                _check_array(about, chunks.get(place, {}), f"{path}: {place.rstrip('/')}")
+                place = name.removesuffix(".zarray").rstrip("/")
+                _check_array(about, chunks.get(place, {}), f"{path}: {place}")
             for pattern, (kind, fields) in _FIELDS.items():
                 if fnmatchcase(name, pattern):
                     note_unknown_within(f"{kind} of the recording", about, fields)
 
 
 # --- containers -----------------------------------------------------------------------------------
-
-
-def _members_of_folder(path: Path) -> dict[str, _StoredMember]:
-    files = [store.regular(file) for file in sorted(path.rglob("*")) if not file.is_dir()]
-    return {file.relative_to(path).as_posix(): _StoredMember(file, 0, file.stat().st_size) for file in files}
 
 
 def _members_of_tar(path: Path) -> dict[str, _StoredMember]:
@@ -232,16 +232,6 @@ def _cbor(content: bytes, where: str) -> Any:
 # --- arrays ---------------------------------------------------------------------------------------
 
 
-def _chunk_sizes(members: Mapping[str, _StoredMember]) -> dict[str, dict[str, _StoredMember]]:
-    """Array (with a slash at the end) -> its chunks by their names."""
-    found: dict[str, dict[str, _StoredMember]] = {}
-    for name, member in members.items():
-        folder, slash, last = name.rpartition("/")
-        if not last.startswith("."):
-            found.setdefault(folder + slash, {})[last] = member
-    return found
-
-
 def _check_array(about: Mapping[str, Any], chunks: Mapping[str, _StoredMember], where: str) -> None:
     """Refuse an array that its chunks cannot fill, that is not of plain numbers or bytes, or that is packed in another
     way."""
@@ -296,9 +286,8 @@ def _blosc_size(chunk: _StoredMember, where: str) -> int:
 
 
 # importer -----------------------------------------------------------------------------------------
-Record = TypeVar("Record", ImageRecord, SweepRecord)
-_WITH_FRAMES: Final = frozenset({SWEEP_TIME, POINT_CLASSES})
-"""What this program stores with a frame."""
+_WITH_FRAMES: Final = frozenset({SWEEP_TIME, "train_ids"})
+"""What this program stores, or did, with a frame."""
 _LIST: Final = known(
     "sequence_id sequence_timestamp_interval_us generic_meta_data version",
     component_stores=known("path md5 components"),
@@ -314,7 +303,6 @@ LABELS: Final[Mapping[str, str]] = name_table(
 """Classes of NVIDIA's recordings and of this program -> labels."""
 _EXACT: Final = 1e-7
 """Errors of rotations that are left as they are."""
-_MANY: Final = 1000
 _LOOKED_AT: Final = 1 << 20
 _MOST_SPAN_US: Final = 4 * 3600 * MICRO
 _MOST_EXPOSURE_US: Final = MICRO
@@ -338,8 +326,7 @@ def import_ncore(source: Path, out: Path, options: ImportOptions) -> Scene:
     stores = _choose(source, options)
     for path in stores:
         check_store(path)
-    where = str(stores[0].parent)
-    with _opened(stores, where) as recording:
+    with _opened(stores, str(stores[0].parent)) as recording:
         return write_log(_drive(recording, options), out, options)
 
 
@@ -349,15 +336,13 @@ def import_ncore(source: Path, out: Path, options: ImportOptions) -> Scene:
 def _recordings(source: Path) -> dict[str, list[Path]]:
     """Name of a recording -> its stores."""
     if source.suffix == ".json" and source.is_file():
-        return {_name(source): _listed(source)} if _is_list(source) else {}
-    if _is_store(source):
-        name = _name(source)
-        return {name: [path for path in sorted(source.parent.iterdir()) if _is_store(path) and _name(path) == name]}
-    found: dict[str, list[Path]] = {}
-    if source.is_dir():
-        for path in sorted(source.iterdir()):
-            if _is_store(path):
-                found.setdefault(_name(path), []).append(path)
+        with store.open_file(source) as handle:
+            listed = b'"component_stores"' in handle.read(_LOOKED_AT)
+        return {_name(source): _listed(source)} if listed else {}
+    folder, found = source.parent if _is_store(source) else source, dict[str, list[Path]]()
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if _is_store(path) and (folder == source or _name(path) == _name(source)):
+            found.setdefault(_name(path), []).append(path)
     return found
 
 
@@ -369,11 +354,6 @@ def _is_store(path: Path) -> bool:
     if MARK not in path.name:
         return False
     return (path.name.endswith(".zarr.itar") and path.is_file()) or (path.name.endswith(".zarr") and path.is_dir())
-
-
-def _is_list(path: Path) -> bool:
-    with store.open_file(path) as handle:
-        return b'"component_stores"' in handle.read(_LOOKED_AT)
 
 
 def _listed(path: Path) -> list[Path]:
@@ -402,8 +382,8 @@ def _choose(source: Path, options: ImportOptions) -> tuple[Path, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _OpenRecording:
-    """An open recording: the package's readers, and its tree of frames. ``knots_us``: i64[K], times of all keys of
-    poses. where: its folder. file: a file of it."""
+    """An open recording: the package's readers, and its tree of frames. ``where``: its folder. ``file``: one of its
+    files."""
 
     reader: Any
     poses: Any
@@ -413,29 +393,23 @@ class _OpenRecording:
     cameras: Mapping[str, Any]
     lidars: Mapping[str, Any]
     graph: Any
-    knots_us: Times
     where: str
     file: Path
 
     def world_from(self, frame: str, times_us: Times, where: str) -> Matrix:
         """Poses f64[N, 4, 4] of a frame in the world; recordings may hold them in single precision."""
-        if frame == WORLD:
+        if frame == WORLD or not len(times_us):
             return np.tile(np.eye(4), (len(times_us), 1, 1))
         with foreign_reader(f"{where}: pose of {frame}"):
             found = np.asarray(self.graph.evaluate_poses(frame, WORLD, times_us), np.float64)
-        if all_rigid(found, _EXACT):
-            return found
-        return np.stack([common.rigid_pose(pose, f"{where}: pose of {frame}") for pose in found])
+        return _rigid(found, _EXACT, f"{where}: pose of {frame}")
 
-    def at_points(self, frame: str, times_us: Times, where: str) -> Matrix:
-        """As ``world_from`` at the many times of points: exact at every key and every millisecond, and between those as
-        between keys."""
-        if len(times_us) < _MANY:
-            return self.world_from(frame, times_us, where) if len(times_us) else np.empty((0, 4, 4))
-        first, last = int(times_us[0]), int(times_us[-1])
-        knots = self.knots_us[(self.knots_us > first) & (self.knots_us < last)]
-        keys = np.unique(np.concatenate([np.arange(first, last, MICRO // 1000), knots, [last]]))
-        return PoseKeys(keys, self.world_from(frame, keys, where)).at(times_us)
+
+def _rigid(poses: Matrix, tolerance: float, where: str) -> Matrix:
+    """Poses f64[N, 4, 4], cleaned of rounding beyond the tolerance. The package would make rotations of any others."""
+    if poses.ndim == 3 and all_rigid(poses, tolerance):
+        return poses
+    return np.stack([common.rigid_pose(pose, f"{where}: key {index}") for index, pose in enumerate(poses)])
 
 
 @contextmanager
@@ -451,37 +425,28 @@ def _opened(stores: tuple[Path, ...], where: str) -> Iterator[_OpenRecording]:
             }
             poses = _single(of["Poses"], "poses", where)
             fixed, moving = list(poses.get_static_poses()), list(poses.get_dynamic_poses())
-        for (source, target), found in (
-            *((pair, pose[None]) for pair, pose in fixed),
-            *((pair, keys[0]) for pair, keys in moving),
-        ):
-            _refuse_bent(np.asarray(found, np.float64), f"{where}: pose of {source} in {target}")
+        for (source, target), found in (*((pair, pose[None]) for pair, pose in fixed), *((p, k[0]) for p, k in moving)):
+            _rigid(np.asarray(found, np.float64), common.POSE_TOLERANCE, f"{where}: pose of {source} in {target}")
         with foreign_reader(where):
             edge = package().transformations.PoseGraphInterpolator.Edge
             edges = [edge(source, target, pose, None) for (source, target), pose in fixed]
             edges += [edge(source, target, *keys) for (source, target), keys in moving]
-            knots = np.unique(
-                np.concatenate([times.astype(np.int64) for _, (_, times) in moving] or [np.empty(0, np.int64)])
-            )
             graph = package().transformations.PoseGraphInterpolator(edges)
         file = stores[0] if stores[0].is_file() else stores[0] / METADATA
-        intrinsics = _single(of["Intrinsics"], "intrinsics", where)
-        masks, cuboids, cameras, lidars = (
-            _perhaps(of["Masks"]),
-            _perhaps(of["Cuboids"]),
-            of["CameraSensor"],
-            of["LidarSensor"],
+        yield _OpenRecording(
+            reader=reader,
+            poses=poses,
+            intrinsics=_single(of["Intrinsics"], "intrinsics", where),
+            masks=_perhaps(of["Masks"]),
+            cuboids=_perhaps(of["Cuboids"]),
+            cameras=of["CameraSensor"],
+            lidars=of["LidarSensor"],
+            graph=graph,
+            where=where,
+            file=file,
         )
-        yield _OpenRecording(reader, poses, intrinsics, masks, cuboids, cameras, lidars, graph, knots, where, file)
     finally:
         close(reader)
-
-
-def _refuse_bent(poses: Matrix, where: str) -> None:
-    """Refuse poses that are no rigid motions; the package would make rotations of them."""
-    if poses.ndim != 3 or not all_rigid(poses, common.POSE_TOLERANCE):
-        for index, pose in enumerate(poses):
-            common.rigid_pose(pose, f"{where}: key {index}")
 
 
 def _perhaps(found: Mapping[str, Any]) -> Any:
@@ -513,9 +478,10 @@ def _drive(recording: _OpenRecording, options: ImportOptions) -> DriveLog:
     lidars = _scene_names(turns, set(names.values()))
     sweeps = [one for lidar, found in turns.items() for one in _sweeps(recording, lidar, lidars[lidar], found, zero_us)]
     ego = _ego(recording, zero_us, np.concatenate([found.reshape(-1) for found in (*spans.values(), *turns.values())]))
-    images, sweeps = _outside_gaps(images, ego, options), _outside_gaps(sweeps, ego, options)
     tracks, track_notes = _tracks(recording, zero_us)
-    about = _about(recording)
+    noted = recording.reader.generic_meta_data.get(ABOUT)  # of this program, when it wrote the recording
+    noted = noted if isinstance(noted, dict) else {}
+    about = {key: value for key, value in noted.items() if isinstance(value, str)}
     notes += [*([] if sweeps else ["no LiDAR sweeps in the recording"]), *track_notes]
     source = Source(about.get("dataset", "ncore"), about.get("licence", UNKNOWN_LICENCE), None, tuple(notes))
     cameras, name = {name: one.recorded for name, one in optics.items()}, str(recording.reader.sequence_id)
@@ -533,12 +499,6 @@ def _scene_names(sensors: Iterable[str], taken: Collection[str] = ()) -> dict[st
             chosen = f"{plain}_{count}"
         names[sensor] = chosen
     return names
-
-
-def _about(recording: _OpenRecording) -> dict[str, str]:
-    """What this program noted when it wrote the recording."""
-    noted = recording.reader.generic_meta_data.get(ABOUT)
-    return {key: value for key, value in noted.items() if isinstance(value, str)} if isinstance(noted, dict) else {}
 
 
 def _spans(reader: Any, where: str) -> Times:
@@ -640,20 +600,18 @@ def _picture(reader: Any, frame: int, where: str) -> bytes:
 
 def _sweeps(recording: _OpenRecording, lidar: str, name: str, spans: Times, zero_us: int) -> list[SweepRecord]:
     reader, where = recording.lidars[lidar], f"{recording.where}: LiDAR {lidar}"
-    at = np.array([_moment(reader, *span, f"{where}: frame {span[1]}") for span in spans.tolist()], np.int64)
+    at = spans.sum(1) // 2
+    for index, (begin, end) in enumerate(spans.tolist()):
+        with foreign_reader(f"{where}: frame {end}"):
+            noted = reader.get_frame_generic_meta_data(end).get(SWEEP_TIME)
+        if isinstance(noted, int) and begin <= noted <= end:
+            at[index] = noted
     poses, records = recording.world_from(lidar, at, where), []
     for end, moment, pose in zip(spans[:, 1].tolist(), at.tolist(), poses, strict=True):
         place = f"{where}: frame {end}"
         read = partial(_points, recording, lidar, end, moment, pose, place)
         records.append(SweepRecord(name, (moment - zero_us) / MICRO, pose, recording.file, read, place))
     return records
-
-
-def _moment(reader: Any, begin: int, end: int, where: str) -> int:
-    """The moment of a sweep: what is noted with it, else the middle."""
-    with foreign_reader(where):
-        noted = reader.get_frame_generic_meta_data(end).get(SWEEP_TIME)
-    return noted if isinstance(noted, int) and begin <= noted <= end else (begin + end) // 2
 
 
 def _points(
@@ -670,7 +628,6 @@ def _points(
         )
         begin, end = (int(time) for time in reader.get_frame_timestamps_us(frame))
         _note_frame(reader, frame, "LiDAR")
-        classes = _classes(reader, frame, len(ray))
     pairs = ray.shape == (len(times), 3) and distance.ndim == 2 and distance.shape[1] == len(ray)
     if not pairs or intensity.shape != distance.shape:
         what = "rays and returns of a sweep do not pair up"
@@ -688,26 +645,16 @@ def _points(
     if not ((seen >= 0) & (seen <= 1)).all():
         raise InputError("intensity is not in 0 to 1", where=where, got=f"{np.nanmin(seen):g} to {np.nanmax(seen):g}")
     moments, index = np.unique(times, return_inverse=True)
-    moved = np.linalg.inv(world_from_lidar) @ recording.at_points(lidar, moments, where)
+    moved = np.linalg.inv(world_from_lidar) @ recording.world_from(lidar, moments, where)
     xyz = np.einsum("nij,nj->ni", moved[index, :3, :3], xyz) + moved[index, :3, 3]
     dt_s = ((times - at) / MICRO).astype(np.float32)
-    given, no_returns = None if classes is None else classes[which], int((distance == 0).sum())
-    return SweepPoints(xyz.astype(np.float32), seen, dt_s, given, no_returns)
+    return SweepPoints(xyz.astype(np.float32), seen, dt_s, no_returns=int((distance == 0).sum()))
 
 
 def _note_frame(reader: Any, frame: int, sensor: str) -> None:
     """Note what else is stored with a frame."""
     names = [*reader.get_frame_generic_data_names(frame), *reader.get_frame_generic_meta_data(frame)]
     note_unknown(f"the {sensor} frames of the recording", names, _WITH_FRAMES)
-
-
-def _classes(reader: Any, frame: int, count: int) -> NDArray[np.uint8] | None:
-    """Classes of the rays, where this program wrote them."""
-    if not reader.has_frame_generic_data(frame, POINT_CLASSES):
-        return None
-    classes = np.asarray(reader.get_frame_generic_data(frame, POINT_CLASSES))
-    fits = classes.dtype == np.uint8 and classes.shape == (count,)
-    return classes if fits and ((classes < len(CLASSES)) | (classes == UNLABELLED)).all() else None
 
 
 # --- vehicle and objects --------------------------------------------------------------------------
@@ -723,22 +670,6 @@ def _ego(recording: _OpenRecording, zero_us: int, moments: Times) -> EgoPath:
     times = np.concatenate(keys) if keys else np.unique(moments)
     poses = recording.world_from(RIG, times, where)
     return common.ego_path([(int(at) - zero_us) / MICRO for at in times], list(poses))
-
-
-def _outside_gaps(records: list[Record], ego: EgoPath, options: ImportOptions) -> list[Record]:
-    """The records whose poses are none that the package guessed on a straight line through a gap of the path's keys."""
-    there = []
-    for record in records:
-        gap = motion.gap_at(ego, record.time_s)
-        if gap is None:
-            there.append(record)
-        elif not options.skip_missing:
-            what, where, got = "vehicle poses have a gap here", record.place, f"at {record.time_s:.3f} s: {gap}"
-            remedy = "leave such frames out with --skip-missing"
-            raise InputError(what, where=where, got=got, expected="poses around every image and scan", remedy=remedy)
-    if len(there) < len(records):
-        log.warn(f"ncore: left out {len(records) - len(there)} records in gaps of the vehicle's poses")
-    return there
 
 
 def _tracks(recording: _OpenRecording, zero_us: int) -> tuple[list[Track], list[str]]:
@@ -757,14 +688,9 @@ def _tracks(recording: _OpenRecording, zero_us: int) -> tuple[list[Track], list[
         moments, index = np.unique(times, return_inverse=True)
         poses = recording.world_from(frame, moments, where)
         for box, which in zip(boxes, index, strict=True):
-            _add(tracks, box, poses[which], zero_us, f"{where}: object {box.track_id} at {box.timestamp_us} us")
+            here = f"{where}: object {box.track_id} at {box.timestamp_us} us"
+            turn = Rotation.from_euler(EULER, box.bbox3.rot).as_matrix() if np.isfinite(box.bbox3.rot).all() else np.nan
+            local = common.rigid_pose(from_rotation_translation(turn, box.bbox3.centroid), here)
+            label, time_s = tracks.label_of(box.class_id), (box.timestamp_us - zero_us) / MICRO
+            tracks.add(box.track_id, label, time_s, box.bbox3.dim, poses[which] @ local, where=here)
     return tracks.tracks()
-
-
-def _add(tracks: BoxTracks, box: Any, world_from_frame: Matrix, zero_us: int, where: str) -> None:
-    values = np.array([*box.bbox3.centroid, *box.bbox3.rot], np.float64)
-    if not np.isfinite(values).all():
-        raise InputError("box is not finite", where=where, got=str(values.tolist())[:120])
-    pose = world_from_frame @ from_rotation_translation(rotation_of(box.bbox3.rot), values[:3])
-    label, time_s = tracks.label_of(box.class_id), (box.timestamp_us - zero_us) / MICRO
-    tracks.add(box.track_id, label, time_s, box.bbox3.dim, pose, where=where)

@@ -8,21 +8,18 @@
 
 ``sensor_blobs`` is looked for beside the database and up to four folders above it.
 
-Frames. World: z up, origin and x axis at the vehicle of the first imported cloud (the log's own world lies thousands of
-kilometres from its origin). Frame numbers (``--frames``) count the clouds of the log or scene. A moment is an image
-time of the cameras; all clouds in between are taken.
-
-Clouds are motion-compensated in the source; ``dt_s`` is 0. Image times are the start of a read-out of about 1/30 s; the
-middle row, and with it the pose, belongs 1/60 s later. Boxes come from an offline tracker, at every cloud.
+Frames count images of the first chosen camera. Clouds are motion-compensated in the source; ``dt_s`` is 0. Image times
+are the start of a read-out of about 1/30 s; the middle row, and with it the pose, belongs 1/60 s later. Boxes come from
+an offline tracker, at every cloud.
 """
 
 from __future__ import annotations
 
-import itertools
 import sqlite3
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
@@ -30,19 +27,45 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import store
+from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, yaw_matrix
 from mudg.base.plain_pickle import NUMPY_MAKERS, Maker, as_list, read_pickle
-from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, foreign_name
+from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, foreign_name
 from mudg.formats.importers import common
 from mudg.formats.importers.clouds import read_cloud
 from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
-from mudg.formats.importers.drive_log import BoxTracks, SceneContent, SceneImage, SceneSweep, write_scene
-from mudg.formats.importers.images import ImageFit, brown_conrady, fit_images, image_notes
+from mudg.formats.importers.drive_log import (
+    BoxTracks,
+    CameraOptics,
+    DriveLog,
+    ImageRecord,
+    SweepRecord,
+    Tracks,
+    write_log,
+)
+from mudg.formats.importers.images import brown_conrady
 from mudg.formats.unknown_fields import note_unknown
 from mudg.scene.clouds import near_places
 from mudg.scene.schema import ref_problem
+
+Matrix = NDArray[np.float64]
+LICENCE: Final = "CC BY-NC-SA 4.0 with the nuPlan dataset licence (Motional; attribution, non-commercial, share-alike)"
+CAMERAS: Final = name_table(
+    """front: CAM_F0; front_left: CAM_L0; front_right: CAM_R0; side_left: CAM_L1; side_right: CAM_R1;
+    back_left: CAM_L2; back_right: CAM_R2; back: CAM_B0"""
+)
+SENSOR: Final = "merged"
+LABELS: Final = name_table(
+    """vehicle: vehicle; bicycle: bicycle; pedestrian: pedestrian; traffic_cone: traffic_cone;
+    barrier: barrier; sign: czone_sign; generic_object: generic_object"""
+)
+IMAGE_DELAY_US: Final = 16_667
+"""From an image's time stamp to the middle of its read-out. The data set's schema does not tell; reconstructions of it
+found this."""
+_MARGIN_US: Final = 100_000
+_REACH_US: Final = 60_000
+_SQLITE: Final = b"SQLite format 3\0"
 
 # database -----------------------------------------------------------------------------------------
 #
@@ -91,28 +114,6 @@ _MAKERS: Final[Mapping[str, Maker | None]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class NuplanCamera:
-    """One camera: place on the vehicle f64[4, 4], fx fy cx cy, lens k1 k2 p1 p2 k3, width and height."""
-
-    channel: str
-    ego_from_cam: Matrix
-    intrinsics: tuple[float, float, float, float]
-    distortion: tuple[float, ...]
-    size: tuple[int, int]
-
-
-@dataclass(frozen=True, slots=True)
-class NuplanCloud:
-    """One point cloud, posed f64[4, 4] in the log's world; ``places``: of the LiDARs in the cloud's frame, f64[3]."""
-
-    token: bytes
-    file: Path
-    time_us: int
-    world_from_lidar: Matrix
-    places: tuple[Matrix, ...]
-
-
 class NuplanLog:
     """An open log. Make one with ``open_log``."""
 
@@ -155,8 +156,8 @@ class NuplanLog:
             return name
         raise InputError("log has no name", where=f"{self.path}: log.logfile")
 
-    def cameras(self) -> dict[bytes, NuplanCamera]:
-        """Token -> camera."""
+    def cameras(self) -> dict[bytes, tuple[str, Camera, Matrix]]:
+        """Token -> channel, camera as recorded, and place on the vehicle f64[4, 4]."""
         found = {}
         for token, channel, *values in self.rows(
             "SELECT token, channel, translation, rotation, intrinsic, distortion, width, height FROM camera"
@@ -169,46 +170,35 @@ class NuplanLog:
                 what, where, got = "intrinsics are not of a pinhole camera", f"{where}.intrinsic", str(matrix.tolist())
                 raise InputError(what, where=where, got=got, expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels")
             size = _whole(values[4], f"{where}.width"), _whole(values[5], f"{where}.height")
-            intrinsics = tuple(matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist())
-            pose, lens = self._pose(*values[:2], where), tuple(self._numbers(values[3], f"{where}.distortion", None))
-            found[token_of(token, f"{where}.token")] = NuplanCamera(channel, pose, intrinsics, lens, size)
+            lens = () if values[3] is None else tuple(self._numbers(values[3], f"{where}.distortion", 5))
+            (fx, fy), (cx, cy) = np.diag(matrix)[:2].tolist(), matrix[:2, 2].tolist()
+            # the calibration counts pixels from the centre of the top-left one, as OpenCV does
+            camera = Camera(CAMERAS.get(channel, channel), *size, fx, fy, cx + 0.5, cy + 0.5, lens)
+            found[token_of(token, f"{where}.token")] = channel, camera, self._pose(values[0], values[1], where)
         return found
 
     def lidars(self) -> dict[bytes, Matrix]:
         """Token -> place on the vehicle f64[4, 4]."""
         found = {}
-        for token, channel, *place in self.rows("SELECT token, channel, translation, rotation FROM lidar"):
+        for token, channel, place, turn in self.rows("SELECT token, channel, translation, rotation FROM lidar"):
             where = f"{self.path}: lidar {text_of(channel, f'{self.path}: lidar.channel')}"
-            found[token_of(token, f"{where}.token")] = self._pose(*place, where)
+            found[token_of(token, f"{where}.token")] = self._pose(place, turn, where)
         return found
 
-    def clouds(self, scene: str) -> Iterator[tuple[bytes, int]]:
-        """Token and time (us) of the point clouds in order of time, of one scene or (empty name) of all."""
-        return (
-            (token_of(token, f"{self.path}: lidar_pc.token"), self._time(time_us, "lidar_pc"))
-            for token, time_us in self.rows(
-                "SELECT p.token, p.timestamp FROM lidar_pc AS p LEFT JOIN scene AS s ON s.token = p.scene_token "
-                "WHERE ? = '' OR s.name = ? ORDER BY p.timestamp",
-                (scene, scene),
-            )
-        )
-
-    def cloud(self, token: bytes, ego_from_lidar: Mapping[bytes, Matrix], blobs: Path) -> NuplanCloud | None:
-        """One point cloud with its pose; its file lies below ``blobs``. None if the vehicle has no pose then."""
-        for lidar, file, time_us, *pose in self.rows(
-            "SELECT p.lidar_token, p.filename, p.timestamp, e.x, e.y, e.z, e.qw, e.qx, e.qy, e.qz "
-            "FROM lidar_pc AS p JOIN ego_pose AS e ON e.token = p.ego_pose_token WHERE p.token = ?",
-            (token,),
+    def clouds(self, scene: str, blobs: Path) -> Iterator[tuple[bytes, int, bytes, Path, Matrix | None]]:
+        """Token, time (us), LiDAR's token, file below ``blobs`` and vehicle pose (None if it is missing) of the point
+        clouds in order of time, of one scene or (empty name) of all."""
+        for token, time_us, lidar, file, pose_token, *pose in self.rows(
+            "SELECT p.token, p.timestamp, p.lidar_token, p.filename, e.token, e.x, e.y, e.z, e.qw, e.qx, e.qy, e.qz "
+            "FROM lidar_pc AS p LEFT JOIN ego_pose AS e ON e.token = p.ego_pose_token "
+            "LEFT JOIN scene AS s ON s.token = p.scene_token WHERE ? = '' OR s.name = ? ORDER BY p.timestamp",
+            (scene, scene),
         ):
+            token = token_of(token, f"{self.path}: lidar_pc.token")
             where = f"{self.path}: lidar_pc {token.hex()}"
-            lidar = token_of(lidar, f"{where}.lidar_token")
-            if lidar not in ego_from_lidar:
-                raise InputError("point cloud is of a LiDAR that is not there", where=where, got=lidar.hex())
-            mount = ego_from_lidar[lidar]
-            places = tuple((invert(mount) @ other)[:3, 3] for other in ego_from_lidar.values())
-            path, time_us = common.path_inside(blobs, file, where), self._time(time_us, "lidar_pc")
-            return NuplanCloud(token, path, time_us, self._ego(pose, where) @ mount, places)
-        return None
+            path, lidar = common.path_inside(blobs, file, where), token_of(lidar, f"{where}.lidar_token")
+            found = None if pose_token is None else self._ego(pose, where)
+            yield token, self._time(time_us, "lidar_pc"), lidar, path, found
 
     def ego_poses(self, first_us: int, last_us: int) -> tuple[NDArray[np.int64], Matrix]:
         """Times (us) and poses f64[n, 4, 4] of the vehicle from ``first_us`` to ``last_us``; doubled times once."""
@@ -338,24 +328,6 @@ def open_log(path: Path) -> Iterator[NuplanLog]:
 
 
 # importer -----------------------------------------------------------------------------------------
-Matrix = NDArray[np.float64]
-LICENCE: Final = "CC BY-NC-SA 4.0 with the nuPlan dataset licence (Motional; attribution, non-commercial, share-alike)"
-CAMERAS: Final = name_table(
-    """front: CAM_F0; front_left: CAM_L0; front_right: CAM_R0; side_left: CAM_L1; side_right: CAM_R1;
-    back_left: CAM_L2; back_right: CAM_R2; back: CAM_B0"""
-)
-SENSOR: Final = "merged"
-LABELS: Final = name_table(
-    """vehicle: vehicle; bicycle: bicycle; pedestrian: pedestrian; traffic_cone: traffic_cone;
-    barrier: barrier; sign: czone_sign; generic_object: generic_object"""
-)
-IMAGE_DELAY_US: Final = 16_667
-"""From an image's time stamp to the middle of its read-out. The data set's schema does not tell; reconstructions of it
-found this."""
-_MARGIN_US: Final = 100_000
-_REACH_US: Final = 60_000
-_PERIOD_US: Final = 100_000
-_SQLITE: Final = b"SQLite format 3\0"
 
 
 def looks_like_nuplan(source: Path) -> bool:
@@ -383,7 +355,7 @@ def import_nuplan(source: Path, out: Path, options: ImportOptions) -> Scene:
     common.refuse_options(options, "nuPlan", "poses", "boxes", "untwist")
     path, scene = _find(source, options)
     with open_log(path) as opened:
-        return write_scene(_content(opened, _plan(opened, scene, options), options), out, options)
+        return write_log(_drive(opened, scene, options), out, options)
 
 
 def _find(source: Path, options: ImportOptions) -> tuple[Path, str]:
@@ -413,34 +385,10 @@ def _sensor_blobs(path: Path, name: str) -> Path | None:
     return next((folder for folder in found if (folder / name).is_dir()), None)
 
 
-# --- what is imported -----------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class _Shot:
-    """One image: camera's channel, file, time (us)."""
-
-    channel: str
-    file: Path
-    time_us: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _NuplanPlan:
-    """Files, times and poses of an import, before anything large is read: the chosen ``cameras`` by channel, ``clouds``
-    and ``moments`` (images of one) in order of time, and the vehicle over the whole span, in the log's world."""
-
-    name: str
-    cameras: Mapping[str, NuplanCamera]
-    clouds: Sequence[NuplanCloud]
-    moments: Sequence[Sequence[_Shot]]
-    ego_us: NDArray[np.int64]
-    world_from_ego: Matrix
-    notes: Sequence[str]
-
-
-def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
-    name, where = opened.name(), str(opened.path)
+def _drive(opened: NuplanLog, scene: str, options: ImportOptions) -> DriveLog:
+    """What the database tells; no image or cloud is opened."""
+    name, where, notes = opened.name(), str(opened.path), list[str]()
+    log.info(f"nuplan: {where}")
     blobs = _sensor_blobs(opened.path, name)
     if blobs is None:
         expected = f"sensor_blobs/{name} beside the database or up to four folders above it"
@@ -449,187 +397,73 @@ def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
     if scene and scene not in opened.scenes():
         what = "the log has no such scene"
         raise UsageError(what, where=where, got=scene, expected=", ".join(opened.scenes()[:12]) or "no scenes")
-    every = list(opened.clouds(scene))
-    first, end = options.frames or (0, len(every))
-    chosen = every[first:end]
-    if not chosen:
-        raise InputError("no clouds to import", where=where, expected=f"frames 0 to {len(every)}", got=f"{first}:{end}")
-    common.seconds(np.array([time_us for _, time_us in chosen]), "us", f"{where}: lidar_pc.timestamp", chosen[0][1])
-    notes = [f"clouds {first} to {first + len(chosen) - 1} of {scene or 'the log'}"]
-    lidars = opened.lidars()
-    placed = {token: opened.cloud(token, lidars, blobs) for token, _ in chosen}
-    clouds = [cloud for cloud in placed.values() if cloud is not None]
-    if len(clouds) < len(placed):
-        without = [token.hex() for token, cloud in placed.items() if cloud is None]
-        if not options.skip_missing:
-            what, where = "point cloud has no vehicle pose", f"{where}: lidar_pc {without[0]}.ego_pose_token"
-            got = f"{len(without)} of {len(placed)} clouds have none"
-            remedy = "choose frames with --frames FIRST:END, or add --skip-missing"
-            raise InputError(what, where=where, expected="a token of ego_pose", got=got, remedy=remedy)
-        notes.append(f"{len(without)} clouds without a vehicle pose were left out")
-    lacking = [cloud.file for cloud in clouds if not cloud.file.is_file()]
-    if lacking:
-        _refuse_missing("point cloud", lacking, len(clouds), options)
-        clouds = [cloud for cloud in clouds if cloud.file.is_file()]
-        notes.append(f"{len(lacking)} clouds whose files are missing were left out")
+    clouds = list(opened.clouds(scene, blobs))
+    if not clouds:
+        raise InputError("no clouds to import", where=where, expected="rows of lidar_pc", got=scene or "the whole log")
+    times_us = [time_us for _, time_us, *_ in clouds]
+    start_us, end_us = times_us[0] - _REACH_US, times_us[-1] + _REACH_US
+    seconds = common.seconds(times_us, "us", f"{where}: lidar_pc.timestamp", start_us)
+    ego_us, poses = opened.ego_poses(start_us - _MARGIN_US, end_us + _MARGIN_US)
+    if not len(ego_us):
+        what, expected = "no vehicle poses at the time of the clouds", "microseconds, as lidar_pc.timestamp"
+        remedy = "are the two in different units?"
+        raise InputError(what, where=f"{where}: ego_pose.timestamp", expected=expected, remedy=remedy)
+    ego = EgoPath(common.seconds(ego_us, "us", f"{where}: ego_pose.timestamp", start_us), poses)
+    ego = common.mended_path(ego, notes)
     by_token = opened.cameras()
-    folders = {camera.channel for camera in by_token.values() if (blobs / name / camera.channel).is_dir()}
+    folders = {channel for channel, _, _ in by_token.values() if (blobs / name / channel).is_dir()}
     available = {channel: ours for channel, ours in CAMERAS.items() if channel in folders}
-    names = common.chosen_cameras(available, options, f"{where}: camera", tuple(CAMERAS))
-    cameras = {camera.channel: camera for camera in by_token.values()}
-    span = (chosen[0][1] - _REACH_US, chosen[-1][1] + _REACH_US)
-    shots = [
-        _Shot(by_token[token].channel, file, time_us)
-        for token, file, time_us in opened.images(*span, blobs)
-        if token in by_token and by_token[token].channel in names
-    ]
-    moments, moment_notes = _moments(shots, names, options, where)
-    ego_us, poses = opened.ego_poses(span[0] - _MARGIN_US, span[1] + _MARGIN_US)
-    name, chosen_cameras = f"{name}_{scene}" if scene else name, {channel: cameras[channel] for channel in names}
-    return _NuplanPlan(name, chosen_cameras, clouds, moments, ego_us, poses, (*notes, *moment_notes))
-
-
-def _refuse_missing(what: str, missing: Sequence[Path], total: int, options: ImportOptions) -> None:
-    """Refuse missing files, unless that is allowed."""
-    if missing and not options.skip_missing:
-        what = f"file of a {what} is missing"
-        remedy = "download the log's sensor blobs, choose frames with --frames FIRST:END, or add --skip-missing"
-        raise InputError(what, where=str(missing[0]), got=f"{len(missing)} of {total} are missing", remedy=remedy)
-
-
-def _moments(
-    shots: Sequence[_Shot], names: Sequence[str], options: ImportOptions, where: str
-) -> tuple[list[list[_Shot]], list[str]]:
-    """The images of each moment at which all cameras fired, and notes; see ``_by_moment``."""
-    groups = _by_moment(shots, names, where)
-    missing = [shot.file for group in groups for shot in group if not shot.file.is_file()]
-    _refuse_missing("camera image", missing, len(shots), options)
-    complete = [{shot.channel for shot in group} == set(names) for group in groups]
-    kept = [g for g, full in zip(groups, complete, strict=True) if full and all(s.file.is_file() for s in g)]
-    inner = [group for group, full in zip(groups[1:-1], complete[1:-1], strict=True) if not full]
-    if inner and not options.skip_missing:
-        absent = sorted(set(names) - {shot.channel for shot in inner[0]})
-        what, where = "a moment lacks images of some cameras", f"{where}: image at {inner[0][0].time_us}"
-        got = f"no {', '.join(absent)}; {len(inner)} such moments"
-        remedy = "choose cameras with --cameras, or add --skip-missing"
-        raise InputError(what, where=where, got=got, expected="every chosen camera", remedy=remedy)
-    if not kept:
-        what = "no moment has images of all cameras"
-        remedy = "choose cameras with --cameras, or other frames with --frames"
-        raise InputError(what, where=where, got=f"{len(shots)} images", expected=", ".join(names), remedy=remedy)
-    cut = len(groups) - len(kept)
-    return kept, [f"{cut} moments without images of all cameras were left out"] if cut else []
-
-
-def _by_moment(shots: Sequence[_Shot], names: Sequence[str], where: str) -> list[list[_Shot]]:
-    """Images put together by time, in order of time.
-
-    Cameras fire one after another, each at its own part of the period. So an image belongs to the nearest image of the
-    camera that has most of them, after its own camera's median delay is taken off. What lies half a period from all is
-    alone.
-    """
-    by_camera = {name: [shot for shot in shots if shot.channel == name] for name in names}
-    for name, found in by_camera.items():
-        for shot, following in itertools.pairwise(found):
-            if shot.time_us == following.time_us:
-                what, where = "two images of one camera have the same time", f"{where}: image at {shot.time_us}"
-                got = f"{name}: {shot.file.name} and {following.file.name}"
-                remedy = "are rows of the table doubled? copy the file again"
-                raise InputError(what, where=where, expected="a row for every image", got=got, remedy=remedy)
-    leading = max(by_camera.values(), key=len)
-    if not leading:
-        return []
-    beats = np.array([shot.time_us for shot in leading])
-    half_us = float(np.median(np.diff(beats))) / 2 if len(beats) > 1 else _PERIOD_US / 2
-    groups: dict[int, list[_Shot]] = {index: [] for index in range(len(beats))}
-    alone = []
-    for found in by_camera.values():
-        times = np.array([shot.time_us for shot in found], np.int64)
-        late = times - beats[common.nearest_index(beats, times)]
-        usual = float(np.median(late[np.abs(late) <= half_us])) if (np.abs(late) <= half_us).any() else 0.0
-        for shot, index in zip(found, common.nearest_index(beats, times - usual), strict=True):
-            taken = any(other.channel == shot.channel for other in groups[int(index)])
-            if taken or abs(shot.time_us - usual - beats[index]) >= half_us:
-                alone.append([shot])
-            else:
-                groups[int(index)].append(shot)
-    return sorted([*groups.values(), *alone], key=lambda group: min(shot.time_us for shot in group))
-
-
-# --- writing --------------------------------------------------------------------------------------
-
-
-def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> SceneContent[Any]:
-    start_us = plan.clouds[0].time_us if plan.clouds else plan.moments[0][0].time_us
-    found: list[str] = []
-    ego = common.mended_path(_ego_path(plan, start_us, str(opened.path)), found)
-    first = ego.pose_at(0.0)
-    if first is None:
-        what, where = "vehicle poses do not cover the log", f"{opened.path}: ego_pose"
-        expected, remedy = f"a pose at {start_us} us", "are pose and cloud times both in microseconds?"
-        raise InputError(what, where=where, expected=expected, got=f"{len(plan.ego_us)} poses near it", remedy=remedy)
-    world_from_source = common.world_from_first(first)
-    ego = EgoPath(ego.times_s, world_from_source @ ego.world_from_ego)
-    fits = {CAMERAS[channel]: _fit(camera, options) for channel, camera in plan.cameras.items()}
-    tracks, track_notes = _read_tracks(opened, plan, start_us, world_from_source)
-    notes = [*plan.notes, *found, *image_notes(fits), common.origin_note(first)]
+    chosen = common.chosen_cameras(available, options, f"{where}: camera", tuple(CAMERAS))
+    cameras = {camera.name: camera for channel in chosen for other, camera, _ in by_token.values() if other == channel}
+    lenses = {name: brown_conrady(*one.distortion) if any(one.distortion) else None for name, one in cameras.items()}
+    images = []
+    for token, file, time_us in opened.images(start_us, end_us, blobs):
+        channel, camera, mount = by_token.get(token, ("", None, np.eye(4)))
+        time_s = (time_us + IMAGE_DELAY_US - start_us) / 1e6
+        if camera is not None and channel in chosen and not (options.skip_missing and not common.has_pose(ego, time_s)):
+            pose = common.pose_near(ego, time_s, where=str(file))
+            images.append(ImageRecord(camera.name, time_s, pose @ mount, file, place=str(file)))
+    lidars, sweeps = opened.lidars(), []
+    without = [token.hex() for token, *_, pose in clouds if pose is None]
+    if without and not options.skip_missing:
+        what, got = "point cloud has no vehicle pose", f"{len(without)} of {len(clouds)} clouds have none"
+        where, remedy = f"{where}: lidar_pc {without[0]}.ego_pose_token", "add --skip-missing"
+        raise InputError(what, where=where, expected="a token of ego_pose", got=got, remedy=remedy)
+    notes += [f"{len(without)} clouds without a vehicle pose were left out"] if without else []
+    for (token, _, lidar, file, pose), time_s in zip(clouds, seconds.tolist(), strict=True):
+        if lidar not in lidars:
+            what, where = "point cloud is of a LiDAR that is not there", f"{where}: lidar_pc {token.hex()}"
+            raise InputError(what, where=where, got=lidar.hex())
+        if pose is not None:
+            places = [(invert(lidars[lidar]) @ other)[:3, 3] for other in lidars.values()]
+            read = partial(_read_points, file, places)
+            sweeps.append(SweepRecord(SENSOR, time_s, pose @ lidars[lidar], file, read))
+    tracks, track_notes = _tracks(
+        opened, dict(zip((token for token, *_ in clouds), seconds.tolist(), strict=True)), times_us
+    )
     notes.append(f"image poses {IMAGE_DELAY_US / 1e6:.4f} s after the time stamps: the middle of the read-out")
-
-    def taken_s(shot: _Shot) -> float:
-        return (shot.time_us + IMAGE_DELAY_US - start_us) / 1e6
-
-    def convert(item: tuple[int, NuplanCloud | Sequence[_Shot]]) -> Iterable[SceneImage | SceneSweep]:
-        index, what = item
-        if isinstance(what, NuplanCloud):
-            time_s, pose = (what.time_us - start_us) / 1e6, world_from_source @ what.world_from_lidar
-            yield SceneSweep(SENSOR, index, time_s, pose, _read_points(what.file, what.places), str(what.file))
-            return
-        for shot in what:
-            time_s = taken_s(shot)
-            mount = plan.cameras[shot.channel].ego_from_cam
-            world_from_cam = common.pose_near(ego, time_s, where=str(shot.file)) @ mount
-            yield SceneImage(CAMERAS[shot.channel], index, time_s, world_from_cam, shot.file, str(shot.file))
-
-    moments = list(enumerate(plan.moments))
-    if options.skip_missing:
-        moments = [one for one in moments if all(common.has_pose(ego, taken_s(shot)) for shot in one[1])]
-        if len(moments) < len(plan.moments):
-            notes.append(f"{len(plan.moments) - len(moments)} moments without a vehicle pose were left out")
-    items = [*enumerate(plan.clouds), *moments]
-    source = Source("nuplan", LICENCE, None, (*notes, *track_notes))
-    name = lambda item: f"{'cloud' if isinstance(item[1], NuplanCloud) else 'moment'} {item[0]}"
-    return SceneContent(plan.name, source, fits, items, convert, name, ego, tracks=lambda: (tracks, ()))
+    return DriveLog(
+        name=f"{name}_{scene}" if scene else name,
+        cameras=cameras,
+        images=images,
+        sweeps=sweeps,
+        tracks=tracks,
+        ego=ego,
+        source=Source("nuplan", LICENCE, None, (*notes, *track_notes)),
+        where=where,
+        optics={name: CameraOptics(camera, lenses[name]) for name, camera in cameras.items()},
+    )
 
 
-def _read_tracks(
-    opened: NuplanLog, plan: _NuplanPlan, start_us: int, world_from_source: Matrix
-) -> tuple[list[Track], list[str]]:
-    """Tracks in the scene's world and clock from the boxes of the plan's clouds, and notes."""
+def _tracks(opened: NuplanLog, time_of: Mapping[bytes, float], times_us: Sequence[int]) -> Tracks:
+    """Tracks in the log's world from the boxes of clouds (token -> seconds), and notes."""
     tracks = BoxTracks(f"{opened.path}: lidar_box", LABELS)
-    time_of = {cloud.token: (cloud.time_us - start_us) / 1e6 for cloud in plan.clouds}
-    span = (plan.clouds[0].time_us, plan.clouds[-1].time_us) if plan.clouds else (0, -1)
-    for token, track, label, (x, y, z, yaw, length, width, height) in opened.boxes(*span):
+    for token, track, label, (x, y, z, yaw, *size) in opened.boxes(times_us[0], times_us[-1]):
         if token in time_of:
-            pose = world_from_source @ yaw_matrix(yaw, (x, y, z))
+            length, width, height = size
+            pose = yaw_matrix(yaw, (x, y, z))
             tracks.add(track, tracks.label_of(label), time_of[token], (length, width, height), pose)
     return tracks.tracks()
-
-
-def _ego_path(plan: _NuplanPlan, start_us: int, where: str) -> EgoPath:
-    """The vehicle in the log's world and the scene's clock."""
-    if not len(plan.ego_us):
-        what, where = "no vehicle poses at the time of the clouds", f"{where}: ego_pose.timestamp"
-        expected = "microseconds, as lidar_pc.timestamp"
-        raise InputError(what, where=where, expected=expected, remedy="are the two in different units?")
-    return EgoPath(common.seconds(plan.ego_us, "us", f"{where}: ego_pose.timestamp", start_us), plan.world_from_ego)
-
-
-def _fit(camera: NuplanCamera, options: ImportOptions) -> ImageFit:
-    fx, fy, cx, cy = camera.intrinsics
-    lens = brown_conrady(*camera.distortion) if any(camera.distortion) else None
-    # the calibration counts pixels from the centre of the top-left one, as OpenCV does
-    recorded = Camera(CAMERAS[camera.channel], *camera.size, fx, fy, cx + 0.5, cy + 0.5, camera.distortion)
-    return fit_images(recorded, options, lens)
 
 
 def _read_points(path: Path, places: Sequence[Matrix]) -> SweepPoints:

@@ -22,10 +22,8 @@ of all, are dropped.
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -110,35 +108,24 @@ def point_times(xyz: NDArray[np.float32], rings: NDArray[np.float32]) -> NDArray
 # field while the file passes through a buffer of a few megabytes; only matching records become Python objects.
 _BUFFER_BYTES: Final = 1 << 22
 _MAX_RECORD_BYTES: Final = 1 << 20
-_FLAT: Final = re.compile(rb'\{(?:[^{}"]++|"(?:[^"\\]++|\\.)*+")*+\}', re.DOTALL)
-"""An object whose fields are not objects; braces may stand in its texts."""
 _TOKEN: Final = re.compile(r"[A-Za-z0-9_\-]{1,128}")
 
 OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
-    "attribute.json": frozenset({"token", "name", "description"}),
-    "calibrated_sensor.json": frozenset({"token", "sensor_token", "translation", "rotation", "camera_intrinsic"}),
-    "category.json": frozenset({"token", "name", "description", "index"}),
-    "ego_pose.json": frozenset({"token", "timestamp", "translation", "rotation"}),
-    "instance.json": frozenset(
-        {"token", "category_token", "nbr_annotations", "first_annotation_token", "last_annotation_token"}
-    ),
-    "sample.json": frozenset({"token", "timestamp", "scene_token", "next", "prev"}),
-    "sample_annotation.json": frozenset(
-        (
-            "token sample_token instance_token attribute_tokens visibility_token translation size rotation "
-            "num_lidar_pts num_radar_pts next prev"
-        ).split()
-    ),
-    "sample_data.json": frozenset(
-        (
-            "token sample_token ego_pose_token calibrated_sensor_token filename fileformat width height "
-            "timestamp is_key_frame next prev"
-        ).split()
-    ),
-    "scene.json": frozenset(
-        {"token", "name", "description", "log_token", "nbr_samples", "first_sample_token", "last_sample_token"}
-    ),
-    "sensor.json": frozenset({"token", "channel", "modality"}),
+    f"{name}.json": frozenset(f"token {fields}".split())
+    for name, fields in {
+        "attribute": "name description",
+        "calibrated_sensor": "sensor_token translation rotation camera_intrinsic",
+        "category": "name description index",
+        "ego_pose": "timestamp translation rotation",
+        "instance": "category_token nbr_annotations first_annotation_token last_annotation_token",
+        "sample": "timestamp scene_token next prev",
+        "sample_annotation": "sample_token instance_token attribute_tokens visibility_token translation size rotation "
+        "num_lidar_pts num_radar_pts next prev",
+        "sample_data": "sample_token ego_pose_token calibrated_sensor_token filename fileformat width height timestamp "
+        "is_key_frame next prev",
+        "scene": "name description log_token nbr_samples first_sample_token last_sample_token",
+        "sensor": "channel modality",
+    }.items()
 }
 """Tables that are read -> their fields. Source: the release's published schema; ``index`` came with
 nuScenes-lidarseg."""
@@ -148,8 +135,7 @@ Row = dict[str, Any]
 
 def read_table(path: Path) -> list[Row]:
     """All records of a table. Raises InputError: missing, no JSON, or not an array of objects."""
-    _refuse_missing(path)
-    rows = store.read_json(path)
+    rows = store.read_json(_there(path))
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise InputError("table is not an array of records", where=str(path), expected="[ {...}, ... ]")
     for row in rows:
@@ -162,28 +148,13 @@ def find_records(
 ) -> Iterator[Row]:
     """Records whose text ``field`` is one of ``values``, in file order.
 
-    Records that do not match are not parsed: the field is looked for in the bytes, and the record around a hit is cut
-    out and parsed strictly. Where that fails (objects in records) the whole table is parsed instead. The file's first
-    and last character are checked, so that a cut-off table is noticed. ``values`` are tokens: texts without escapes.
-    Raises InputError: no JSON array, a matching record that is malformed, or the file is cut off."""
-    found = 0
-    try:
-        for record in _search(path, field, values, buffer_bytes):
-            found += 1
-            yield record
-    except _Unclear:
-        yield from itertools.islice((row for row in read_table(path) if row.get(field) in values), found, None)
-
-
-class _Unclear(Exception):
-    """The bytes around a hit are no record: the quick search cannot go on."""
-
-
-def _search(path: Path, field: str, values: Collection[str], buffer_bytes: int) -> Iterator[Row]:
+    Records that do not match are not parsed: the field is looked for in the bytes, and the record around a hit, from
+    brace to brace, is cut out and parsed strictly. The file's first and last character are checked, so that a cut-off
+    table is noticed. ``values`` are tokens: texts without escapes. Raises InputError: no JSON array, a matching record
+    that is malformed or holds braces, or the file is cut off."""
     wanted = {value.encode() for value in values}
     hit = re.compile(rb'"' + re.escape(field.encode()) + rb'"\s*:\s*"([^"\\]*)"')
-    _refuse_missing(path)
-    with store.open_file(path) as file:
+    with store.open_file(_there(path)) as file:
         buffer, offset, piece = file.read(buffer_bytes), 0, b" "
         if buffer.lstrip()[:1] != b"[":
             what, got = "table does not start as a JSON array", repr(buffer[:20]) if buffer else "an empty file"
@@ -195,10 +166,9 @@ def _search(path: Path, field: str, values: Collection[str], buffer_bytes: int) 
             end = buffer.rfind(b"}") + 1
             for match in hit.finditer(buffer, 0, end):
                 if match[1] in wanted:
-                    record = _FLAT.match(buffer, max(0, buffer.rfind(b"{", 0, match.start())))
-                    if record is None or record.end() <= match.start():
-                        raise _Unclear
-                    row = store.parse_json(record[0], f"{path}: byte {offset + record.start()}")
+                    start = max(0, buffer.rfind(b"{", 0, match.start()))
+                    record = buffer[start : buffer.find(b"}", match.end()) + 1]
+                    row = store.parse_json(record, f"{path}: byte {offset + start}")
                     _note_fields(row, path)
                     yield row
             if not piece and not buffer.rstrip().endswith(b"]"):
@@ -216,46 +186,39 @@ def _note_fields(row: Row, path: Path) -> None:
         note_unknown(path.name, row, OFFICIAL[path.name])
 
 
-def _refuse_missing(path: Path) -> None:
+def _there(path: Path) -> Path:
     if not path.exists():
         what = "table is missing"
         raise InputError(what, where=str(path), remedy="unpack the release's metadata archive, which holds all tables")
+    return path
 
 
 # --- rows -----------------------------------------------------------------------------------------
 
 
+def _field(row: Row, key: str, where: str, expected: str, kinds: Any, count: int = 0) -> Any:
+    """A field that is one of ``kinds``, or a list of ``count`` such."""
+    found = row.get(key)
+    items = found if count and isinstance(found, list) else [found]
+    if len(items) != (count or 1) or not all(isinstance(one, kinds) and not isinstance(one, bool) for one in items):
+        what, where = f"field {key!r} is missing or malformed", f"{where}: record {row.get('token', '?')!r}"
+        raise InputError(what, where=where, expected=expected, got=repr(found)[:120])
+    return found
+
+
 def text(row: Row, key: str, where: str) -> str:
     """A text field."""
-    value = row.get(key)
-    if not isinstance(value, str):
-        raise _bad_field(row, key, where, "a text")
-    return value
+    return _field(row, key, where, "a text", str)
 
 
 def integer(row: Row, key: str, where: str) -> int:
     """An integer field."""
-    value = row.get(key)
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise _bad_field(row, key, where, "an integer")
-    return value
+    return _field(row, key, where, "an integer", int)
 
 
 def numbers(row: Row, key: str, count: int, where: str) -> list[float]:
     """A field that is a list of ``count`` numbers."""
-    value = row.get(key)
-    if not isinstance(value, list) or len(value) != count or not all(_is_number(item) for item in value):
-        raise _bad_field(row, key, where, f"{count} numbers")
-    return [float(item) for item in value]
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _bad_field(row: Row, key: str, where: str, expected: str) -> InputError:
-    what, where = f"field {key!r} is missing or malformed", f"{where}: record {row.get('token', '?')!r}"
-    return InputError(what, where=where, expected=expected, got=repr(row.get(key))[:120])
+    return [float(one) for one in _field(row, key, where, f"{count} numbers", int | float, count)]
 
 
 class TokenTable:
@@ -376,22 +339,33 @@ def read_log(source: Path, options: ImportOptions) -> DriveLog:
     used.sort(key=lambda row: row["timestamp"])
     ego_poses = _those(folder, "ego_pose", "token", {text(r, "ego_pose_token", data.where) for r in used})
     zero_us = int(used[0]["timestamp"])
-    reader = _RowReader(folder.parent, data.where, calibrations, ego_poses, zero_us)
+
+    def time_s(row: Row) -> float:
+        return (int(row["timestamp"]) - zero_us) / MICROSECONDS
+
+    def map_from_ego(row: Row) -> Matrix:
+        return _pose(ego_poses.get(row, "ego_pose_token", data.where), ego_poses.where)
+
     scene_name_of = {raw: name for name, raw in chosen.items()}
-    images, sweeps = [], []
-    rows_of: dict[str, Row] = {}
+    images, sweeps, cameras = [], [], dict[str, Camera]()
     for row in used:
-        channel = channel_of[row["token"]]
-        if channel == LIDAR:
-            sweeps.append(reader.sweep(row))
-        else:
-            images.append(reader.image(row, scene_name_of[channel]))
-            rows_of.setdefault(channel, row)
-    cameras = {name: reader.camera(rows_of[raw], name) for name, raw in chosen.items() if raw in rows_of}
+        calibration = calibrations.get(row, "calibrated_sensor_token", data.where)
+        pose = map_from_ego(row) @ _pose(calibration, calibrations.where)
+        path = common.path_inside(folder.parent, row.get("filename"), f"{data.where}: record {row['token']!r}")
+        if channel_of[row["token"]] == LIDAR:
+            sweeps.append(SweepRecord(SENSOR, time_s(row), pose, path, partial(read_scan, path)))
+            continue
+        name = scene_name_of[channel_of[row["token"]]]
+        images.append(ImageRecord(name, time_s(row), pose, path))
+        if name not in cameras:
+            here = f"{calibrations.where}: record {calibration['token']!r}"
+            size = integer(row, "width", data.where), integer(row, "height", data.where)
+            cameras[name] = camera_from_intrinsics(name, size, calibration.get("camera_intrinsic"), here)
+    cameras = {name: cameras[name] for name in chosen if name in cameras}
     tracks, notes = _read_tracks(folder, samples, zero_us)
     if not sweeps:
         notes.append("no LiDAR sweeps in the tables")
-    ego = common.ego_path([reader.time_s(r) for r in used], [reader.map_from_ego(r) for r in used])
+    ego = common.ego_path(list(map(time_s, used)), list(map(map_from_ego, used)))
     source = Source("nuscenes", LICENCE, None, (f"release {folder.name}, {scene['name']}", *notes))
     return DriveLog(str(scene["name"]), cameras, images, sweeps, tracks, ego, source, where)
 
@@ -444,43 +418,6 @@ def _check_times(rows: Sequence[Row], samples: Mapping[str, int], where: str) ->
         raise InputError("an image or sweep lies outside its scene's time", where=where, got=got, expected=expected)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _RowReader:
-    """Records of ``sample_data`` to images and sweeps with their poses."""
-
-    root: Path
-    where: str
-    calibrations: TokenTable
-    ego_poses: TokenTable
-    zero_us: int
-
-    def time_s(self, row: Row) -> float:
-        return (int(row["timestamp"]) - self.zero_us) / MICROSECONDS
-
-    def map_from_ego(self, row: Row) -> Matrix:
-        return _pose(self.ego_poses.get(row, "ego_pose_token", self.where), self.ego_poses.where)
-
-    def map_from_sensor(self, row: Row) -> Matrix:
-        calibration = self.calibrations.get(row, "calibrated_sensor_token", self.where)
-        return self.map_from_ego(row) @ _pose(calibration, self.calibrations.where)
-
-    def file(self, row: Row) -> Path:
-        return common.path_inside(self.root, row.get("filename"), f"{self.where}: record {row['token']!r}")
-
-    def image(self, row: Row, camera: str) -> ImageRecord:
-        return ImageRecord(camera, self.time_s(row), self.map_from_sensor(row), self.file(row))
-
-    def sweep(self, row: Row) -> SweepRecord:
-        path = self.file(row)
-        return SweepRecord(SENSOR, self.time_s(row), self.map_from_sensor(row), path, partial(read_scan, path))
-
-    def camera(self, row: Row, name: str) -> Camera:
-        calibration = self.calibrations.get(row, "calibrated_sensor_token", self.where)
-        where = f"{self.calibrations.where}: record {calibration['token']!r}"
-        size = integer(row, "width", self.where), integer(row, "height", self.where)
-        return camera_from_intrinsics(name, size, calibration.get("camera_intrinsic"), where)
-
-
 def _pose(row: Row, where: str) -> Matrix:
     """Rigid f64[4, 4] of a record with ``rotation`` (w, x, y, z) and ``translation``."""
     rotation, translation = numbers(row, "rotation", 4, where), numbers(row, "translation", 3, where)
@@ -503,18 +440,13 @@ def _read_tracks(folder: Path, samples: Mapping[str, int], zero_us: int) -> tupl
         instance = instances.get(row, "instance_token", annotations.where)
         category = categories.get(instance, "category_token", instances.where)
         label = tracks.label_of(text(category, "name", categories.where))
-        if attributes is not None and label in _RIDDEN and _is_ridden(row, attributes):
-            label = _RIDDEN[label]
+        if attributes is not None and label in _RIDDEN:
+            tokens = row.get("attribute_tokens")
+            known = [attributes.rows.get(str(one), {}) for one in tokens] if isinstance(tokens, list) else []
+            label = _RIDDEN[label] if any(one.get("name") == _WITH_RIDER for one in known) else label
         width, length, height = numbers(row, "size", 3, annotations.where)  # in this order in the tables
         where = f"{annotations.where}: record {row['token']!r}"
         time_s = (samples[row["sample_token"]] - zero_us) / MICROSECONDS
         pose = _pose(row, annotations.where)
         tracks.add(instance["token"], label, time_s, (length, width, height), pose, where=where)
     return tracks.tracks()
-
-
-def _is_ridden(row: Row, attributes: TokenTable) -> bool:
-    tokens = row.get("attribute_tokens")
-    return isinstance(tokens, list) and any(
-        attributes.rows.get(token, {}).get("name") == _WITH_RIDER for token in tokens if isinstance(token, str)
-    )

@@ -30,15 +30,14 @@ apart: 1 m at 20 m/s); it is moved to the sweep's time with its track's velocity
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import log, palette, store
+from mudg.base import palette, store
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert, transform_points, yaw_matrix
 from mudg.base.plain_pickle import MAX_BYTES, NUMPY_MAKERS, Array, Maker, Name, PickledObject, read_pickle
@@ -53,12 +52,10 @@ from mudg.formats.unknown_fields import known, note_unknown, note_unknown_within
 #
 # Tables that pandas pickled, read as columns of numpy arrays without pandas and without running the pickle.
 #
-# The forms of pandas 0.2x, 1.x and 2.x are understood: a data frame is a manager of blocks, each block an array of
-# several columns and the places of these columns. Extension types (categories, text arrays of pandas 3) are refused by
-# name.
+# The forms of pandas 0.2x to 1.2 (which the data set has) and 2.x are understood: a data frame is a manager of blocks,
+# each block an array of several columns and the places of these columns. Extension types are refused by name.
 _MANAGERS: Final = ("pandas.core.internals.managers.BlockManager", "pandas.core.internals.BlockManager")
 MAX_COLUMNS: Final = 1000
-_NEW_BLOCK: Final = "pandas.core.internals.blocks.new_block"
 
 
 def _new_index(kind: Any, entries: Any) -> NDArray[Any] | range:
@@ -84,8 +81,6 @@ _MAKERS: Final[Mapping[str, Maker | None]] = {
     **dict.fromkeys(f"pandas.core.indexes.numeric.{kind}Index" for kind in ("Int64", "UInt64", "Float64")),
     "pandas.core.indexes.range.RangeIndex": None,
     "pandas._libs.internals._unpickle_block": lambda values, places, _dimensions: (values, places),
-    _NEW_BLOCK: None,
-    "functools.partial": None,
     "builtins.slice": _slice,
 }
 
@@ -119,8 +114,8 @@ def parse_frame(content: bytes, where: str) -> dict[str, NDArray[Any]]:
         return _columns_pandas_frame(value)
     except (ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         what, got = "pickle is not a plain data frame", f"{type(error).__name__}: {error}"[:200]
-        expected = "a table of numbers and texts as pandas 0.2x to 2.x writes it"
-        remedy = "read it with pandas yourself and write it again with DataFrame.to_pickle of pandas 1 or 2"
+        expected = "a table of numbers and texts as pandas 0.2x to 1.2 or 2.x writes it"
+        remedy = "read it with pandas yourself and write it again with DataFrame.to_pickle of pandas 2"
         raise InputError(what, where=where, expected=expected, got=got, remedy=remedy) from error
 
 
@@ -131,8 +126,7 @@ def _columns_pandas_frame(frame: Any) -> dict[str, NDArray[Any]]:
     if manager.name not in _MANAGERS:
         raise ValueError(f"holds a {manager.name}")
     if manager.arguments:
-        blocks, axes = manager.arguments
-        parts = [_block_parts(block) for block in blocks]
+        parts, axes = manager.arguments
     else:
         extra = manager.state[3]["0.14.1"]
         axes, parts = extra["axes"], [(block["values"], block["mgr_locs"]) for block in extra["blocks"]]
@@ -150,18 +144,6 @@ def _columns_pandas_frame(frame: Any) -> dict[str, NDArray[Any]]:
     if len(columns) != len(names):
         raise ValueError(f"{len(columns)} of {len(names)} columns are there")
     return {name: columns[name] for name in names}
-
-
-def _block_parts(block: Any) -> tuple[Any, Any]:
-    """Values and places of a block in the forms of pandas 1.3 (a partial call) and later (a tuple)."""
-    if isinstance(block, PickledObject):
-        if block.name != "functools.partial":
-            raise ValueError(f"a block is a {block.name}")
-        partial, *block = block.arguments
-        if partial.arguments != (Name(_NEW_BLOCK),):
-            raise ValueError("a block of unknown form")
-    values, places = block
-    return values, places
 
 
 def _array(value: Any) -> NDArray[Any]:
@@ -188,34 +170,31 @@ several would (driveways are labelled either way; emergency vehicles are cars an
 guard rails). Ground is unpaved. Pickup trucks are trucks by definition of Cityscapes, as their boxes here."""
 
 
-class PointClasses:
-    """The class tables of the chosen frames in ``annotations/semseg``; without any no point has a class. Raises
-    InputError: a frame has no table though others have one, or ``classes.json`` is missing or malformed."""
+PointClasses = Callable[[int, int], NDArray[np.uint8] | None]
 
-    def __init__(self, folder: Path, frames: Sequence[int], options: ImportOptions) -> None:
-        self._files = _tables(folder, frames, options, "classes of points")
-        self._names = _names(folder / "classes.json") if self._files else {}
-        unknown = sorted(set(self._names.values()) - set(CLASS_OF))
-        some = ", ".join(unknown[:8])
-        self.notes = [f"classes of points that are not known here are unlabelled: {some}"] if unknown else []
 
-    def of(self, frame: int, points: int) -> NDArray[np.uint8] | None:
-        """Train ids u8[points] of a frame's cloud, 255 where unlabelled; None for a frame without a table."""
-        path = self._files.get(frame)
-        if path is None:
+def _point_classes(folder: Path, frames: Sequence[int], options: ImportOptions, notes: list[str]) -> PointClasses:
+    """The class tables of the chosen frames in ``annotations/semseg``, as a function of a frame's number and of how
+    many points its cloud has: train ids u8[points], 255 where unlabelled; None for a frame without a table."""
+    files = _tables(folder, frames, options, "classes of points")
+    names = _class_names(folder / "classes.json") if files else {}
+    if unknown := sorted(set(names.values()) - set(CLASS_OF)):
+        notes.append(f"classes of points that are not known here are unlabelled: {', '.join(unknown[:8])}")
+    ids = {number: palette.ID.get(CLASS_OF.get(name, ""), palette.UNLABELLED) for number, name in names.items()}
+
+    def classes(frame: int, points: int) -> NDArray[np.uint8] | None:
+        if frame not in files:
             return None
-        table = _columns(path, ("class",), _CLASSES)
-        numbers = common.finite_columns(table, ("class",), path)[:, 0].astype(np.int64)
+        path, expected = files[frame], f"{points} rows, one for each point of the frame's cloud"
+        numbers = common.finite_columns(_columns(path, ("class",), _CLASSES), ("class",), path)[:, 0].astype(np.int64)
         if len(numbers) != points:
-            what, expected = "classes do not fit the points", f"{points} rows, one for each point of the frame's cloud"
-            remedy = "is the file of another frame or sequence?"
-            raise InputError(what, where=f"{path}: class", got=f"{len(numbers)} rows", expected=expected, remedy=remedy)
+            what, remedy = "classes do not fit the points", "is the file of another frame or sequence?"
+            got = f"{len(numbers)} rows"
+            raise InputError(what, where=f"{path}: class", got=got, expected=expected, remedy=remedy)
         present, where = np.unique(numbers, return_inverse=True)
-        strange = [int(number) for number in present if int(number) not in self._names]
-        if strange:
-            log.warn(f"pandaset: {path}: classes {strange[:8]} are not in classes.json; their points are unlabelled")
-        names = [CLASS_OF.get(self._names.get(int(number), ""), "") for number in present]
-        return np.array([palette.ID.get(name, palette.UNLABELLED) for name in names], np.uint8)[where]
+        return np.array([ids.get(int(number), palette.UNLABELLED) for number in present], np.uint8)[where]
+
+    return classes
 
 
 def _tables(folder: Path, frames: Sequence[int], options: ImportOptions, what: str) -> dict[int, Path]:
@@ -229,7 +208,7 @@ def _tables(folder: Path, frames: Sequence[int], options: ImportOptions, what: s
     return tables
 
 
-def _names(path: Path) -> Mapping[int, str]:
+def _class_names(path: Path) -> Mapping[int, str]:
     """Number -> name of the data set's classes."""
     where, expected = str(path), '{"1": "Smoke", ...}'
     if not path.is_file():
@@ -262,8 +241,6 @@ LABELS: Final = name_table(
     sign: Signs, Construction Signs; container: Rolling Containers"""
 )
 """The data set's classes -> labels; pickup trucks count as trucks, as in Cityscapes."""
-FRONT_CAMERA_M: Final = (0.86, -0.07, 1.80)
-"""Place of the front camera on the vehicle where its poses are missing; from published poses of sequence 002."""
 EXPOSURE_S: Final = -0.01
 """When an image was taken, from its time stamp on, by the places of moving cars in the images of three cameras."""
 POSE_S: Final = -0.02
@@ -289,19 +266,8 @@ OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
 _POSE_FIELDS: Final = known("", heading=known("w x y z"), position=known("x y z"))
 
 
-@dataclass(frozen=True, slots=True)
-class _Cuboid:
-    """One row of a cuboid table; ``sibling`` is empty where there is none."""
-
-    uuid: str
-    label: str
-    time_s: float
-    late_s: float
-    size_m: tuple[float, float, float]
-    world_from_box: Matrix
-    standing: bool
-    sensor: int
-    sibling: str
+Cuboid = tuple[int, str, dict[str, Any]]
+"""LiDAR of a box (-1: none), its sibling or an empty text, and what ``BoxTracks.add`` wants to know."""
 
 
 def looks_like_pandaset(source: Path) -> bool:
@@ -331,14 +297,12 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
     motion = _Motion(folder, frames, chosen, options, notes)
     fits = {cameras[n]: _fit(folder / "camera" / n, cameras[n], images[n][frames[0]], options) for n in chosen}
     cuboids = _tables(folder / "annotations" / "cuboids", frames, options, "boxes")
-    classes = PointClasses(folder / "annotations" / "semseg", frames, options)
     notes.append(f"source frames {frames[0]} to {frames[-1]} are frames 0 to {len(frames) - 1} here")
-    notes += [*image_notes(fits), *classes.notes]
-    if "front_camera" not in motion.world_from_cam:
-        notes.append("front camera's poses are missing: the LiDARs' places are those of sequence 002")
+    notes += image_notes(fits)
+    classes = _point_classes(folder / "annotations" / "semseg", frames, options, notes)
     if not cuboids:
         notes.append("no boxes found: everything counts as static")
-    boxes: dict[int, list[_Cuboid]] = {}
+    boxes: dict[int, list[Cuboid]] = {}
     images_s: dict[float, tuple[float, float]] = {}
 
     def convert(index: int) -> Iterator[SceneImage | SceneSweep]:
@@ -347,7 +311,7 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
             time_s, pose = float(motion.camera_s[name][index]), motion.world_from_cam[name][index]
             yield SceneImage(cameras[name], index, time_s, pose, images[name][number])
         cloud = _Cloud(clouds[number], motion, index)
-        train_ids = classes.of(number, len(cloud.returns))
+        train_ids = classes(number, len(cloud.returns))
         train_ids = None if train_ids is None else train_ids[cloud.returns]
         for d, sensor in SENSORS.items():
             if d == 0 or (cloud.d == d).any():
@@ -412,11 +376,8 @@ class _Motion:
         self.raw_s = raw_s[[number - known[0] for number in frames]]
         self.camera_s: dict[str, NDArray[np.float64]] = {}
         self.world_from_cam: dict[str, Matrix] = {}
-        camera = np.array(FRONT_CAMERA_M)
         for name in dict.fromkeys((*cameras, "front_camera")):
             here = folder / "camera" / name
-            if name not in cameras and not (here / "poses.json").is_file():
-                continue
             stamps = here / "timestamps.json"
             times = _times(stamps, frames)
             late = np.abs(times - self.raw_s)
@@ -431,13 +392,11 @@ class _Motion:
             self.world_from_cam[name] = np.stack(
                 [self.ego_at(t + POSE_S) @ invert(self.ego_at(t)) @ p for t, p in timed]
             )
-        if "front_camera" in self.camera_s:
-            timed = zip(
-                self.camera_s["front_camera"] - EXPOSURE_S + POSE_S, self.world_from_cam["front_camera"], strict=True
-            )
-            seen = [transform_points(invert(self.ego_at(t)), pose[None, :3, 3])[0] for t, pose in timed]
-            camera = np.median(seen, axis=0)
         # places of the LiDARs on the vehicle: where the front camera is, plus the static calibration
+        front_s = self.camera_s["front_camera"] - EXPOSURE_S + POSE_S
+        timed = zip(front_s, self.world_from_cam["front_camera"], strict=True)
+        seen = [transform_points(invert(self.ego_at(t)), pose[None, :3, 3])[0] for t, pose in timed]
+        camera = np.median(seen, axis=0)
         self._places = {d: camera + np.array(offset) for d, offset in OFFSET_FROM_FRONT_CAMERA_M.items()}
 
     def ego_at(self, time_s: float) -> Matrix:
@@ -573,47 +532,42 @@ class _Cloud:
 # --- boxes ----------------------------------------------------------------------------------------
 
 
-def _read_cuboids(path: Path, cloud: _Cloud, motion: _Motion) -> list[_Cuboid]:
+def _read_cuboids(path: Path, cloud: _Cloud, motion: _Motion) -> list[Cuboid]:
     frame = _columns(path, _CUBOID_COLUMNS, _CUBOIDS)
     centre = common.finite_columns(frame, ("position.x", "position.y", "position.z"), path)
     length_width_height = ("dimensions.y", "dimensions.x", "dimensions.z")
-    sizes = common.finite_columns(frame, length_width_height, path)
+    sizes = common.finite_columns(frame, length_width_height, path).tolist()
     yaw = common.finite_columns(frame, ("yaw",), path)[:, 0]
-    sensor = np.full(len(yaw), -1.0)
-    if "cuboids.sensor_id" in frame:
-        ids = frame["cuboids.sensor_id"]
-        ids = np.where(np.array([one is None or one != one for one in ids], bool), -1, ids)
-        sensor = common.finite_columns({"cuboids.sensor_id": ids}, ("cuboids.sensor_id",), path)[:, 0]
+    ids = frame.get("cuboids.sensor_id", np.full(len(yaw), -1))
+    ids = np.where(np.array([one is None or one != one for one in ids], bool), -1, ids)
+    sensors = common.finite_columns({"cuboids.sensor_id": ids}, ("cuboids.sensor_id",), path)[:, 0].astype(int)
     siblings = frame.get("cuboids.sibling_id", np.full(len(yaw), "", object))
     rows = []
-    for row in range(len(yaw)):
-        box = yaw_matrix(yaw[row] + np.pi / 2, centre[row])
-        length, width, height = sizes[row].tolist()
-        size, uuid, label = (length, width, height), str(frame["uuid"][row]), str(frame["label"][row])
-        standing, of = bool(frame["stationary"][row]), int(sensor[row])
-        late_s = 0.0 if standing else cloud.delay_s(box, size, of)
-        sibling = siblings[row] if isinstance(siblings[row], str) and len(siblings[row]) > 1 else ""
-        world_from_box = motion.world_from_source @ box
-        rows.append(_Cuboid(uuid, label, cloud.time_s, late_s, size, world_from_box, standing, of, sibling))
+    for row, sibling in enumerate(siblings):
+        box, sensor, size = yaw_matrix(yaw[row] + np.pi / 2, centre[row]), int(sensors[row]), tuple(sizes[row])
+        standing = bool(frame["stationary"][row])
+        about = {"track": str(frame["uuid"][row]), "label": str(frame["label"][row]), "time_s": cloud.time_s}
+        about |= {"size_m": size, "world_from_box": motion.world_from_source @ box, "standing": standing}
+        about["late_s"] = 0.0 if standing else cloud.delay_s(box, size, sensor)
+        rows.append((sensor, sibling if isinstance(sibling, str) and len(sibling) > 1 else "", about))
     return rows
 
 
-def _add_boxes(tracks: BoxTracks, boxes: Mapping[int, Sequence[_Cuboid]]) -> list[str]:
+def _add_boxes(tracks: BoxTracks, boxes: Mapping[int, Sequence[Cuboid]]) -> list[str]:
     """Give the boxes to their tracks, siblings to one; returns notes."""
     one_of: dict[str, str] = {}
-    for index in sorted(boxes):
-        for box in boxes[index]:
-            if box.sibling and box.sensor in (0, 1):
-                turning, solid = (box.uuid, box.sibling) if box.sensor == 0 else (box.sibling, box.uuid)
-                one_of.setdefault(solid, turning)
+    for sensor, sibling, about in (box for index in sorted(boxes) for box in boxes[index]):
+        if sibling and sensor in (0, 1):
+            turning, solid = (about["track"], sibling) if sensor == 0 else (sibling, about["track"])
+            one_of.setdefault(solid, turning)
     doubled = 0
     for index in sorted(boxes):
-        kept: dict[str, _Cuboid] = {}
-        for box in sorted(boxes[index], key=lambda b: b.sensor == 1):
-            name = one_of.get(box.uuid, box.uuid)
+        kept: dict[str, dict[str, Any]] = {}
+        for _, _, about in sorted(boxes[index], key=lambda box: box[0] == 1):
+            uuid: str = about["track"]
+            name = one_of.get(uuid, uuid)
             doubled += name in kept
-            kept.setdefault(name, box)
-        for name, box in kept.items():
-            label, pose = tracks.label_of(box.label), box.world_from_box
-            tracks.add(name, label, box.time_s, box.size_m, pose, box.standing, box.late_s)
+            kept.setdefault(name, about)
+        for name, about in kept.items():
+            tracks.add(**{**about, "track": name, "label": tracks.label_of(about["label"])})
     return [f"{doubled} boxes are second boxes of an object for the other LiDAR and were left out"] if doubled else []

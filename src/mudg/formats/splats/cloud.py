@@ -322,15 +322,31 @@ def spacing_m(places: NDArray[np.floating], kind: type[np.floating] = np.float32
     return float(np.spacing(kind(np.quantile(np.abs(places).max(1), 0.9))))
 
 
-def refuse_plain_values(cloud: SplatCloud, where: str) -> None:
-    """InputError where sizes and opacities can be neither the logarithms nor the logits that formats store."""
-    opacities, sizes = cloud.logits, cloud.log_scales[:, :2]  # the third size is that of flat Gaussians
-    if (opacities >= 0).all() and (opacities <= 1).all() and (opacities > 0).any() and (sizes > 0).all():
+def doubtful_values(cloud: SplatCloud, where: str) -> list[str]:
+    """Sentences on values that a format stores as logarithms and logits, and that look as if they had not been taken.
+    Raises InputError: neither sizes nor opacities can be what the format says."""
+    plain_opacity = bool((cloud.logits >= 0).all() and (cloud.logits <= 1).all() and (cloud.logits > 0).any())
+    plain_size = bool((cloud.log_scales[:, :2] > 0).all())  # the third is that of flat Gaussians
+    if plain_opacity and plain_size:
         what = "sizes and opacities are plain values, where files of Gaussians hold logarithms and logits"
         expected = "negative numbers for sizes below 1 m and opacities below 0.5"
-        got = f"sizes from {sizes.min():.3g}, opacities from {opacities.min():.3g} to {opacities.max():.3g}"
+        got = f"sizes from {cloud.log_scales[:, :2].min():.3g}, opacities from {cloud.logits.min():.3g} to"
         remedy = "write log(scale) and log(opacity / (1 - opacity)) into the file"
-        raise InputError(what, where=where, expected=expected, got=got, remedy=remedy)
+        raise InputError(what, where=where, expected=expected, got=f"{got} {cloud.logits.max():.3g}", remedy=remedy)
+    found, fog = [], "if it looks like fog, write"
+    if plain_opacity:
+        stored = "all opacities lie between 0.5 and 0.73, as if values from 0 to 1 had been stored where logits are due"
+        found.append(f"{stored}: {fog} log(opacity / (1 - opacity)) into the file")
+    if plain_size:
+        stored = "all Gaussians are wider than 1 m, as if sizes had been stored where their logarithms are due"
+        found.append(f"{stored}: {fog} log(scale) into the file")
+    if len(cloud) and (cloud.logits >= 0).all() and cloud.logits.max() > 2 * MOST_LOGIT:
+        stored = "as if values from 0 to 255 had been stored where logits are due"
+        found.append(f"opacities reach {cloud.logits.max():.4g}, {stored}: all Gaussians count as solid")
+    if len(cloud) and np.median(np.abs(cloud.sh[:, 0])) > 8:
+        stored = "colours lie far beyond black and white, as if values from 0 to 255 had been stored as f_dc"
+        found.append(f"{stored}: write (colour / 255 - 0.5) / 0.2821 into the file")
+    return found
 
 
 def each_once(names: Iterable[str]) -> list[str]:

@@ -26,8 +26,8 @@ from mudg.formats.splats.cloud import (
     SplatNode,
     SplatScene,
     checked,
+    doubtful_values,
     logit,
-    refuse_plain_values,
     spacing_m,
 )
 
@@ -218,12 +218,12 @@ def read_cloud(content: bytes, name: str, choice: str = "file") -> tuple[SplatCl
     found = format_of(content, name)
     with np.errstate(over="ignore", invalid="ignore"):  # readers check what comes of numbers that overflow or are none
         file = _READERS[found](content, name)
-    refuse_plain_values(file.cloud, name)
+        doubts = doubtful_values(file.cloud, name)
     usual = {"viewer": FORMATS[found].axes, "world": axes.WORLD, "file": file.axes or FORMATS[found].axes}
     chosen = usual.get(choice, choice)
     for note in file.notes:
         log.info(f"{name}: {note}")
-    for warning in file.warnings:
+    for warning in (*file.warnings, *doubts):
         log.warn(f"{name}: {warning}")
     if file.axes and file.axes != chosen:
         stated = f"{file.axes_by} says {axes.in_words(file.axes)}"

@@ -29,6 +29,7 @@ from mudg.formats.splats.cloud import (
     SplatNode,
     SplatScene,
     checked,
+    in_words,
     joined,
     logit,
     spacing_m,
@@ -185,7 +186,7 @@ def rising(times: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 _KINDS: Final = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
-_READ: Final = (EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit")
+_READ: Final = (EXTENSION, "KHR_mesh_quantization", "KHR_node_visibility", "KHR_materials_unlit")
 """Extensions without which a file can be read, or that are read."""
 _ATTRIBUTE: Final = re.compile(
     r"POSITION|NORMAL|TANGENT|(TEXCOORD|COLOR|JOINTS|WEIGHTS)_\d+|" + re.escape(PREFIX) + r".*", re.DOTALL
@@ -213,6 +214,7 @@ class _Node(ForeignRecord):
     rotation: Four = [0.0, 0.0, 0.0, 1.0]
     translation: Three = [0.0, 0.0, 0.0]
     scale: Three = [1.0, 1.0, 1.0]
+    extensions: dict[str, Any] = {}
 
 
 class _Primitive(ForeignRecord):
@@ -241,7 +243,7 @@ class _View(ForeignRecord):
     extensions: dict[str, Any] = {}
 
 
-class _Scene(ForeignRecord):
+class _GltfScene(ForeignRecord):
     nodes: list[Size] = []
 
 
@@ -250,7 +252,7 @@ class _Document(ForeignRecord):
     extensionsUsed: list[str] = []
     extensionsRequired: list[str] = []
     scene: Size = 0
-    scenes: list[_Scene] = []
+    scenes: list[_GltfScene] = []
     nodes: list[_Node] = []
     meshes: list[_Mesh] = []
     accessors: list[_Accessor] = []
@@ -289,11 +291,16 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     if file.document.animations:
         file.warnings.append("its animations are not read: everything is where the nodes put it at rest")
     notes = (sentence(sorted(file.passed), "the document"),) if file.passed else ()
+    axes = "RDF" if file.of_old_transform(2) else ""
+    if axes:
+        reads = f"{file.generator} wrote {in_words(axes)}, where glTF has y up: read so"
+        file.warnings.append(f"{reads}; --axes viewer reads as glTF")
     extras = file.document.asset.get("extras")
     drawing = extras.get("drawing") if isinstance(extras, dict) else None
     antialias = isinstance(drawing, dict) and drawing.get("antialias") is True
     cloud = replace(joined(clouds), antialias=antialias)
-    return SplatFile(cloud, step_m=file.step_m, notes=notes, warnings=tuple(dict.fromkeys(file.warnings)))
+    by, warnings = f"its program {file.generator}", tuple(dict.fromkeys(file.warnings))
+    return SplatFile(cloud, axes, by, file.step_m, notes, warnings)
 
 
 def _moved(cloud: SplatCloud, matrix: Array, where: str) -> SplatCloud:
@@ -349,6 +356,8 @@ class _GlbFile:
             raise InputError(what, where=f"{where}: JSON", got=listed(unknown), expected=expected, remedy=remedy)
         self.passed = {name for name in self.document.extensionsUsed if name not in _READ}
         self.warnings = list[str]()
+        generator = str(self.document.asset.get("generator", ""))[:60]
+        self.generator = "".join(letter for letter in generator if letter.isprintable())
         self.note("", self.document)
         for node in self.document.nodes:
             self.note("nodes.", node)
@@ -358,6 +367,11 @@ class _GlbFile:
     def note(self, within: str, record: ForeignRecord) -> None:
         """Note the fields of a record that glTF does not have."""
         self.passed.update(within + name for name in record.model_extra or () if name not in _STANDARD)
+
+    def of_old_transform(self, before: int) -> bool:
+        """Whether splat-transform of a major version below this one wrote the file."""
+        match = re.match(r"splat-transform v?(\d{1,4})\.", self.generator)
+        return match is not None and int(match[1]) < before
 
     def entry(self, name: str, entries: Sequence[Entry], index: int) -> Entry:
         """The object that an index names."""
@@ -389,6 +403,12 @@ class _GlbFile:
                 )
                 own[:3, :3] *= scale
             matrix = matrix @ own
+            visible = node.extensions.get("KHR_node_visibility")
+            if isinstance(visible, dict) and visible.get("visible") is False:
+                self.warnings.append("nodes that the file hides were left out")
+                continue
+            if "EXT_mesh_gpu_instancing" in node.extensions:
+                self.warnings.append("instances (EXT_mesh_gpu_instancing) are not read: their mesh is there once")
             if node.mesh is not None:
                 yield matrix, self.entry("meshes", self.document.meshes, node.mesh)
             waiting += [(matrix, child, depth + 1) for child in node.children]
@@ -406,6 +426,11 @@ class _GlbFile:
         self.passed.update(f"attributes.{name}" for name in attributes if not _ATTRIBUTE.fullmatch(name))
         self.note(f"{EXTENSION}.", kind)
         self.passed.update(f"{EXTENSION}.extensions.{name}" for name in kind.extensions)
+        if kind.colorSpace is None:
+            self.warnings.append("it names no colorSpace, which the standard requires: read as sRGB")
+        for name, usual in (("projection", "perspective"), ("sortingMethod", "cameraDistance")):
+            if (stated := getattr(kind, name) or usual) != usual:
+                self.warnings.append(f"{name} {stated!r:.40} is not drawn: {usual} instead")
         means = self.values(attributes, "POSITION", 3)
         count = len(means)
         self.total += count
@@ -413,8 +438,17 @@ class _GlbFile:
             what = "the nodes of the GLB file repeat its Gaussians too often"
             raise InputError(what, where=self.where, got=f"{self.total} Gaussians")
         rotation = self.values(attributes, PREFIX + "ROTATION", 4, count)
-        logits = self._logits(self.values(attributes, PREFIX + "OPACITY", 1, count)[:, 0])
-        logs = self._logarithms(self.values(attributes, PREFIX + "SCALE", 3, count))
+        if np.abs(np.linalg.norm(rotation, axis=1) - 1).max(initial=0) > 0.05:
+            self.warnings.append("rotations are not of length 1, as the standard requires: they were brought to it")
+        opacity = self.values(attributes, PREFIX + "OPACITY", 1, count)[:, 0]
+        scale = self.values(attributes, PREFIX + "SCALE", 3, count)
+        outside = (scale < 0).any() or (np.abs(opacity - 0.5) > 0.5 + _ROUNDING).any()
+        if outside and self.of_old_transform(3):
+            words = "wrote logits and logarithms, where glTF has opacities and sizes: read so"
+            self.warnings.append(f"{self.generator} {words}")
+            logits, logs = opacity, scale
+        else:
+            logits, logs = self._logits(opacity), self._logarithms(scale)
         degrees = [d for d in range(4) if f"{PREFIX}SH_DEGREE_{d}_COEF_0" in attributes]
         if degrees != list(range(len(degrees))) or not degrees:
             what = "the harmonics of a primitive leave a degree out"

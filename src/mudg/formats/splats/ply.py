@@ -40,6 +40,8 @@ _ELEMENTS: Final = (
 )
 """Columns and elements of others that say nothing about Gaussians (from ``extrinsic`` on: ml-sharp). PLY has no closed
 list."""
+_MOTION: Final = tuple("trbf motion omega t_ time scale_t scaling_t rot_r rotation_r velocity duration".split())
+"""Beginnings of columns with which methods for moving scenes move their Gaussians."""
 _NAMES: Final = "char uchar short ushort int uint float double int8 uint8 int16 uint16 int32 uint32 float32 float64"
 _TYPES: Final = dict(zip(_NAMES.split(), 2 * "i1 u1 i2 u2 i4 u4 f4 f8".split(), strict=True))
 _ORDERS: Final = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
@@ -96,9 +98,13 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
         cloud = _filtered(cloud, np.asarray(table[filters[0]], np.float64), where)
         notes.append("the column filter_3D (Mip-Splatting) went into sizes and opacities")
     used = {*wanted, *_indexed("f_rest", rest), *_UNREAD, *filters, *(["class"] if ours else [])}
-    if passed := [name for name in names if name not in used]:
-        notes.append(sentence(passed, "element vertex"))
+    passed = [name for name in names if name not in used]
+    moving = [name for name in passed if name.lower().startswith(_MOTION)]
+    if rest_of := [name for name in passed if name not in moving]:
+        notes.append(sentence(rest_of, "element vertex"))
     warnings = [*file.warnings, *(["harmonics beyond degree 3 were dropped"] if _REST[rest] > 3 else [])]
+    if moving:
+        warnings.append(f"columns of motion over time are not read: {listed(moving)}; the Gaussians are as they rest")
     single = [axis for axis, name in enumerate("xyz") if table.dtype[name] == np.float32]
     step = spacing_m(means[:, single]) if single else 0.0
     return SplatFile(cloud, file.axes, file.axes_by, step, tuple(notes), tuple(warnings))
@@ -200,6 +206,12 @@ def read_elements(content: bytes, where: str, wanted: tuple[str, ...]) -> PlyFil
     warnings = list[str]()
     antialias = _antialias(comments, warnings)
     axes, by = _axes(comments, warnings)
+    if colors := [one.name for one in elements if "color" in one.name.lower() and one.name not in wanted]:
+        warnings.append(f"the colour space in element {listed(colors)} is not read: colours are taken as sRGB")
+    for line in comments:
+        if re.search(r"(?i)\b(offset|shift|epsg|utm|georef\w*|crs)\b", line):
+            places = "places are as the file has them (--origin-m chooses the origin)"
+            warnings.append(f"the comment {line[:80]!r} is not used: {places}")
     return PlyFile(tables, antialias, axes, by, (sentence(others, "the header"),) if others else (), tuple(warnings))
 
 

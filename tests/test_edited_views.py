@@ -1,5 +1,4 @@
-"""Edits that a diffusion model repairs: what its condition shows of an edited drive, what is pasted, what the guard
-keeps."""
+"""What a diffusion model is shown of an edited drive, and views that it repairs."""
 
 from __future__ import annotations
 
@@ -12,12 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fit_settings import fit_config
 from PIL import Image
 from test_clips import RULES, image_of_wall, stripes, view_at, wall
 from tiny_networks import small_mdm
-from toy_published import write_tiny
-from toy_world import write_scene
 
 from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
@@ -34,27 +30,20 @@ from mudg.diffusion import model_files as files
 from mudg.diffusion.condition import ConditionRules, build_conditions, image_tensor
 from mudg.diffusion.inputs import ConditionSources, InWeather, conditions_of
 from mudg.diffusion.model import MDM
-from mudg.diffusion.published import PublishedMDM
-from mudg.diffusion.requests import SampleRequest, StartClip
-from mudg.diffusion.settings import HarmonizeConfig, SynthesizeConfig
+from mudg.diffusion.settings import SynthesizeConfig
 from mudg.diffusion.synthesize import JobInputs, view_maker
-from mudg.diffusion.views import recorded_images
-from mudg.editing import harmonised
-from mudg.editing.harmonised import RenderMixer, Touched, guarded, off_path_m, pasted, soft_edge
-from mudg.editing.plan import Actor, EditPlan, EditSources, EditWorld, plan_edits
-from mudg.editing.recorded import boxes_mask, cleared_cloud, ground_mask, photos_of_edited, vacated_at
+from mudg.editing.edit import boxes_mask, cleared_cloud, photos_of_edited, vacated_at
+from mudg.editing.plan import Actor, EditPlan, EditWorld, plan_edits
+from mudg.editing.render import REPAIR_STEPS, RenderMixer, off_path_m
 from mudg.editing.script import parse_edits
 from mudg.editing.settings import EditConfig, RenderConfig
-from mudg.gaussians import fit
 from mudg.gaussians.rendering import raster_of, render_view
 from mudg.gaussians.storage import load_model
-from mudg.scene.labels import read_label
 from mudg.scene.observations import read_observations
-from mudg.scene.read import read_image, read_scene
+from mudg.scene.read import read_scene
 from mudg.sim.optics import Pinhole
 from mudg.sim.session import CameraRequest, Instant, Session
 from mudg.steps.edit import Edit
-from mudg.steps.fit import Fit
 from mudg.steps.render import RenderViews
 from mudg.steps.synthesize import Synthesize
 from mudg.viewer.live import FrameRequest, FrameSource
@@ -68,7 +57,7 @@ def drive(text: str) -> EditPlan:
     """A small box 6 m ahead, at y = -2 at first and at y = 2 after a second; and a script on it."""
     poses = np.stack([geometry.yaw_matrix(0.0, (6.0, y, 0.0)) for y in (-2.0, 2.0)])
     world = EditWorld({"box": Actor("car", CAR, Motion.recorded([0.0, 1.0], poses))})
-    return plan_edits(parse_edits(text, "edits.yaml"), world, EditSources(lambda source: None, lambda name: None))
+    return plan_edits(parse_edits(text, "edits.yaml"), world, lambda source: None)
 
 
 def photo_with_box(time_s: float, y: float) -> Photo:
@@ -77,14 +66,6 @@ def photo_with_box(time_s: float, y: float) -> Photo:
     columns = 24 - 40 * (y + np.array([0.5, -0.5])) / 5.7
     image[11:21, int(columns[0]) : int(columns[1]) + 1] = 0
     return Photo(view_at(time_s=time_s), image)
-
-
-def observed(rgb: torch.Tensor, ids: torch.Tensor) -> Observation:
-    height, width = ids.shape
-    one = torch.ones(1, height, width)
-    return Observation(
-        view_at(), rgb, torch.where(ids == ID["sky"], torch.nan, 9.0)[None], ids, one, one > 0, "virtual", "made"
-    )
 
 
 CLOUD = FusedCloud(wall(12.0, stripes), {})
@@ -207,40 +188,6 @@ def test_ground_continues_ground_and_what_is_above_continues_what_is_above() -> 
     assert torch.allclose(filled, color, atol=1e-5) and torch.equal(classes, ids)
 
 
-def test_pasting_changes_nothing_outside_of_the_mask() -> None:
-    generator = torch.Generator().manual_seed(1)
-    ids = torch.randint(0, 19, (32, 48), generator=generator)
-    one, two = (observed(torch.rand(3, 32, 48, generator=generator), ids.roll(n)) for n in (0, 1))
-    mask = np.zeros((32, 48), bool)
-    mask[8:20, 10:30] = True
-    weight = soft_edge(mask)
-    assert not bool(weight[~torch.from_numpy(mask)].any()) and float(weight.max()) == 1.0
-    assert bool((weight[14, 10:14].diff() > 0).all()) and float(weight[14, 10]) == pytest.approx(0.25)
-    made = pasted(one, two, weight)
-    for name in ("rgb", "depth", "semantics", "confidence", "mask"):
-        mine, theirs = (getattr(view, name)[..., ~torch.from_numpy(mask)].nan_to_num(-1) for view in (one, made))
-        assert torch.equal(mine, theirs), name
-    for name in ("rgb", "semantics"):
-        assert torch.equal(getattr(made, name)[..., 14, 20], getattr(two, name)[..., 14, 20])
-    nothing = pasted(one, two, torch.zeros(32, 48))
-    assert torch.equal(nothing.rgb, one.rgb) and torch.equal(nothing.semantics, one.semantics)
-
-
-def test_a_removed_car_does_not_come_back_and_an_inserted_one_does_not_vanish() -> None:
-    road, car = torch.full((32, 48), ID["road"]), torch.full((32, 48), ID["car"])
-    left, right = torch.zeros(32, 48, dtype=torch.bool), torch.zeros(32, 48, dtype=torch.bool)
-    left[8:20, 4:20], right[8:20, 26:40] = True, True
-    touched, gray = Touched(right, left, torch.zeros_like(left)), torch.full((3, 32, 48), 0.5)
-    none = np.zeros((32, 48), bool)
-    wanted = observed(gray, torch.where(right, car, road))
-    assert torch.equal(guarded(touched, wanted, wanted, none), left | right)
-    assert torch.equal(guarded(touched, wanted, observed(gray, car), none), right)
-    assert torch.equal(guarded(touched, wanted, observed(gray, road), none), left)
-    behind = none.copy()
-    behind[8:20, 4:10] = True  # somebody else drives there
-    assert torch.equal(guarded(touched, wanted, observed(gray, car), behind), right | (left & torch.from_numpy(behind)))
-
-
 # -- through the commands --------------------------------------------------------------------------
 
 FRAMES = 4
@@ -264,13 +211,6 @@ def script(folder: Path, text: str) -> Path:
     return folder / "edits.yaml"
 
 
-def rendered(run: Path, out: Path, *, shifts_m: tuple[float, ...] = (0.0,), **parts: Any) -> Path:
-    """Views of the fit. ``parts``: inputs of the verb, and ``harmonize``, settings with which they are repaired."""
-    harmonize = HarmonizeConfig(on=True, **how) if (how := parts.pop("harmonize", {})) else HarmonizeConfig()
-    settings = RenderConfig(shifts_m=shifts_m, video=False, harmonize=harmonize)
-    return RenderViews(**{"scene": run / "scene", "model": run / FITTED, **parts, "out": out}, settings=settings).run()
-
-
 def synthesized(run: Path, out: Path, settings: SynthesizeConfig, **parts: Any) -> Path:
     return Synthesize(scene=run / "scene", fused=run / "fuse", **parts, out=out, settings=settings).run()
 
@@ -280,45 +220,25 @@ def views_of(folder: Path, name: str = "front_recorded") -> list[Observation]:
     return [seen[i] for i in range(len(seen))]
 
 
-def test_a_sample_stays_at_its_start_where_it_is_not_free(run: Path) -> None:
-    model = files.load(str(run / "model"))
-    views = [view_at(time_s=0.1 * n) for n in range(2)]
-    photos = [Photo(view, image_of_wall(view, 12.0)) for view in views]
-    condition = build_conditions(CLOUD, [], views, photos, RULES)[0]
-    freedom = torch.zeros(2, 1, 32, 48)
-    freedom[..., 8:24, 8:24] = 1.0
-    road = torch.full((2, 1, 32, 48), ID["road"], dtype=torch.uint8)
-    begun = StartClip(condition.color.flip(-1), condition.depth, road, freedom)
-    free = model.sample(condition, SampleRequest(2))
-    same = model.sample(condition, SampleRequest(2, start=replace(begun, freedom=torch.ones_like(freedom))))
-    held = model.sample(condition, SampleRequest(2, start=begun))
-    assert torch.equal(free.rgb, same.rgb)  # wholly free: as without a start
-    code = model.codec.encode_rgb(begun.rgb[None])[0]
-    assert torch.equal(held.latents["rgb"][..., :, :3], code[..., :, :3])
-    assert not torch.equal(held.latents["rgb"][..., 6:10, 6:10], code[..., 6:10, 6:10])
-    with pytest.raises(UsageError, match="small models"):
-        PublishedMDM.check_request(SampleRequest(2, start=begun))
-
-
 def test_a_repaired_view_is_the_mean_of_render_and_generated_view(run: Path, tmp_path: Path) -> None:
     """Against what render writes and what the model makes of each view, mixed here in numpy: half the confidence on the
     recorded path, 1.5 times at 1.5 m; the same after an interruption."""
     shifts = {"shifts_m": (0.0, 1.5), "video": False, "device": "cpu"}
-    how = HarmonizeConfig(model=str(run / "model"), steps=1, precision="float32")
+    model = str(run / "model")
     parts = {"scene": run / "scene", "model": run / FITTED}
     plain = RenderViews(**parts, out=tmp_path / "plain", settings=RenderConfig(**shifts)).run()
     step = RenderViews(
         **parts,
         fused=run / "fuse",
         out=tmp_path / "repaired",
-        settings=RenderConfig(**shifts, repair=True, harmonize=how),
+        settings=RenderConfig(**shifts, repair=True, repair_model=model),
     )
-    again = SynthesizeConfig(model=how.model, shifts_m=(1.5,), steps=1, processes=1, precision="float32", device="cpu")
-    inputs, model = JobInputs(run / "scene", run / "fuse", run / FITTED), files.load(how.model)
+    again = SynthesizeConfig(model=model, steps=REPAIR_STEPS, processes=1, device="cpu")
+    inputs, loaded = JobInputs(run / "scene", run / "fuse", run / FITTED), files.load(model)
     result = step.run()
     for name, factor in (("front_recorded", 0.5), ("front_shift+1.5", 1.5)):
         for render, one in zip(views_of(plain, name), views_of(result, name), strict=True):
-            view = view_maker(again, inputs, [render.view], model, None).make([render.view], 0, None)[2][0]
+            view = view_maker(again, inputs, [render.view], loaded, None).make([render.view], 0, None)[2][0]
             weight = factor * view.confidence
             share = (weight / (1 + weight)).numpy()
             wanted = (1 - share) * render.rgb.numpy() + share * view.rgb.numpy()
@@ -356,7 +276,7 @@ def test_sessions_and_exact_frames_are_repaired_like_renders(run: Path) -> None:
     frame = scene.frames_of("front")[1].view
     pose = frame.world_from_cam @ geometry.from_rotation_translation(np.eye(3), [-0.5, 0.0, 0.0])
     view, camera = replace(frame, world_from_cam=pose), frame.camera
-    mixer = RenderMixer(JobInputs(run / "scene", run / "fuse", run / FITTED), HarmonizeConfig(), "cpu")
+    mixer = RenderMixer(JobInputs(run / "scene", run / "fuse", run / FITTED), device="cpu")
     render = render_view(model, view, raster)
     wanted = to_bytes(mixer(view, render).rgb)
     assert np.abs(wanted.astype(int) - to_bytes(render.rgb)).max() > 5
@@ -386,23 +306,22 @@ def test_sessions_and_exact_frames_are_repaired_like_renders(run: Path) -> None:
 
 def test_what_cannot_be_repaired_is_refused(run: Path, tmp_path: Path) -> None:
     parts = {"scene": run / "scene", "model": run / FITTED, "out": tmp_path / "out"}
-    settings = RenderConfig(shifts_m=(0.0,), video=False, repair=True)
-    with pytest.raises(UsageError, match="no --fused"):
-        RenderViews(**parts, settings=settings).run()
-    edits = script(tmp_path, CAR_GONE)
-    with pytest.raises(UsageError, match="--harmonize.on"):
-        RenderViews(**parts, fused=run / "fuse", edits=edits, settings=settings).run()
+    settings, edits = RenderConfig(shifts_m=(0.0,), video=False, repair=True), script(tmp_path, CAR_GONE)
     alone = {"source": run / FITTED, "script": edits, "scene": run / "scene", "out": tmp_path / "changed"}
-    changed = Edit(**alone, settings=EditConfig())
-    with pytest.raises(UsageError, match="as it was recorded"):
-        RenderViews(**parts | {"model": changed.run()}, fused=run / "fuse", settings=settings).run()
+    changed = {"model": Edit(**alone, settings=EditConfig()).run(), "fused": run / "fuse"}
+    for more, message in (
+        ({}, "no --fused"),
+        ({"fused": run / "fuse", "edits": edits}, "--edits or --layers"),
+        (changed, "as it was recorded"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            RenderViews(**parts | more, settings=settings).run()
     assert not (tmp_path / "out").exists()
     whole = Edit(source=run, script=edits, out=tmp_path / "whole", settings=EditConfig()).run()
     with pytest.raises(UsageError, match="as it was recorded"):
         Session(whole, device="cpu", repair=True)
-    for source, exact, message in ((whole, True, "as it was recorded"), (run, False, "only exact frames")):
-        with pytest.raises(UsageError, match=message):
-            server_of(ViewConfig(repair=True, exact=exact, images=0, port=0, device="cpu"), source, None, None)
+    with pytest.raises(UsageError, match="as it was recorded"):
+        server_of(ViewConfig(repair=True, images=0, port=0, device="cpu"), whole, None, None)
 
 
 def test_synthesize_shows_the_edited_drive(run: Path, tmp_path: Path) -> None:
@@ -419,74 +338,7 @@ def test_synthesize_shows_the_edited_drive(run: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "bad").exists()
 
 
-@pytest.fixture
-def unguarded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The render is kept nowhere, whatever the model shows: these models were not trained."""
-    monkeypatch.setattr(harmonised, "guarded", lambda touched, *_: touched.any)
-
-
-def test_renders_are_repaired_where_the_edit_touches_them(
-    run: Path, tmp_path: Path, unguarded: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(harmonised, "FEATHER_PX", 0)
-    edits, model = script(tmp_path, CAR_GONE), {"model": str(run / "model"), "steps": 2}
-    with pytest.raises(UsageError, match="--fused"):
-        rendered(run, tmp_path / "none", edits=edits, harmonize=model)
-    before, physical, made = (
-        views_of(rendered(run, tmp_path / name, fused=run / "fuse", **parts))
-        for name, parts in (
-            ("before", {}),
-            ("physical", {"edits": edits}),
-            ("made", {"edits": edits, "harmonize": model}),
-        )
-    )
-    assert len(made) == FRAMES
-    scene, changed = read_scene(run / "scene"), 0
-    for old, plain, new in zip(before, physical, made, strict=True):
-        differs = (new.rgb != plain.rgb).any(0)
-        changed += int(differs.sum())
-        boxes = [(scene.track("car").pose_at(old.view.time_s), scene.track("car").size_m)]
-        near = boxes_mask(old.view, boxes) | ground_mask(old.view, boxes)
-        assert not bool((differs & ~torch.from_numpy(near)).any())  # beside the car and its ground every bit stays
-        assert torch.equal(new.semantics[~near], plain.semantics[~near])
-    assert changed > 0
-
-
-@pytest.mark.slow
-def test_an_edited_run_with_repaired_images_is_fitted_on(run: Path, tmp_path: Path, unguarded: None) -> None:
-    """Its images say which pixels were not recorded; warps leave these out; a fit goes on with the run's own fit."""
-    harmonize = HarmonizeConfig(on=True, model=str(run / "model"), steps=1)
-    edits, repaired = script(tmp_path, CAR_GONE), EditConfig(harmonize=harmonize)
-    out = Edit(source=run, script=edits, out=tmp_path / "edited", settings=repaired).run()
-    plain = Edit(source=run, script=edits, out=tmp_path / "plain", settings=EditConfig()).run()
-    scene, other, old = read_scene(out / "scene"), read_scene(plain / "scene"), read_scene(run / "scene")
-    differ = 0
-    for frame, rendered, recorded in zip(scene.frames, other.frames, old.frames, strict=True):
-        mask, image = read_label(scene, frame, "rendered"), read_image(scene, frame)
-        assert 0 < mask.mean() < 0.9
-        assert np.array_equal(image[~mask], read_image(old, recorded)[~mask])
-        differ += int((image != read_image(other, rendered)).any(-1).sum())
-    assert differ > 0
-    photos = recorded_images(scene, SynthesizeConfig())
-    for photo, frame in zip(photos, scene.frames_in("train"), strict=True):
-        assert np.array_equal(~photo.usable, read_label(scene, frame, "rendered"))
-    parts = {"start_from": out / FITTED, "settings": fit_config(iterations=4, **FIT)}
-    again = Fit(scene=out / "scene", fused=out / "fuse", out=tmp_path / "again", **parts).run()
-    assert "car" not in fit.load_model(again).node_names()
-    with pytest.raises(InputError, match="another scene"):
-        Fit(scene=run / "scene", fused=run / "fuse", out=tmp_path / "wrong", **parts).run()
-    alone = {"source": run / FITTED, "scene": run / "scene", "out": tmp_path / "alone"}
-    with pytest.raises(UsageError, match="no images"):
-        Edit(**alone, script=edits, settings=repaired).run()
-
-
 # -- published-type models -------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def published(tmp_path_factory) -> str:
-    """A tiny model of the published kind, whose clips have 4 frames."""
-    return str(write_tiny(tmp_path_factory.mktemp("published")))
 
 
 def test_points_and_reference_of_the_published_condition_are_in_fog_at_their_own_distances() -> None:
@@ -520,24 +372,3 @@ def test_points_and_reference_of_the_published_condition_are_in_fog_at_their_own
     small = torch.nn.functional.interpolate(expected[None], size=(8, 12), mode="bilinear")[0]
     assert torch.allclose(made.reference, small, atol=0.015)
     assert torch.allclose(made.color[0][:, colored], expected[:, ::4, ::4][:, colored], atol=0.015)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"objects": 0.5}, "makes views from noise"),
-        ({"uncovered": 0.3}, "--harmonize.uncovered"),
-        ({"short": True}, "at least 4 frames"),
-    ],
-)
-def test_what_published_type_models_cannot_harmonise_is_refused_first(
-    run: Path, published: str, tmp_path: Path, settings, message
-) -> None:
-    edits, scene = script(tmp_path, CAR_GONE), run / "scene"
-    if settings.pop("short", False):
-        scene = tmp_path / "scene"
-        write_scene(scene, frames=3, cameras=("front",), width=60, height=40)
-    model = {"model": published, "steps": 1, **settings}
-    with pytest.raises(UsageError, match=message):
-        rendered(run, tmp_path / "out", scene=scene, fused=run / "fuse", edits=edits, harmonize=model)
-    assert not (tmp_path / "out").exists()

@@ -1,1 +1,0 @@
-"""Waymo Open Dataset, both file formats."""
