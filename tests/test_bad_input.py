@@ -14,17 +14,16 @@ import kitti_folders as made
 import numpy as np
 import pytest
 from bad_logs import refused
-from byte_faults import damaged
 from PIL import Image
 from toy_scene import ToyStreet
 
 from mudg.base import store
-from mudg.base.errors import InputError, MudgError, UsageError
+from mudg.base.errors import InputError, UsageError
 from mudg.formats.settings import IngestConfig
 from mudg.labels.settings import AnnotateConfig
 from mudg.scene.check import check_scene
 from mudg.scene.clouds import read_fused
-from mudg.scene.read import read_image, read_points, read_scene
+from mudg.scene.read import read_points, read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.steps.ingest import Annotate, Fuse, Ingest
 from mudg.steps.run import Run

@@ -24,7 +24,7 @@ from mudg.formats.importers import IMPORTERS, files_of
 from mudg.formats.importers.common import ImportOptions
 from mudg.formats.settings import IngestConfig
 from mudg.scene.labels import read_label
-from mudg.scene.read import read_image, read_points, read_scene
+from mudg.scene.read import read_image, read_scene
 from mudg.scene.schema import scene_to_json_text
 from mudg.steps.ingest import Ingest
 

@@ -18,7 +18,7 @@ import pytest
 import toy_splats
 from refusals import refused
 
-from mudg.base.errors import InputError, MudgError
+from mudg.base.errors import InputError
 from mudg.formats.splats import binary, formats, gltf, ply, sog, spz
 from mudg.formats.splats.cloud import SplatCloud
 

@@ -207,7 +207,12 @@ _MAX_LOG_S: Final = 4 * 3600.0
 
 
 def for_each(
-    items: Iterable[Item], work: Callable[[Item], None], title: str, total: int, workers: int, name: Callable[[Item], str]
+    items: Iterable[Item],
+    work: Callable[[Item], None],
+    title: str,
+    total: int,
+    workers: int,
+    name: Callable[[Item], str],
 ) -> None:
     """Do ``work`` on every item with a progress bar, in ``workers`` threads (0 = as many as there are processors to
     use); at most two items per worker are in memory. ``items``: read lazily, by the calling thread. ``total``: their

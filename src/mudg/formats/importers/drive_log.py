@@ -1,12 +1,5 @@
-"""The one writer of imported scenes, and logs whose sensors run on their own clocks.
-
-Every importer ends in ``write_scene``: a ``SceneContent`` holds what is small (cameras, vehicle path, notes), and turns
-one item after another (a frame, an image, a sweep) into ``SceneImage`` and ``SceneSweep``.
-
-Formats whose sensors run on their own clocks fill a ``DriveLog`` instead: every image and sweep with its own time and
-pose in the map's frame, nothing decoded yet. ``write_log`` chooses frames and moves the world to the first vehicle
-pose. Frame n is the n-th image of one camera, the reference, and what was recorded nearer to it than to its neighbours;
-``--frames`` and the held-out split go by this number.
+"""The one writer of imported scenes: every importer ends in ``write_scene``. Formats whose sensors run on their own
+clocks fill a ``DriveLog``, whose frame n is the n-th image of its first camera and what was recorded nearest to it.
 """
 
 from __future__ import annotations
@@ -136,9 +129,7 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
         for fit in content.fits.values():
             writer.add_camera(fit.camera)
         total = content.total or (len(content.items) if isinstance(content.items, Sequence) else 0)
-        common.for_each(
-            content.items, convert, f"importing {dataset}", total, options.workers, content.item_name
-        )
+        common.for_each(content.items, convert, f"importing {dataset}", total, options.workers, content.item_name)
         tracks, notes = content.tracks()
         tracks, turned = turned_back(tracks)
         notes = [*notes, *turned]
@@ -350,10 +341,9 @@ def _outside_gaps(chosen: dict[Record, int], drive: DriveLog, options: ImportOpt
 
 # --- when a box was seen --------------------------------------------------------------------------
 #
-# A turning sensor meets an object some time before or after the sweep's time stamp, and people draw the box around the
-# points as the beams met them: it belongs to the mean time of the points inside it, not to the stamp it is filed under
-# (0.8 m at 10 m/s and 0.08 s). Each such box is moved by the track's velocity to the stamp, where points, too, are
-# brought by their ``dt_s``.
+# A turning sensor meets an object some time before or after the sweep's stamp, and people draw the box around points as
+# the beams met them: it belongs to the mean time of the points inside it (0.8 m at 10 m/s and 0.08 s), and is moved by
+# the track's velocity to the stamp, where points, too, are brought by their ``dt_s``.
 MOVES_M: Final = 1.0
 """A track whose box's centre visits a region of a longer diagonal moves; other boxes stay as they were drawn."""
 REACH_S: Final = 0.05
@@ -525,9 +515,7 @@ class BoxTracks:
         row = (time_s, late_s, *size, *world_from_box[:3].ravel().tolist())
         self._rows.setdefault(track, array("d")).extend(row)
 
-    def tracks(
-        self, images_s: Mapping[float, tuple[float, float]] | None = None
-    ) -> tuple[list[Track], list[str]]:
+    def tracks(self, images_s: Mapping[float, tuple[float, float]] | None = None) -> tuple[list[Track], list[str]]:
         """All tracks in the order of their first boxes, and notes.
 
         The size is the median over the track. What stands gets one pose (median place, mean heading) from its first to

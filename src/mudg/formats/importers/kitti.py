@@ -1,24 +1,5 @@
-"""KITTI importer: raw drives, odometry and tracking sequences.
-
-What is read (the parts that are there are found by looking, and each choice is logged):
-
-=========== =============================================================================================
-images      ``image_02/data``, ``image_02``, ``image_2``, or ``image_02/<sequence>``
-scans       ``velodyne_points/data``, ``velodyne``, or ``velodyne/<sequence>``
-calibration ``calib.txt``, ``calib/<sequence>.txt``, or the day's ``calib_*_to_*.txt`` here or one folder up
-poses       ``oxts/data`` (raw) or ``oxts/<sequence>.txt``; ``poses.txt``; ``poses_velo.txt``; ``poses_cam0.txt``; also
-            in ``derived/``
-boxes       ``tracklet_labels.xml``; ``label_02.txt`` or ``label_02/<sequence>.txt``, also in ``derived/``
-times       ``timestamps.txt`` per sensor, ``times.txt``; without them 10 Hz is assumed, and said
-=========== =============================================================================================
-
-Frames. World: z up, origin and x axis at the first ego pose. The ego frame is the IMU where there is GPS/IMU data, else
-the velodyne. Camera ``image_02`` is called ``front``.
-
-Scans of raw drives are distorted by the vehicle's motion. They are untwisted here when poses come from GPS/IMU packets:
-the sensor turns counter-clockwise in 0.1 s and faces forward at the scan's time, so a point at azimuth a was measured a
-/ 2 pi turns later, and ``dt_s`` says so. The odometry and tracking benchmarks document their scans as
-compensated; those keep ``dt_s`` = 0.
+"""KITTI importer: raw drives, odometry and tracking sequences (docs/reference/formats.md). World: z up, origin and x at
+the first ego pose; the ego frame is the IMU where there is GPS/IMU data, else the velodyne.
 """
 
 from __future__ import annotations

@@ -24,8 +24,8 @@ from mudg.formats.unknown_fields import note_unknown
 
 # scans --------------------------------------------------------------------------------------------
 #
-# The sensor turns counter-clockwise in 0.1 s and faces forward at the scan's time, so a point at azimuth a was measured
-# a / 2 pi turns later.
+# The sensor turns counter-clockwise in 0.1 s and faces forward at the scan's time: a point at azimuth a is a / 2 pi
+# turns later. The odometry and tracking benchmarks document their scans as compensated.
 SENSOR: Final = "velodyne"
 TURN_PERIOD_S: Final = 0.1
 _TURN_STEPS: Final = 36

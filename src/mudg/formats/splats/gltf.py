@@ -1,7 +1,5 @@
-"""glTF 2.0 with KHR_gaussian_splatting, as one GLB file; objects are nodes of their own, which an animation moves.
-
-Axes: y up; (x, y, z) of this program is (x, z, -y). Quaternions x, y, z, w; scales in metres; opacities 0 to 1; one
-accessor per harmonic. An animation's times begin at 0. Where an object does not exist, its node has the scale `HIDDEN`.
+"""glTF 2.0 with KHR_gaussian_splatting, as one GLB file, y up: (x, y, z) of this program is (x, z, -y). Objects are
+nodes of their own, which an animation from 0 s on moves; where one does not exist, its node has the scale ``HIDDEN``.
 """
 
 from __future__ import annotations
@@ -192,8 +190,8 @@ _ATTRIBUTE: Final = re.compile(
     r"POSITION|NORMAL|TANGENT|(TEXCOORD|COLOR|JOINTS|WEIGHTS)_\d+|" + re.escape(PREFIX) + r".*", re.DOTALL
 )
 _STANDARD: Final = frozenset(
-    """extensions extras name camera skin weights indices material mode targets max min cameras images materials samplers
-    skins textures""".split()
+    """extensions extras name camera skin weights indices material mode targets max min cameras images materials
+    samplers skins textures""".split()
 )
 """Fields of glTF 2.0 that are not read."""
 _ROUNDING: Final = 1e-3
