@@ -462,9 +462,9 @@ def box_size(length: Any, width: Any, height: Any, where: str) -> tuple[float, f
 
 
 class BoxTracks:
-    """Collects boxes in any order; ``tracks`` puts them together. ``where``: file or folder of the boxes, for messages.
-    ``labels``: the data set's class -> the label here. Other classes keep the last part (after a dot) of their name in
-    lower case, and are named once in the notes. ``max_gap_s``: an object that is not seen for longer is split."""
+    """Collects boxes in any order; ``tracks`` puts them together. ``where``: file or folder of the boxes. ``labels``:
+    the data set's class -> the label here; other classes keep the last part (after a dot) of their name in lower case,
+    and are named in the notes. ``max_gap_s``: an object that is not seen for longer is split."""
 
     def __init__(self, where: str, labels: Mapping[str, str], max_gap_s: float = MAX_GAP_S) -> None:
         self._where, self._labels, self._max_gap_s = where, labels, max_gap_s
@@ -495,16 +495,14 @@ class BoxTracks:
         late_s: float = 0.0,
         where: str = "",
     ) -> None:
-        """Add one box. Raises InputError: the size is not positive or absurd, or the id is longer than 200 bytes.
+        """Add one box of the object ``track``. Raises InputError: the size is not positive or absurd, or the id is
+        longer than 200 bytes.
 
         Args:
-            track: the object's id.
-            label: of ``label_of``. The track takes its commonest one.
-            size_m: length, width, height.
+            label: of ``label_of``; the track takes its commonest one. size_m: length, width, height.
             world_from_box: f64[4, 4], x forward, y left, z up, origin in the centre.
             standing: the data set says with every box of the object that it does not move in the whole log.
-            late_s: how long after ``time_s`` the box was measured. The track's key stands at ``time_s``, moved there
-                with the object's velocity.
+            late_s: how long after ``time_s`` the box was measured; it is moved there with the object's velocity.
             where: file and record, for messages.
         """
         foreign_name(track, f"{where or self._where}: id of an object")
@@ -516,16 +514,12 @@ class BoxTracks:
         self._rows.setdefault(track, array("d")).extend(row)
 
     def tracks(self, images_s: Mapping[float, tuple[float, float]] | None = None) -> tuple[list[Track], list[str]]:
-        """All tracks in the order of their first boxes, and notes.
+        """All tracks in the order of their first boxes, and notes. Raises InputError: an object has two boxes at one
+        moment; length and width are swapped.
 
         The size is the median over the track. What stands gets one pose (median place, mean heading) from its first to
         its last moment. What may move is split where it is not seen for more than ``max_gap_s``: ``7``, ``7.1``, ...
-
-        Args:
-            images_s: time of a box -> times of the first and last image that show the object, which a track reaches to.
-
-        Raises:
-            InputError: an object has two boxes at one moment; length and width are swapped.
+        ``images_s``: time of a box -> times of the first and last image that show the object, which a track reaches to.
         """
         tracks: list[Track] = []
         split = 0

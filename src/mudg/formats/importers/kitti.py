@@ -86,9 +86,9 @@ class _Recording:
     """The files of one recording and what they tell, read in the order of the constructor.
 
     ``images``: scene camera name -> frame number -> file, ``numbers``: its KITTI number; ``scans`` may be empty.
-    ``frames``: the numbers that are imported.
-    ``image_s`` by camera and frame and ``scan_s`` by frame: seconds since the first frame, which is ``start_s`` in the
-    source. ``untwist``: whether scans are to be untwisted with the vehicle's path ``ego``.
+    ``frames``: the numbers that are imported. ``image_s`` by camera and frame and ``scan_s`` by frame: seconds since
+    the first frame, which is ``start_s`` in the source. ``untwist``: whether scans are to be untwisted with the
+    vehicle's path ``ego``.
     """
 
     def __init__(self, folder: Path, options: ImportOptions) -> None:

@@ -229,25 +229,25 @@ def read_pose_file(path: Path, frame_numbers: Sequence[int]) -> tuple[dict[int, 
     """Poses f64[4, 4] by frame number, and which sensor they are of: ``cam0`` or ``velo``.
 
     Two forms are told apart by the numbers in a line: 12 = KITTI odometry, row-major 3x4 of rectified camera 0, line k
-    for frame number k; 13 = frame number, then
-    row-major 3x4 of the velodyne in a z-up world. An empty line is a frame without a pose."""
-    lines = read_lines(path)
-    if not lines:
+    for frame number k; 13 = frame number, then row-major 3x4 of the velodyne in a z-up world. An empty line is a frame
+    without a pose."""
+    rows = {n: line_numbers(line, (12, 13), f"{path}: line {n + 1}", "pose") for n, line in read_lines(path).items()}
+    if not rows:
         raise InputError("pose file is empty", where=str(path), expected="one pose a line")
-    rows = {n: line_numbers(line, (12, 13), f"{path}: line {n + 1}", "pose") for n, line in lines.items()}
-    widths, count = {len(row) for row in rows.values()}, max(rows) + 1
+    widths = {len(row) for row in rows.values()}
     if len(widths) != 1:
         raise InputError("pose file mixes two forms", where=str(path), expected="12 or 13 numbers in every line")
+    if widths == {12} and max(rows) < max(frame_numbers):
+        what, expected = (
+            "pose file does not cover the frames",
+            f"at least {max(frame_numbers) + 1} (one per frame number)",
+        )
+        raise InputError(what, where=str(path), got=f"{max(rows) + 1} lines", expected=expected)
+    poses = rows
     if widths == {13}:
         poses = {int(row[0]): row[1:] for row in rows.values()}
         if len(poses) != len(rows) or any(number != row[0] for number, row in zip(poses, rows.values(), strict=True)):
             raise InputError("first column is not a list of distinct frame numbers", where=str(path))
-    elif count > max(frame_numbers):
-        poses = rows
-    else:
-        expected = f"at least {max(frame_numbers) + 1} (one per frame number)"
-        what = "pose file does not cover the frames"
-        raise InputError(what, where=str(path), got=f"{count} lines", expected=expected)
     sensor = "velo" if widths == {13} else "cam0"
     return {n: rigid_pose(row.reshape(3, 4), f"{path}: pose of frame {n}") for n, row in poses.items()}, sensor
 
