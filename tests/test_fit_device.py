@@ -32,9 +32,8 @@ from mudg.editing.settings import RenderConfig, ScoreConfig
 from mudg.gaussians import fit
 from mudg.gaussians.corrections import Appearance
 from mudg.gaussians.densify import DensifySettings, DensifyStats, densify
-from mudg.gaussians.fit import perception_of
-from mudg.gaussians.model import SceneModel, compose
-from mudg.gaussians.nodes import SkyNode, StaticNode
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.nodes import StaticNode
 from mudg.gaussians.rendering import render_planes
 from mudg.gaussians.schedule import FiniteCheck
 from mudg.gaussians.settings import FitConfig

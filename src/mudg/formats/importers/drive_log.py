@@ -1,12 +1,5 @@
-"""The one writer of imported scenes, and logs whose sensors run on their own clocks.
-
-Every importer ends in ``write_scene``: a ``SceneContent`` holds what is small (cameras, vehicle path, notes), and turns
-one item after another (a frame, an image, a sweep) into ``SceneImage`` and ``SceneSweep``.
-
-Formats whose sensors run on their own clocks fill a ``DriveLog`` instead: every image and sweep with its own time and
-pose in the map's frame, nothing decoded yet. ``write_log`` chooses frames and moves the world to the first vehicle
-pose. Frame n is the n-th image of one camera, the reference, and what was recorded nearer to it than to its neighbours;
-``--frames`` and the held-out split go by this number.
+"""The one writer of imported scenes: every importer ends in ``write_scene``. Formats whose sensors run on their own
+clocks fill a ``DriveLog``, whose frame n is the n-th image of its first camera and what was recorded nearest to it.
 """
 
 from __future__ import annotations
@@ -348,10 +341,9 @@ def _outside_gaps(chosen: dict[Record, int], drive: DriveLog, options: ImportOpt
 
 # --- when a box was seen --------------------------------------------------------------------------
 #
-# A turning sensor meets an object some time before or after the sweep's time stamp, and people draw the box around the
-# points as the beams met them: it belongs to the mean time of the points inside it, not to the stamp it is filed under
-# (0.8 m at 10 m/s and 0.08 s). Each such box is moved by the track's velocity to the stamp, where points, too, are
-# brought by their ``dt_s``.
+# A turning sensor meets an object some time before or after the sweep's stamp, and people draw the box around points as
+# the beams met them: it belongs to the mean time of the points inside it (0.8 m at 10 m/s and 0.08 s), and is moved by
+# the track's velocity to the stamp, where points, too, are brought by their ``dt_s``.
 MOVES_M: Final = 1.0
 """A track whose box's centre visits a region of a longer diagonal moves; other boxes stay as they were drawn."""
 REACH_S: Final = 0.05
@@ -454,9 +446,6 @@ _ROW: Final = 17  # time, delay, size, pose
 _MIN_STEP_S: Final = 0.05
 _SAME_TIME_S: Final = 1e-4
 _NAMED: Final = 5
-Speeds = Callable[[NDArray[np.float64], Matrix, Sequence[NDArray[np.intp]]], Matrix]
-"""Times f64[n] at which an object was measured, its places f64[n, 3], the pieces of its track (indices) -> velocities
-f64[n, 3] m/s."""
 
 
 def box_size(length: Any, width: Any, height: Any, where: str) -> tuple[float, float, float]:
@@ -473,9 +462,9 @@ def box_size(length: Any, width: Any, height: Any, where: str) -> tuple[float, f
 
 
 class BoxTracks:
-    """Collects boxes in any order; ``tracks`` puts them together. ``where``: file or folder of the boxes, for messages.
-    ``labels``: the data set's class -> the label here. Other classes keep the last part (after a dot) of their name in
-    lower case, and are named once in the notes. ``max_gap_s``: an object that is not seen for longer is split."""
+    """Collects boxes in any order; ``tracks`` puts them together. ``where``: file or folder of the boxes. ``labels``:
+    the data set's class -> the label here; other classes keep the last part (after a dot) of their name in lower case,
+    and are named in the notes. ``max_gap_s``: an object that is not seen for longer is split."""
 
     def __init__(self, where: str, labels: Mapping[str, str], max_gap_s: float = MAX_GAP_S) -> None:
         self._where, self._labels, self._max_gap_s = where, labels, max_gap_s
@@ -506,16 +495,14 @@ class BoxTracks:
         late_s: float = 0.0,
         where: str = "",
     ) -> None:
-        """Add one box. Raises InputError: the size is not positive or absurd, or the id is longer than 200 bytes.
+        """Add one box of the object ``track``. Raises InputError: the size is not positive or absurd, or the id is
+        longer than 200 bytes.
 
         Args:
-            track: the object's id.
-            label: of ``label_of``. The track takes its commonest one.
-            size_m: length, width, height.
+            label: of ``label_of``; the track takes its commonest one. size_m: length, width, height.
             world_from_box: f64[4, 4], x forward, y left, z up, origin in the centre.
             standing: the data set says with every box of the object that it does not move in the whole log.
-            late_s: how long after ``time_s`` the box was measured. The track's key stands at ``time_s``, moved there
-                with the object's velocity.
+            late_s: how long after ``time_s`` the box was measured; it is moved there with the object's velocity.
             where: file and record, for messages.
         """
         foreign_name(track, f"{where or self._where}: id of an object")
@@ -526,20 +513,13 @@ class BoxTracks:
         row = (time_s, late_s, *size, *world_from_box[:3].ravel().tolist())
         self._rows.setdefault(track, array("d")).extend(row)
 
-    def tracks(
-        self, speeds: Speeds | None = None, images_s: Mapping[float, tuple[float, float]] | None = None
-    ) -> tuple[list[Track], list[str]]:
-        """All tracks in the order of their first boxes, and notes.
+    def tracks(self, images_s: Mapping[float, tuple[float, float]] | None = None) -> tuple[list[Track], list[str]]:
+        """All tracks in the order of their first boxes, and notes. Raises InputError: an object has two boxes at one
+        moment; length and width are swapped.
 
         The size is the median over the track. What stands gets one pose (median place, mean heading) from its first to
         its last moment. What may move is split where it is not seen for more than ``max_gap_s``: ``7``, ``7.1``, ...
-
-        Args:
-            speeds: how velocities are found; None = from the neighbouring boxes of a piece.
-            images_s: time of a box -> times of the first and last image that show the object, which a track reaches to.
-
-        Raises:
-            InputError: an object has two boxes at one moment; length and width are swapped.
+        ``images_s``: time of a box -> times of the first and last image that show the object, which a track reaches to.
         """
         tracks: list[Track] = []
         split = 0
@@ -571,7 +551,7 @@ class BoxTracks:
                 continue
             pieces = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(times) > self._max_gap_s) + 1)
             split += len(pieces) > 1
-            velocity = (speeds or neighbour_speeds)(times + rows[:, 1], poses[:, :3, 3], pieces)
+            velocity = _speeds(times + rows[:, 1], poses[:, :3, 3], pieces)
             poses[:, :3, 3] -= velocity * rows[:, 1:2]
             for part, piece in enumerate(pieces):
                 keys = times[piece], poses[piece]
@@ -610,7 +590,7 @@ def turned_back(tracks: Sequence[Track]) -> tuple[list[Track], list[str]]:
     return mended, [f"headings that flip by 180 degrees were turned back: {some}"] if names else []
 
 
-def neighbour_speeds(measured_s: NDArray[np.float64], places: Matrix, pieces: Sequence[NDArray[np.intp]]) -> Matrix:
+def _speeds(measured_s: NDArray[np.float64], places: Matrix, pieces: Sequence[NDArray[np.intp]]) -> Matrix:
     """Velocities of an object's boxes, f64[n, 3]: from the neighbours on both sides within each of the ``pieces`` of
     its track, or from the one there is."""
     velocity = np.zeros_like(places)
