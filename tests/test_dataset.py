@@ -473,7 +473,7 @@ def test_layers_of_render_are_those_of_the_views_and_say_how_far_to_trust_them(
             assert 0 <= view["trust"]["determined"] <= 1
 
 
-def test_a_scene_in_memory_is_filmed_and_saved_with_its_edits(run: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_scene_in_memory_is_filmed_saved_and_exported_with_its_edits(run: tuple[Path, Path], tmp_path: Path) -> None:
     scene, fitted = mudg.read_scene(run[0]), mudg.FittedScene.read(run[1])
     path = mudg.camera_path(scene, mudg.Camera.from_fov("mine", 64, 48, 80.0), shift_m=0.5)
     pictures = list(fitted.render_path(path))
@@ -488,10 +488,9 @@ def test_a_scene_in_memory_is_filmed_and_saved_with_its_edits(run: tuple[Path, P
     assert np.array_equal(again.rgb, before.rgb) and car not in saved.object_ids
     with pytest.raises(UsageError, match="there already"):
         empty.save(tmp_path / "saved")
-    fits = (run[1], tmp_path / "saved")
-    files = [mudg.export("ply", fit, out=tmp_path / f"{n}.ply", time_s=now.time_s) for n, fit in enumerate(fits)]
+    files = [one.export("ply", tmp_path / f"{len(one)}.ply", time_s=now.time_s) for one in (fitted, empty)]
     assert files[0].stat().st_size > files[1].stat().st_size
     with pytest.raises(UsageError, match="no export format"):
-        mudg.export("obj", run[1], out=tmp_path / "x.obj")
+        fitted.export("obj", tmp_path / "x.obj")
     above = mudg.camera_path(scene, name="up+1.0").views[0].center_world[2]
     assert above == pytest.approx(scene.frames_of("front")[0].view.center_world[2] + 1.0)

@@ -235,5 +235,4 @@ def test_from_python(run: Path, tmp_path: Path) -> None:
         s.render(view.camera, view.world_from_cam, view.time_s).rgb for s in (stopped, mudg.FittedScene.read(made))
     ]
     assert np.array_equal(*pictures)
-    kept = stopped.save(tmp_path / "stopped")
-    assert mudg.export_asset(kept, "car", out=tmp_path / "car.safetensors", scene=run / "scene").is_file()
+    assert fitted.export_asset("car", tmp_path / "car.safetensors", scene).is_file()

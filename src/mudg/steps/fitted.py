@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import shutil
+import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -134,6 +135,19 @@ class FittedScene:
         drive = carry_out(read_edits(script), self._model, scene)
         return FittedScene(drive.model(self._model, keep_ego=True))
 
+    def export_asset(self, track_id: str, out: str | Path, scene: Scene | None = None) -> Path:
+        """Write one object to a file (``.safetensors``, replaced if it exists) that edit scripts can insert. scene: the
+        log, for the sides from which it was seen."""
+        from mudg.base.run_folder import ResultFile
+        from mudg.editing.apply import complete_asset, write_asset
+        from mudg.editing.model import asset_of
+
+        model, views = self._model, () if scene is None else tuple(frame.view for frame in scene.frames)
+        asset = complete_asset(model, track_id, views) if views else asset_of(model, track_id)
+        with ResultFile.open(Path(out), "asset export", {"id": track_id}, {}, overwrite=True) as file:
+            write_asset(file.staged(), asset)
+            return file.finish({"id": track_id})
+
     def gaussians(self, time_s: float) -> Gaussians:
         """All Gaussians in the world at a time, activated, on the CPU (see ``mudg.Gaussians``). Objects that are not
         there then have opacity 0; the sky is not among them."""
@@ -159,6 +173,15 @@ class FittedScene:
         store.write_manifest(part)
         part.rename(folder)
         return folder
+
+    def export(self, format: str, out: str | Path, **settings: Any) -> Path:
+        """Write the scene, with its edits, for another program, as ``mudg.export`` does. format: ``ply``, ``spz``,
+        ``glb``, ``usdz``, ``sog`` and so on. settings: such as ``time_s=1.5``. UsageError: no such format, or not its
+        setting."""
+        from mudg.steps import functions
+
+        with tempfile.TemporaryDirectory() as scratch:
+            return functions.export(format, self.save(Path(scratch) / "fit"), out=Path(out), **settings)
 
     def render_path(self, path: Trajectory | Iterable[View]) -> Iterator[Picture]:
         """Pictures along a path (``mudg.camera_path``), drawn as they are asked for. Errors as in ``render``."""
