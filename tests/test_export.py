@@ -311,7 +311,7 @@ def test_colmap_binaries_hold_the_poses_and_one_rig(tmp_path: Path) -> None:
     files = colmap_files(both)
     sensors = sensors_from_rig(both)
     assert np.allclose(sensors["front"], np.eye(4))
-    rigs = [len(one.frames) for one in rig_frames(both, sensors)]
+    rigs = [len(frames) for _, frames in rig_frames(both, sensors)]
     assert rigs == [2, 2, 1, 1]
 
     def pose_of(seven: tuple[float, ...]) -> np.ndarray:
