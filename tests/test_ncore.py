@@ -29,12 +29,11 @@ from mudg.base import geometry
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.types import Camera, EgoPath, Frame, Scene, SweepPoints
 from mudg.formats.exporters.messages import LogRecords
-from mudg.formats.exporters.ncore import sensor_ids, write_ncore
+from mudg.formats.exporters.ncore import PoseKeys, package, sensor_ids, write_ncore
 from mudg.formats.importers import RECOGNISERS
 from mudg.formats.importers import ncore as importer
 from mudg.formats.importers.common import ImportOptions
 from mudg.formats.importers.images import brown_conrady, equidistant, fit_images
-from mudg.formats.ncore import PoseKeys, package
 from mudg.scene.labels import read_label
 from mudg.scene.read import open_files, read_points
 

@@ -20,7 +20,7 @@ from mudg.base import geometry, store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Scene
 from mudg.core.edit import HeightMap
-from mudg.formats.ncore import MICRO, PoseKeys, shutter_type
+from mudg.formats.exporters.ncore import MICRO, PoseKeys, shutter_type
 from mudg.formats.splats import ply
 from mudg.formats.splats.cloud import SplatScene
 from mudg.formats.splats.usd import to_package
