@@ -4,6 +4,7 @@ clocks fill a ``DriveLog``, whose frame n is the n-th image of its first camera 
 
 from __future__ import annotations
 
+import itertools
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -227,11 +228,8 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
     chosen = _outside_gaps(_without_missing(_choose_frames(drive, options), options), drive, options)
     records = sorted(chosen, key=lambda record: record.time_s)
     start_s, end_s = records[0].time_s, records[-1].time_s
-    counts: Counter[str] = Counter()
-    numbers: dict[Record, int] = {}
-    for record in records:
-        numbers[record] = counts[record.sensor]
-        counts[record.sensor] += 1
+    counts = {record.sensor: itertools.count() for record in records}
+    numbers = {record: next(counts[record.sensor]) for record in records}
     near = (drive.ego.times_s >= start_s - _EGO_MARGIN_S) & (drive.ego.times_s <= end_s + _EGO_MARGIN_S)
     if not near.any():
         raise InputError("no vehicle pose lies in the time of the chosen frames", where=drive.where)
