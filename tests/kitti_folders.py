@@ -220,6 +220,19 @@ def write_derived(root: Path, drive: Drive | None = None) -> Path:
     return root
 
 
+def write_object(root: Path, frames: Sequence[int] = (8,)) -> Path:
+    """The single-frame object layout."""
+    drive = Drive(frames)
+    write_images(root / "image_2", frames, 6)
+    write_scans(root / "velodyne", {n: still_scan(drive, 0.1 * n) for n in frames}, 6)
+    (root / "label_2").mkdir(parents=True)
+    for number in frames:
+        write_calibration_text(root / "calib" / f"{number:06d}.txt")
+        dont_care = "DontCare -1 -1 -10 5 5 9 9 -1 -1 -1 -1000 -1000 -1000 -10"
+        (root / "label_2" / f"{number:06d}.txt").write_text(label_line(0.1 * number, "") + "\n" + dont_care + "\n")
+    return root
+
+
 def write_tracking(root: Path, sequence: str = "0003", drive: Drive | None = None) -> Path:
     """The tracking layout: ``image_02/<sequence>`` and so on, one file of GPS/IMU packets per sequence."""
     drive = drive or Drive()

@@ -48,7 +48,7 @@ def test_camera_projects_as_the_projection_matrix_does_and_day_calibration_equal
     assert worst(one.velo_from_cam(3), other.velo_from_cam(3)) < 1e-12
 
 
-def test_a_rounded_rotation_becomes_exact(tmp_path: Path) -> None:
+def test_rounded_rotation_becomes_exact_and_a_scaled_one_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "calib.txt"
     made.write_calibration_text(path)
     rounded = [f"{v:.4f}" for v in geometry.yaw_matrix(0.3)[:3, :3].ravel()]
@@ -56,6 +56,8 @@ def test_a_rounded_rotation_becomes_exact(tmp_path: Path) -> None:
     path.write_text(text.replace(made.numbers(np.eye(3)), " ".join(rounded)))
     rotation = read_calibration_text(path).rect0_from_velo[:3, :3]
     assert worst(rotation @ rotation.T, np.eye(3)) < 1e-14
+    path.write_text(text.replace(made.numbers(np.eye(3)), made.numbers(1.01 * np.eye(3))))
+    refused("pose is scaled", read_calibration_text, path)
 
 
 # --- raw drives -----------------------------------------------------------------------------------
@@ -162,6 +164,18 @@ def test_tracking_layout_needs_its_sequence_named(tmp_path: Path) -> None:
     assert worst(scene.tracks[0].world_from_object, truth) < 1e-4
 
 
+def test_object_frame(tmp_path: Path) -> None:
+    root = made.write_object(tmp_path / "training")
+    scene = ingest(root, tmp_path / "out")
+    assert len(scene.frames) == len(scene.sweeps) == 1
+    assert worst(scene.ego.world_from_ego[0], np.eye(4)) == 0
+    (track,) = scene.tracks  # the DontCare row is no box
+    assert worst(track.world_from_object[0], invert(made.world_from_velo(0.8)) @ made.world_from_car(0.8)) < 1e-6
+    made.write_object(tmp_path / "many", frames=(3, 8))
+    refused("unrelated frames", ingest, tmp_path / "many", tmp_path / "out2", raises=UsageError)
+    assert len(ingest(tmp_path / "many", tmp_path / "out2", sequence="000008").frames) == 1
+
+
 def test_explicit_files_win_over_those_found(tmp_path: Path) -> None:
     (tmp_path / "drive").mkdir()
     root = made.write_derived(tmp_path / "drive")
@@ -172,6 +186,20 @@ def test_explicit_files_win_over_those_found(tmp_path: Path) -> None:
     scene = ingest(root, tmp_path / "out", poses=still, boxes=none)
     assert worst(scene.ego.world_from_ego, np.stack([np.eye(4)] * 6)) == 0
     assert scene.tracks == ()
+
+
+def test_track_with_a_gap_is_split_where_it_is_long(tmp_path: Path) -> None:
+    drive = made.Drive(tuple(range(14)))
+    (tmp_path / "drive").mkdir()
+    root = made.write_derived(tmp_path / "drive", drive)
+    rows = [made.label_line(0.1 * n, f"{n} 7 ") for n in drive.frames if n not in (2, 3, 6, 7, 8, 9, 10, 11)]
+    (root / "derived" / "label_02.txt").write_text("\n".join(rows) + "\n")
+    scene = ingest(root, tmp_path / "out")
+    spans = {t.id: (round(float(t.times_s[0]), 3), round(float(t.times_s[-1]), 3)) for t in scene.tracks}
+    assert spans == {"7": (0.0, 0.5), "7.1": (1.2, 1.3)}
+    short_gap = scene.track("7").pose_at(0.25)
+    assert worst(short_gap, invert(made.world_from_velo(0)) @ made.world_from_car(0.25)) < 1e-6
+    assert any("0.55 s and were split" in note for note in scene.source.notes)
 
 
 # --- real pieces ----------------------------------------------------------------------------------

@@ -25,8 +25,6 @@ from toy_scene import ToyStreet
 from mudg.base import store
 from mudg.base.errors import UsageError
 from mudg.benchmarks import chain
-from mudg.benchmarks import run as bench
-from mudg.benchmarks.settings import BenchConfig
 from mudg.city.config import CityConfig
 from mudg.core import trajectory
 from mudg.diffusion import convert
@@ -115,15 +113,11 @@ STEPS: dict[str, tuple[tuple[str, ...], Callable[[Given, int], Any]]] = {
     "fill": (("scene", "fused"), _fill),
 }
 """Verb -> its inputs by name, and the step from these in variants 1 and 2, which differ in the settings."""
-VERBS: Final = {**{name: inputs for name, (inputs, _) in STEPS.items()}, "bench": ("model",)}
+VERBS: Final = {name: inputs for name, (inputs, _) in STEPS.items()}
 
 
 def call(name: str, given: Given, out: Path, variant: int, overwrite: bool) -> None:
-    if name == "bench":
-        config = BenchConfig(model=str(given["model"]), seed=variant, precision="float32", threads=1)
-        bench.run("mdm", config, out, overwrite=overwrite)
-    else:
-        STEPS[name][1](given, variant)(out=out, overwrite=overwrite).run()
+    STEPS[name][1](given, variant)(out=out, overwrite=overwrite).run()
 
 
 @pytest.fixture(scope="module")
@@ -289,19 +283,6 @@ def listed(folder: Path) -> dict[str, Any]:
     return {n: f["sha256"] for n, f in store.read_json(folder / store.MANIFEST)["files"].items()}
 
 
-@pytest.fixture
-def quick_bench(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A measurement that only writes some files."""
-
-    def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
-        for number in range(4):
-            store.write_text(out / "clips" / f"{number}.safetensors", f"{number} {config.seed}")
-        return {"seed": config.seed}, "table"
-
-    monkeypatch.setitem(bench.BENCHES, "mdm", measure)
-
-
-@pytest.mark.usefixtures("quick_bench")
 @pytest.mark.parametrize("name", VERBS)
 def test_an_interrupted_replacement_keeps_the_old_result_and_continues(
     name: str, world: Given, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -1,5 +1,5 @@
-"""KITTI importer: raw drives, odometry and tracking sequences (docs/reference/formats.md). World: z up, origin and x at
-the first ego pose; the ego frame is the IMU where there is GPS/IMU data, else the velodyne.
+"""KITTI importer: raw drives, odometry and tracking sequences, single object frames (docs/reference/formats.md). World:
+z up, origin and x at the first ego pose; the ego frame is the IMU where there is GPS/IMU data, else the velodyne.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Matrix = NDArray[np.float64]
 # scans --------------------------------------------------------------------------------------------
 #
 # The sensor turns counter-clockwise in 0.1 s and faces forward at the scan's time: a point at azimuth a is a / 2 pi
-# turns later. The odometry and tracking benchmarks document their scans as compensated.
+# turns later. The benchmarks document their scans as compensated.
 SENSOR: Final = "velodyne"
 TURN_PERIOD_S: Final = 0.1
 _TURN_STEPS: Final = 36
@@ -180,7 +180,7 @@ def rotation_entry(table: Mapping[str, NDArray[np.float64]], keys: tuple[str, ..
 
 
 def read_calibration_text(path: Path) -> KittiCalibration:
-    """Tracking or odometry calibration: P0..P3, R0_rect (odometry: none), Tr_velo_to_cam, Tr_imu_to_velo."""
+    """Object, tracking or odometry calibration: P0..P3, R0_rect (odometry: none), Tr_velo_to_cam, Tr_imu_to_velo."""
     table = read_number_table(path)
     projections = {n: table_entry(table, (f"P{n}",), (3, 4), path) for n in range(4) if f"P{n}" in table}
     rectify, rectify_keys, imu_keys = np.eye(4), ("R0_rect", "R_rect"), ("Tr_imu_to_velo", "Tr_imu_velo")
@@ -242,21 +242,24 @@ def read_pose_file(path: Path, frame_numbers: Sequence[int]) -> tuple[dict[int, 
     """Poses f64[4, 4] by frame number, and which sensor they are of: ``cam0`` or ``velo``.
 
     Two forms are told apart by the numbers in a line: 12 = KITTI odometry, row-major 3x4 of rectified camera 0, line k
-    for frame number k; 13 = frame number, then row-major 3x4 of the velodyne in a z-up world. An empty line is a frame
-    without a pose."""
+    for frame number k (or, in a file that has just one line per frame, for the k-th frame); 13 = frame number, then
+    row-major 3x4 of the velodyne in a z-up world. An empty line is a frame without a pose."""
     rows = {n: line_numbers(line, (12, 13), f"{path}: line {n + 1}", "pose") for n, line in read_lines(path).items()}
     if not rows:
         raise InputError("pose file is empty", where=str(path), expected="one pose a line")
     widths = {len(row) for row in rows.values()}
     if len(widths) != 1:
         raise InputError("pose file mixes two forms", where=str(path), expected="12 or 13 numbers in every line")
-    if widths == {12} and max(rows) < max(frame_numbers):
-        what, expected = (
-            "pose file does not cover the frames",
-            f"at least {max(frame_numbers) + 1} (one per frame number)",
-        )
-        raise InputError(what, where=str(path), got=f"{max(rows) + 1} lines", expected=expected)
-    poses = rows
+    poses, count = rows, max(rows) + 1
+    if widths == {12} and count <= max(frame_numbers):
+        if not len(rows) == count == len(frame_numbers):
+            what, got = "pose file does not cover the frames", f"{count} lines"
+            expected = f"{len(frame_numbers)} (one per frame) or at least {max(frame_numbers) + 1} (one per number)"
+            raise InputError(what, where=str(path), got=got, expected=expected)
+        poses = dict(zip(frame_numbers, rows.values(), strict=True))
+        if frame_numbers[-1] - frame_numbers[0] >= count:
+            words = f"{path} has a line for each of the {count} frames"
+            log.warn(f"kitti: {words}: line k is taken for the k-th of them, gaps or not")
     if widths == {13}:
         poses = {int(row[0]): row[1:] for row in rows.values()}
         if len(poses) != len(rows) or any(number != row[0] for number, row in zip(poses, rows.values(), strict=True)):
@@ -349,7 +352,7 @@ _TRACKLET_POSE = frozenset(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KittiBox:
-    """One annotated box. ``track``: its number. ``label``: lower-case class, e.g. ``car``.
+    """One annotated box. ``track``: its number; object labels count lines. ``label``: lower-case class, e.g. ``car``.
     ``size_m``: length, width, height. ``sensor_from_box``: box frame (x forward, y left, z up, origin in the centre) to
     the velodyne, f64[4, 4]."""
 
@@ -360,22 +363,24 @@ class KittiBox:
     sensor_from_box: Matrix
 
 
-def read_label_text(path: Path, rect0_from_velo: Matrix) -> list[KittiBox]:
-    """Boxes of a tracking label file (17 columns and optionally a score), which are given in rectified camera 0;
-    ``DontCare`` regions are left out. Raises InputError: another number of columns, values that are no finite numbers,
-    or a size that makes no sense."""
+def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = None) -> list[KittiBox]:
+    """Boxes of a tracking label file (17 columns and optionally a score), or, with the number of its ``frame``, of an
+    object label file (15). They are given in rectified camera 0; ``DontCare`` regions are left out. Raises InputError:
+    another number of columns, values that are no finite numbers, or a size that makes no sense."""
     velo_from_rect0 = invert(rect0_from_velo)
     boxes = []
+    skip = 2 if frame is None else 0
     for index, line in read_lines(path).items():
         columns, where = line.split(), f"{path}: line {index + 1}"
-        if len(columns) not in (17, 18):
-            what, expected = "label line has the wrong number of columns", "17 (or 18 with a score)"
-            remedy = "is this a tracking label file?"
+        if len(columns) - skip not in (15, 16):
+            what, expected = "label line has the wrong number of columns", f"{15 + skip} (or {16 + skip} with a score)"
+            remedy = "is this a tracking or an object label file?"
             raise InputError(what, where=where, got=str(len(columns)), expected=expected, remedy=remedy)
-        if columns[2] == "DontCare":
+        if columns[skip] == "DontCare":
             continue
         try:
-            number, track, values = int(columns[0]), int(columns[1]), [float(text) for text in columns[3:]]
+            number, track = (frame, index) if frame is not None else (int(columns[0]), int(columns[1]))
+            values = [float(text) for text in columns[skip + 1 :]]
         except ValueError as error:
             raise InputError("label value is not a number", where=where, got=str(error)) from error
         if not np.isfinite(values).all():
@@ -386,7 +391,7 @@ def read_label_text(path: Path, rect0_from_velo: Matrix) -> list[KittiBox]:
         c, s = np.cos(turn), np.sin(turn)
         rotation = np.array([(c, 0.0, -s), (s, 0.0, c), (0.0, -1.0, 0.0)]).T
         pose = velo_from_rect0 @ from_rotation_translation(rotation, np.array([x, y - height / 2, z]))
-        boxes.append(KittiBox(number, track, columns[2].lower(), size_m, pose))
+        boxes.append(KittiBox(number, track, columns[skip].lower(), size_m, pose))
     return boxes
 
 
@@ -477,10 +482,19 @@ def build_tracks(
             pose = velo_at(time_s + late_s)
         label, here = collected.label_of(box.label), f"{where}: track {name}, frame {box.frame}"
         collected.add(name, label, time_s, box.size_m, pose @ box.sensor_from_box, late_s=late_s, where=here)
-    found, notes = collected.tracks()
+    found, notes = collected.tracks(_speeds)
     if outside:
         notes.insert(0, f"{outside} boxes lie in frames that were not imported and were left out")
     return sorted(found, key=lambda track: [int(part) for part in track.id.split(".")]), notes
+
+
+def _speeds(measured_s: NDArray[np.float64], places: Matrix, pieces: Sequence[NDArray[np.intp]]) -> Matrix:
+    """Velocities f64[n, 3] by second-order differences within each piece of a track; 0 where it is one box."""
+    velocity = np.zeros_like(places)
+    for piece in pieces:
+        if len(piece) > 1:
+            velocity[piece] = np.gradient(places[piece], measured_s[piece], axis=0)
+    return velocity
 
 
 # importer -----------------------------------------------------------------------------------------
@@ -497,10 +511,12 @@ def looks_like_kitti(source: Path) -> bool:
 
 
 def files_of_kitti(source: Path, options: ImportOptions) -> LogFiles:
-    """The folder, with the calibration and poses beside it; of a folder with many sequences only what is chosen."""
+    """The folder, with the calibration and poses beside it; of a folder with many sequences or frames only what is
+    chosen."""
     beside = sorted(p for p in (*source.parent.glob("calib_*.txt"), *_odometry_poses(source)) if p.is_file())
-    wanted = options.sequence
-    chosen = [path for path in sorted(source.glob("*/*")) if wanted and path.stem == wanted]
+    wanted, number = options.sequence, int(options.sequence) if options.sequence.isdigit() else -1
+    paths = sorted(source.glob("*/*")) if wanted else ()
+    chosen = [p for p in paths if p.stem == wanted or (p.stem.isdigit() and int(p.stem) == number)]
     if not chosen:
         return LogFiles((source, *beside))
     here = [path for path in sorted(source.iterdir()) if path.is_file() or path.name == "derived"]
@@ -548,17 +564,19 @@ class _Recording:
     """The files of one recording and what they tell, read in the order of the constructor.
 
     ``images``: scene camera name -> frame number -> file, ``numbers``: its KITTI number; ``scans`` may be empty.
-    ``frames``: the numbers that are imported. ``image_s`` by camera and frame and ``scan_s`` by frame: seconds since
-    the first frame, which is ``start_s`` in the source. ``untwist``: whether scans are to be untwisted with the
-    vehicle's path ``ego``.
+    ``single``: one frame of the object benchmark, without a clock or motion. ``frames``: the numbers that are imported.
+    ``image_s`` by camera and frame and ``scan_s`` by frame: seconds since the first frame, which is ``start_s`` in the
+    source. ``untwist``: whether scans are to be untwisted with the vehicle's path ``ego``.
     """
 
     def __init__(self, folder: Path, options: ImportOptions) -> None:
         self.folder, self.options = folder, options
         self.notes: list[str] = []
+        benchmark = (folder / "image_2").is_dir() and (folder / "calib").is_dir()
+        self.single = benchmark and not (folder / "times.txt").is_file()
         self._find_files()
         stamps = self._read_stamps()
-        self.frames = self._complete_frames(stamps)
+        self.frames = [self._single_frame()] if self.single else self._complete_frames(stamps)
         self.calibration = self._read_calibration()
         self._set_clock(stamps)
         if options.poses is not None and not options.poses.exists():
@@ -573,7 +591,7 @@ class _Recording:
     # --- files and frames ---
 
     def _find_files(self) -> None:
-        sequence, where = self.options.sequence, str(self.folder)
+        sequence, where = "" if self.single else self.options.sequence, str(self.folder)
         images: dict[str, dict[int, Path]] = {}
         for folder in CAMERA_NAMES:
             names = (f"{folder}/data", f"{folder}/{sequence}", f"{folder.replace('_0', '_')}/{sequence}")
@@ -599,6 +617,21 @@ class _Recording:
         self.scans = scans or numbered_files(self.folder / "velodyne" / sequence, (".bin",))
         self._streams = {**self.images, **({SENSOR: self.scans} if self.scans else {})}
 
+    def _single_frame(self) -> int:
+        numbers, options = list(next(iter(self.images.values()))), self.options
+        if options.sequence.isdigit() and int(options.sequence) in numbers:
+            numbers = [int(options.sequence)]
+        if options.frames is not None:
+            numbers = [n for n in numbers if options.frames[0] <= n < options.frames[1]]
+        if len(numbers) != 1:
+            what, where = "an object-benchmark folder holds unrelated frames; a scene is one of them", str(self.folder)
+            got = f"{len(numbers)} frames: {common.number_ranges(numbers)}"
+            raise UsageError(what, where=where, expected="--sequence with one frame number, e.g. 000008", got=got)
+        if self.scans and numbers[0] not in self.scans:
+            where = str(self.folder / "velodyne")
+            raise InputError("frame has no scan", where=where, expected=f"{numbers[0]:06d}.bin")
+        return numbers[0]
+
     def _complete_frames(self, stamps: Stamps) -> list[int]:
         """The frames that all chosen cameras and scans have, with a time stamp where there are any."""
         streams, recorded = self._streams, set().union(*self._streams.values())
@@ -611,7 +644,8 @@ class _Recording:
         return frames
 
     def _read_calibration(self) -> KittiCalibration:
-        path = common.first_file(self.folder / "calib.txt", self.folder / "calib" / f"{self.options.sequence}.txt")
+        name = f"{self.frames[0]:06d}" if self.single else self.options.sequence
+        path = common.first_file(self.folder / "calib.txt", self.folder / "calib" / f"{name}.txt")
         if path is not None:
             return read_calibration_text(path)
         for day in (self.folder, self.folder.parent):
@@ -631,7 +665,7 @@ class _Recording:
             folder = next(iter(found.values())).parent
             paths[name] = common.first_file(folder.parent / "timestamps.txt", folder / "timestamps.txt", shared)
         files = [path for path in paths.values() if path is not None]
-        if len(files) < len(paths):
+        if self.single or len(files) < len(paths):
             return {}
         if self.scans:
             paths[SENSOR] = common.first_file(self.folder / "velodyne_points" / "timestamps.txt", shared, *files)
@@ -648,7 +682,8 @@ class _Recording:
         """The recording's clock: measured, or 10 Hz from the first frame on, which is noted."""
         self.start_s, self._measured = 0.0, bool(stamps)
         if not stamps:
-            self.notes.append("no timestamps in the source: 10 Hz assumed, image and scan of a frame at one moment")
+            if not self.single:
+                self.notes.append("no timestamps in the source: 10 Hz assumed, image and scan of a frame at one moment")
             self.scan_s = {n: (n - self.frames[0]) * FRAME_PERIOD_S for n in self.frames}
             self.image_s = dict.fromkeys(self.images, self.scan_s)
             return
@@ -760,14 +795,16 @@ class _Recording:
             raise InputError("box file does not exist", where=str(boxes_file))
         names = ("tracklet_labels.xml", "label_02.txt", f"label_02/{self.options.sequence}.txt")
         paths = [*(folder / name for name in names), *(folder / "derived" / name for name in names[:2])]
-        found = boxes_file or common.first_file(*paths)
+        object_label = folder / "label_2" / f"{self.frames[0]:06d}.txt"
+        found = boxes_file or common.first_file(*paths, *([object_label] if self.single else []))
         if found is None:
             self.notes.append("no boxes found: everything counts as static")
             return []
         if found.suffix == ".xml":
             boxes = read_tracklets(found)
         else:
-            boxes = read_label_text(found, self.calibration.rect0_from_velo)
+            frame = self.frames[0] if self.single and found in (boxes_file, object_label) else None
+            boxes = read_label_text(found, self.calibration.rect0_from_velo, frame)
         velo_at = self.velo_at if self.untwist else None
         tracks, notes = build_tracks(boxes, world_from_velo, self.scan_s, str(found), velo_at)
         self.notes += [f"boxes from {found.name}", *notes]
