@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mudg.base import geometry, log, store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Scene, Trajectory, View
-from mudg.formats.importers.kitti_files import line_numbers
+from mudg.formats.importers.kitti import line_numbers
 
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 FAR_M = 5.0

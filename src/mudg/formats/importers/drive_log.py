@@ -4,6 +4,7 @@ clocks fill a ``DriveLog``, whose frame n is the n-th image of its first camera 
 
 from __future__ import annotations
 
+import itertools
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -227,11 +228,8 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
     chosen = _outside_gaps(_without_missing(_choose_frames(drive, options), options), drive, options)
     records = sorted(chosen, key=lambda record: record.time_s)
     start_s, end_s = records[0].time_s, records[-1].time_s
-    counts: Counter[str] = Counter()
-    numbers: dict[Record, int] = {}
-    for record in records:
-        numbers[record] = counts[record.sensor]
-        counts[record.sensor] += 1
+    counts = {record.sensor: itertools.count() for record in records}
+    numbers = {record: next(counts[record.sensor]) for record in records}
     near = (drive.ego.times_s >= start_s - _EGO_MARGIN_S) & (drive.ego.times_s <= end_s + _EGO_MARGIN_S)
     if not near.any():
         raise InputError("no vehicle pose lies in the time of the chosen frames", where=drive.where)
@@ -446,6 +444,9 @@ _ROW: Final = 17  # time, delay, size, pose
 _MIN_STEP_S: Final = 0.05
 _SAME_TIME_S: Final = 1e-4
 _NAMED: Final = 5
+Speeds = Callable[[NDArray[np.float64], Matrix, Sequence[NDArray[np.intp]]], Matrix]
+"""Times f64[n] at which an object was measured, its places f64[n, 3], the pieces of its track (indices) -> velocities
+f64[n, 3] m/s."""
 
 
 def box_size(length: Any, width: Any, height: Any, where: str) -> tuple[float, float, float]:
@@ -513,13 +514,16 @@ class BoxTracks:
         row = (time_s, late_s, *size, *world_from_box[:3].ravel().tolist())
         self._rows.setdefault(track, array("d")).extend(row)
 
-    def tracks(self, images_s: Mapping[float, tuple[float, float]] | None = None) -> tuple[list[Track], list[str]]:
+    def tracks(
+        self, speeds: Speeds | None = None, images_s: Mapping[float, tuple[float, float]] | None = None
+    ) -> tuple[list[Track], list[str]]:
         """All tracks in the order of their first boxes, and notes. Raises InputError: an object has two boxes at one
         moment; length and width are swapped.
 
         The size is the median over the track. What stands gets one pose (median place, mean heading) from its first to
         its last moment. What may move is split where it is not seen for more than ``max_gap_s``: ``7``, ``7.1``, ...
-        ``images_s``: time of a box -> times of the first and last image that show the object, which a track reaches to.
+        ``speeds``: how velocities are found; None = from the neighbouring boxes of a piece. ``images_s``: time of a box
+        -> times of the first and last image that show the object, which a track reaches to.
         """
         tracks: list[Track] = []
         split = 0
@@ -551,7 +555,7 @@ class BoxTracks:
                 continue
             pieces = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(times) > self._max_gap_s) + 1)
             split += len(pieces) > 1
-            velocity = _speeds(times + rows[:, 1], poses[:, :3, 3], pieces)
+            velocity = (speeds or neighbour_speeds)(times + rows[:, 1], poses[:, :3, 3], pieces)
             poses[:, :3, 3] -= velocity * rows[:, 1:2]
             for part, piece in enumerate(pieces):
                 keys = times[piece], poses[piece]
@@ -590,7 +594,7 @@ def turned_back(tracks: Sequence[Track]) -> tuple[list[Track], list[str]]:
     return mended, [f"headings that flip by 180 degrees were turned back: {some}"] if names else []
 
 
-def _speeds(measured_s: NDArray[np.float64], places: Matrix, pieces: Sequence[NDArray[np.intp]]) -> Matrix:
+def neighbour_speeds(measured_s: NDArray[np.float64], places: Matrix, pieces: Sequence[NDArray[np.intp]]) -> Matrix:
     """Velocities of an object's boxes, f64[n, 3]: from the neighbours on both sides within each of the ``pieces`` of
     its track, or from the one there is."""
     velocity = np.zeros_like(places)

@@ -24,7 +24,7 @@ from mudg.formats.importers import common
 from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
 from mudg.formats.importers.drive_log import BoxTracks, SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.formats.importers.images import ImageFit, fit_images, image_notes, image_size
-from mudg.formats.importers.kitti_files import (
+from mudg.formats.importers.kitti import (
     SENSOR,
     line_numbers,
     pinhole_camera,
