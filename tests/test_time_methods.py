@@ -24,10 +24,9 @@ from mudg.baselines import emernerf as radiance_loop
 from mudg.baselines import emernerf as rays
 from mudg.baselines import pvg
 from mudg.baselines.bezier import BezierNode, bernstein, distance_change, fit_path
-from mudg.baselines.omnire import DeformationField, DeformedNode
+from mudg.baselines.omnire import DeformationField, DeformedNode, FlatNetwork, waves
 from mudg.baselines.pvg import VibrationNode, starting_columns
 from mudg.baselines.s3gaussian import HexPlaneNode, plane_smoothness
-from mudg.baselines.timed import FlatNetwork, waves
 from mudg.core import losses, metrics
 from mudg.core.grids import PlaneSizes
 from mudg.core.raster.rasterize import RasterConfig
@@ -511,7 +510,12 @@ FOREIGN = {
 
 
 @pytest.mark.parametrize("method, flag", FOREIGN.items())
-def test_settings_of_other_methods_are_refused(method, flag):
+def test_help_shows_the_settings_of_a_method_and_others_are_refused(method, flag):
+    page = command.help_page(Fit, everything=True, choice=method)
+    assert flag not in page.split() and "--iterations" in page
+    assert flag in command.help_page(Fit, everything=True).split()
+    assert command.chosen(Fit, ["--out", "x", f"--method={method}"]) == method
+    assert command.chosen(Fit, ["--method", method]) == method
     value = {"--radiance.size": "tiny"}.get(flag, "1")
     words = ["scene", "--out", "x", "--method", method, flag, value]
     assert flag in str(refused(f"does not apply to --method {method}", command.parse, Fit, words, raises=UsageError))

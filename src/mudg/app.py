@@ -149,7 +149,8 @@ def _help(verb: str, words: Sequence[str]) -> str | None:
         lines = [f"usage: mudg {verb} WORD [flags]", "", *_listed(steps.groups()[verb])]
         return "\n".join([*lines, "", f"mudg {verb} WORD --help lists its flags."])
     cls, part = steps.step_class(verb), next((word for word in words if not word.startswith("-")), "")
-    return command.help_page(cls, everything="--help-all" in words, part=part if part in cls.parts else "")
+    part, choice = part if part in cls.parts else "", command.chosen(cls, words)
+    return command.help_page(cls, everything="--help-all" in words, part=part, choice=choice)
 
 
 def _listed(names: Sequence[str]) -> list[str]:

@@ -154,13 +154,22 @@ def _flag_words(name: str, value: Any) -> list[str]:
     return [flag_name(name), *(map(str, value) if isinstance(value, tuple | list) else [str(value)])]
 
 
+def chosen(cls: type[Step], words: Sequence[str]) -> str:
+    """The value of the verb's ``choice`` in a command line that asks for help; "" if there is none."""
+    plain = [part for word in _plain_flags(words) for part in word.split("=", 1)]
+    kind = next((one.kind for one in options(cls) if cls.choice and one.name == cls.choice), None)
+    after = [b for a, b in zip(plain, plain[1:]) if a == flag_name(cls.choice)]
+    return after[-1] if after and after[-1] in get_args(kind) else ""
+
+
 # -- help ------------------------------------------------------------------------------------------
 _FLAG_COLUMNS = 26
 
 
-def help_page(cls: type[Step], *, everything: bool, part: str = "") -> str:
+def help_page(cls: type[Step], *, everything: bool, part: str = "", choice: str = "") -> str:
     """A verb's page of help. ``everything``: all settings with their whole texts; else those that most people need,
-    with the first sentence of each. ``part``: only what this part of the verb takes."""
+    with the first sentence of each. ``part``: only what this part of the verb takes. ``choice``: only settings that
+    apply to this value of the verb's ``choice``."""
     head = f"mudg {cls.verb()}{f' {part}' if part else ''}"
     examples = [line for line in cls.examples if line.startswith(f"{head} ") or not part]
     shown = examples if everything or part else examples[:3]
@@ -175,20 +184,24 @@ def help_page(cls: type[Step], *, everything: bool, part: str = "") -> str:
     own, settings = [one for one in rows if one.own], [one for one in rows if not one.own]
     if part:
         own, settings = ([one for one in rows if cls.applies(part, one.name, one.text)] for rows in (own, settings))
+    if choice:
+        settings = [one for one in settings if cls.suits(choice, one.name)]
     hidden = 0
     if not everything and cls.short and not part:
         chosen = [one for one in settings if one.name in cls.short]
         hidden, settings = len(settings) - len(chosen), chosen
     names = {one.name for one in own}
     common = [one for one in common_options() if one.name not in names]
-    tables = {"inputs and outputs:": own, "settings:": settings, "every command:": common if everything else []}
+    title = f"settings of {flag_name(cls.choice)} {choice}:" if choice else "settings:"
+    tables = {"inputs and outputs:": own, title: settings, "every command:": common if everything else []}
     for title, rows in tables.items():
         if rows:
             lines += ["", title, *(line for one in rows for line in _row(cls, one, everything))]
     if not everything:
         short = " ".join(flag_name(one.name) + (" PATH" if one.kind is not bool else "") for one in common)
         lines += ["", f"every command: {short}"]
-        lines += [f"{hidden} more settings, and longer texts: mudg {cls.verb()} --help-all"] * bool(hidden)
+        words = f" {flag_name(cls.choice)} {choice}" if choice else ""
+        lines += [f"{hidden} more settings, and longer texts: mudg {cls.verb()}{words} --help-all"] * bool(hidden)
     return "\n".join(lines)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self, cast, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, cast, get_args
 
 from mudg.base import config as configuration
 from mudg.base.errors import UsageError
@@ -32,6 +32,7 @@ class Fit(Watched):
     )
     smaller = "smaller images (mudg ingest --resolution), fewer Gaussians (--start.gaussians, --densify.max-gaussians)"
     result = "model"
+    choice: ClassVar[str] = "method"
     version = 3
     files = (*MODEL_FILES, "appearance.json", "appearance.safetensors", "field.safetensors", "preview/*.png", "steps/")
     short = ("method", "iterations", "cameras", "width_px", "sh_degree", "seed", "device", "densify.max_gaussians")
@@ -53,15 +54,20 @@ class Fit(Watched):
     @classmethod
     def settings_from(cls, inputs: Mapping[str, Any], file: Path | None, given: Mapping[str, Any]) -> FitConfig:
         """UsageError for a setting that was given and does not apply to the method."""
-        from mudg.gaussians.settings import has_setting
-
         settings = super().settings_from(inputs, file, given)
         for name in configuration.dotted(given):
-            if not has_setting(settings.method, name):
-                own = [method for method in get_args(hint_of(type(settings), "method")) if has_setting(method, name)]
+            if not cls.suits(settings.method, name):
+                own = [method for method in get_args(hint_of(type(settings), "method")) if cls.suits(method, name)]
                 what, remedy = f"this setting does not apply to --method {settings.method}", "leave it out"
                 raise UsageError(what, where=flag_name(name), expected=f"one of {', '.join(own)}", remedy=remedy)
         return settings
+
+    @classmethod
+    def suits(cls, choice: str, name: str) -> bool:
+        """See ``Step``: settings of a method."""
+        from mudg.gaussians.settings import has_setting
+
+        return has_setting(choice, name)
 
     @property
     def reads_scene_alone(self) -> bool:

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 FORMATS = ("kitti360", "waymo", "nuscenes", "argoverse2", "pandaset", "nuplan", "ncore", "custom", "kitti")
 
 
+OF_A_LOG = ("format", "frames", "cameras", "sequence", "poses", "boxes", "resolution", "skip_missing", "untwist")
+"""Settings that a generated city does not have."""
+
+
 class Ingest(Output):
     """Convert a driving log, or the built-in city, to a scene directory."""
 
@@ -39,6 +43,9 @@ class Ingest(Output):
         *("resolution", "frames", "cameras", "sequence", "test_every"),
         *("city.seed", "city.n_frames", "city.width", "city.height"),
     )
+    parts = {"city": "Generate a city: a scene with exact truth."} | {
+        name: f"Convert a log in the format {name} to a scene directory." for name in FORMATS
+    }
     log: Annotated[str, Flag("[FORMAT] LOG [OUT]", "first")]
     """LOG: folder of a dataset log, a scene directory, or the word city. FORMAT: its format, only needed if it is not
     recognised. OUT: the folder to write, in place of --out."""
@@ -63,6 +70,10 @@ class Ingest(Output):
         if left:
             raise UsageError("too many words", expected=usage(cls), got=" ".join(words))
         return values
+
+    @classmethod
+    def applies(cls, part: str, name: str, text: str) -> bool:
+        return name not in OF_A_LOG if part == "city" else not name.startswith("city.") and name != "format"
 
     @functools.cached_property
     def kind(self) -> str:

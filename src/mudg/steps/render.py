@@ -78,7 +78,7 @@ class RenderViews(Output):
         views = partial(render.write_views, self.settings, self.scene, model, edited, path=self.path, fused=self.fused)
         if not self.settings.lidar and not self.settings.layers:
             return views
-        from mudg.datasets import layers
+        from mudg.datasets.write import write_layers
         from mudg.scene.read import read_scene
         from mudg.sim import lidar as sweeps
 
@@ -88,7 +88,7 @@ class RenderViews(Output):
         def make(work: RunDir) -> dict[str, Any]:
             summary, drawn = views(work), (self.settings, self.scene, model, script)
             if self.settings.layers:
-                summary["layers"] = layers.write_layers(*drawn, self.path, work.path)
+                summary["layers"] = write_layers(*drawn, self.path, work.path)
             if self.settings.lidar:
                 summary["lidar"] = sweeps.simulate_log(*drawn, work.path)
             return summary
@@ -97,8 +97,8 @@ class RenderViews(Output):
 
 
 _FILES = (
-    *("lpips_weights", "lpips_vgg_weights", "fid_weights", "fvd_weights", "dino_weights"),
-    *("clip_weights", "detections", "lanes"),
+    *("lpips_weights", "lpips_vgg_weights", "fid_weights", "fvd_weights", "clip_weights"),
+    *("detections", "lanes"),
 )
 """Settings that name files and folders to read."""
 
@@ -191,16 +191,13 @@ class ViewScene(Step):
     """Edit script (docs/edit.md) that the page begins with."""
     edits_out: Annotated[Path | None, FILE_YAML] = None
     """Where edits made on the page are saved (without it: edits.yaml beside RUN, or in the current folder)."""
-    overwrite: bool = False
-    """Save edits over a file that mudg view did not write."""
     settings: ViewConfig
 
     def act(self) -> dict[str, Any]:
-        from mudg.viewer import live as edits
         from mudg.viewer import view
 
-        files = edits.EditFiles(self.edits, self.edits_out, self.overwrite)
-        return view.run_view(self.settings, self.source, self.compare, scene=self.scene, files=files)
+        places = {"scene": self.scene, "edits": self.edits, "edits_out": self.edits_out}
+        return view.run_view(self.settings, self.source, self.compare, **places)
 
 
 class Page(Step):

@@ -67,6 +67,8 @@ class Step:
     """Inputs that come from the run at `scene` where they are not given."""
     parts: ClassVar[Mapping[str, str]] = {}
     """First words that choose what the verb does, each with a page of help of its own, and what each does."""
+    choice: ClassVar[str] = ""
+    """The setting whose value says which other settings apply (`suits`)."""
     if typing.TYPE_CHECKING:
         __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
 
@@ -144,6 +146,11 @@ class Step:
         return True
 
     @classmethod
+    def suits(cls, choice: str, name: str) -> bool:
+        """Whether a setting, by its dotted name, applies where `choice` has this value."""
+        return True
+
+    @classmethod
     def build(
         cls, values: Mapping[str, Any], settings: Mapping[str, Any] | None = None, file: Path | None = None
     ) -> Self:
@@ -188,6 +195,7 @@ class Step:
 HOMES: Final[Mapping[str, str]] = {
     "AnnotateConfig": "mudg.labels.settings",
     "BatchConfig": "mudg.fleet.settings",
+    "BenchConfig": "mudg.benchmarks.settings",
     "ConvertConfig": "mudg.diffusion.settings",
     "DatasetConfig": "mudg.datasets.settings",
     "FuseConfig": "mudg.scene.settings",
@@ -196,7 +204,6 @@ HOMES: Final[Mapping[str, str]] = {
     "FitConfig": "mudg.gaussians.settings",
     "ServeConfig": "mudg.sim.settings",
     "SynthesizeConfig": "mudg.diffusion.settings",
-    **dict.fromkeys(("BenchConfig", "BenchOwn"), "mudg.benchmarks.settings"),
     **dict.fromkeys(("EditConfig", "RenderConfig", "ScoreConfig"), "mudg.editing.settings"),
     **dict.fromkeys(("ExportConfig", "ImportConfig"), "mudg.exporting.settings"),
     **dict.fromkeys(("PageConfig", "ViewConfig"), "mudg.viewer.settings"),
