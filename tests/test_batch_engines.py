@@ -87,12 +87,6 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return found
 
 
-def test_several_at_a_time(tmp_path: Path, undisturbed: dict[str, str]) -> None:
-    made = ListOfScenes(tmp_path)
-    assert made.start(tmp_path / "out", "--jobs", "3").wait(300) == 12
-    assert ends(tmp_path / "out") == undisturbed and made.runs() == SCENES
-
-
 def test_numbered_tasks(tmp_path: Path, undisturbed: dict[str, str]) -> None:
     made = ListOfScenes(tmp_path)
     tasks = [made.start(tmp_path / "out", "--shard", "env/3", JOB_COMPLETION_INDEX=str(index)) for index in range(3)]

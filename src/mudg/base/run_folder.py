@@ -590,9 +590,10 @@ class ResultFile:
     ``complete``: the same command has finished before and the file is as it was written."""
 
     def __init__(self, out: Path, verb: str, key: str, forms: Sequence[Path]) -> None:
-        self.out, self.verb, self.key = out, verb, key
-        self.complete = False
-        self._forms = tuple(forms) or (out,)
+        self.out, self.verb, self.key, self.complete = out, verb, key, False
+        self._forms, self._lock = tuple(forms) or (out,), out.with_name(f".{out.name}.lock")
+        self.path = self.staged()
+        """Where the file is made."""
 
     @classmethod
     @contextlib.contextmanager
@@ -618,17 +619,12 @@ class ResultFile:
         """
         key = hashlib.sha256(store.json_text([verb, dict(settings), dict(inputs)], indent=None).encode()).hexdigest()
         result = cls(Path(out), verb, key, forms)
-        with locked(_lock_path(out), out):
+        with locked(result._lock, out):
             try:
                 result._examine(overwrite)
                 yield result
             finally:
                 result._tidy()
-
-    @property
-    def path(self) -> Path:
-        """Where the file is made."""
-        return self.staged()
 
     def staged(self, form: Path | None = None) -> Path:
         """Where the content of a form is made."""
@@ -681,14 +677,10 @@ class ResultFile:
 
     def _tidy(self) -> None:
         """Remove what this and earlier, killed commands left: no other is at work here."""
-        targets = (*self._forms, description_path(self.out), _lock_path(self.out))
+        targets = (*self._forms, description_path(self.out), self._lock)
         names = [re.escape(f".{one.stem}.") + r"[a-z0-9_]{8}\.part" + re.escape(one.suffix) for one in targets]
         names += [rf"\.?{re.escape(self.staged(one).name.removesuffix(one.suffix))}.*" for one in self._forms]
         left = re.compile("|".join(names))
         with contextlib.suppress(OSError):  # an error may have brought us here, and that one is to be told
             for one in [one for one in self.out.parent.iterdir() if left.fullmatch(one.name)]:
                 shutil.rmtree(one) if one.is_dir() and not one.is_symlink() else one.unlink()
-
-
-def _lock_path(out: Path) -> Path:
-    return out.with_name(f".{out.name}.lock")

@@ -110,25 +110,20 @@ def _refuse_unknown(cls: type[Step], word: str, listed: dict[str, Option]) -> No
 
 def _value(kind: Any, value: Any) -> Any:
     """The words of a flag as the plain value that its type is checked against."""
-    kind = kind if value == "None" or value == ["None"] else present(kind)
-    if value == ["None"] and type(None) in get_args(kind):
+    if value in ("None", ["None"]) and type(None) in get_args(kind):
         return None
+    kind = present(kind)
+    if isinstance(value, list) and get_origin(kind) is tuple:
+        return tuple(_value(get_args(kind)[0], word) for word in value)
     if isinstance(value, list):
-        if get_origin(kind) is tuple:
-            inner = get_args(kind)[0]
-            return tuple(_value(inner, word) for word in value)
         pairs = [word.partition("=") for word in value]
         for name, equals, folder in pairs:
             if not equals or not name or not folder:
                 got = "=".join(filter(None, (name, folder)))
                 raise UsageError("a value is not a name and a folder", expected="NAME=FOLDER", got=got)
         return {name: folder for name, _, folder in pairs}
-    if isinstance(value, str):
-        if value == "None" and type(None) in get_args(kind):
-            return None
-        choices = [choice for choice in get_args(kind) if get_origin(kind) is Literal and not isinstance(choice, str)]
-        return next((choice for choice in choices if str(choice) == value), value)
-    return value
+    choices = get_args(kind) if get_origin(kind) is Literal else ()
+    return next((choice for choice in choices if str(choice) == value), value)
 
 
 def words_of(step: Step) -> list[str]:
