@@ -20,7 +20,7 @@ from mudg.core.fusion import STATIC
 from mudg.core.metrics import LaneFacts, ViewFacts
 from mudg.core.street_scores import VEHICLE_LABELS, visible_agents
 from mudg.editing.settings import ScoreConfig
-from mudg.labels.ground import driven_path, ground_near
+from mudg.labels.evidence import driven_path, ground_near
 from mudg.labels.inputs import box_outline
 from mudg.scene.observations import ObservationSet, list_observation_sets, read_observations
 from mudg.scene.read import read_image
