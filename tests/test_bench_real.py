@@ -8,8 +8,8 @@ import pytest
 import torch
 import write_custom
 import write_pandaset
-from pandas_pickles import write_frame
 from tiny_networks import saved_mdm
+from write_pandaset import write_frame
 
 from mudg.base import store
 from mudg.base.camera_colors import ColorMap

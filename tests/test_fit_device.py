@@ -32,11 +32,11 @@ from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
 from mudg.editing.settings import RenderConfig, ScoreConfig
 from mudg.gaussians import fit
-from mudg.gaussians.appearance import Appearance
+from mudg.gaussians.corrections import Appearance
 from mudg.gaussians.densify import DensifySettings, DensifyStats, densify
+from mudg.gaussians.fit import perception_of
 from mudg.gaussians.model import SceneModel, compose
 from mudg.gaussians.nodes import SkyNode, StaticNode
-from mudg.gaussians.perception import perception_of
 from mudg.gaussians.rendering import render_planes
 from mudg.gaussians.schedule import FiniteCheck
 from mudg.gaussians.settings import FitConfig, VirtualConfig

@@ -119,7 +119,7 @@ def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_clips_floor_and_reasons(weights: Path, tmp_path: Path) -> None:
     assert [videos.clip_count(n) for n in (0, 15, 16, 23, 24, 40)] == [0, 0, 1, 1, 2, 4]
     scene = read_scene(toy_views.write_scene(tmp_path / "scene"))
-    found = videos.videos_of(ScoreConfig(fvd_weights=str(weights), device="cpu"), scene, tmp_path)
+    found = videos.videos(scene, videos.ClipFiles(weights, "videogpt", tmp_path, torch.device("cpu")))
     same = videos.ImageSet(40, toy_views.colors)
     backwards = videos.ImageSet(40, lambda n: toy_views.colors(39 - n))
     sets = videos.TrajectorySets("front_shift+2.0", "front", 48, 32, {"a": same, "b": backwards}, None)

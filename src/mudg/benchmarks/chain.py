@@ -32,7 +32,7 @@ from mudg.core.pictures import resize_area
 from mudg.core.raster.rasterize import drawing_device
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing.settings import RenderConfig
-from mudg.formats.exporters.video import Encoding, jpeg_bytes, mp4_within, video_encoders
+from mudg.formats.exporters.video import jpeg_bytes, mp4_within, video_encoders
 from mudg.gaussians.settings import FitConfig
 from mudg.scene.clouds import read_fused
 from mudg.scene.observations import ObservationSet, ObservationWriter, list_observation_sets, read_observations
@@ -243,7 +243,7 @@ class FillViews(Output):
 
 
 PANEL_WIDTH: Final = 320
-ENCODING: Final = Encoding(FPS, first_crf=29, last_crf=41, preset="veryfast")
+QUALITY: Final = (29, 41)
 VIDEO_BYTES: Final = 900 * 1024
 """A video larger than this is made anew in lower quality: eight logs of seven trajectories stay under 60 MB."""
 ROWS: Final = ("rgb", "error", "depth")
@@ -274,7 +274,7 @@ class Film(Output):
                 continue
             pictures = list(_frames(sets, list(self.views), range(len(path)) if playable else [len(path) // 2]))
             if playable:
-                video = mp4_within(lambda frames=pictures: frames, ENCODING, VIDEO_BYTES)
+                video = mp4_within(lambda frames=pictures: frames, FPS, QUALITY, VIDEO_BYTES)
                 store.atomic_write(work.path / f"{path.name}.mp4", video)
             middle = pictures[len(pictures) // 2]
             poster = resize_area(middle, middle.shape[1] // 2, middle.shape[0] // 2)

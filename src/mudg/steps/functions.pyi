@@ -108,7 +108,7 @@ def convert(
     to: str | Path,
     overwrite: bool = False,
     config: str | Path | None = None,
-    network: Literal['diffusion', 'inception', 'i3d', 'dinov2', 'clip', 'lpips', 'lpips-vgg'] = 'diffusion',
+    network: Literal['diffusion', 'inception', 'i3d', 'clip', 'lpips', 'lpips-vgg'] = 'diffusion',
     resolution: Literal['auto', '320x512', '576x1024'] = 'auto',
     dtype: Literal['keep', 'float32', 'float16', 'bfloat16'] = 'keep',
     towers: str = '',
@@ -667,11 +667,9 @@ def score(
     fid_resize: Literal['pytorch-fid', 'tf1', 'clean', 'tm', 'neurad'] = 'pytorch-fid',
     fvd_weights: str = '',
     fvd_resize: Literal['videogpt', 'google', 'stylegan-v'] = 'videogpt',
-    dino_weights: str = '',
     clip_weights: str = '',
     detections: str = '',
     lanes: str = '',
-    as_published: bool = False,
     error_pictures: bool = True,
     device: str = 'auto',
 ) -> Any:
@@ -694,13 +692,11 @@ def score(
         fid_resize: How FID's network gets its 299 x 299 pixels: as pytorch-fid, torch-fidelity (tf1), clean-fid (clean), torchmetrics (tm) or neurad-studio (neurad) do it. Numbers of different rules cannot be compared.
         fvd_weights: File with the weights of FVD's I3D network (Kinetics-400), as safetensors, a state dict or the TorchScript archive. FVD then compares clips of 16 views with those of the recorded video of the same camera (empty = not computed).
         fvd_resize: How FVD's network gets its 224 x 224 pixels: shorter side and crop (videogpt), or squashed (google, stylegan-v).
-        dino_weights: File with the weights of DINOv2, ViT-S/14 or ViT-L/14 (`dinov2_vits14_pretrain.pth`, `dinov2_vitl14_pretrain.pth`, or their tensors as safetensors). FD-DINOv2 and the consistency of a video are then computed (empty = not computed).
-        clip_weights: File with the image tower of CLIP ViT-L/14 at 336 pixels (`model.safetensors` of openai/clip-vit-large-patch14-336, or OpenAI's names). CMMD, CLIP-F and CLIP-V are then computed (empty = not computed).
+        clip_weights: File with the image tower of CLIP ViT-L/14 at 336 pixels (`model.safetensors` of openai/clip-vit-large-patch14-336, or OpenAI's names). CLIP-F and CLIP-V are then computed (empty = not computed).
         detections: File with boxes that a detector found in the views, as COCO results. NTA-IoU is then computed (empty = not computed).
         lanes: Folder with lane masks that a detector made of the views, METHOD/TRAJECTORY/000000.png. NTL-IoU is then computed (empty = not computed). Generated cities only: prepared logs have no lane lines.
-        as_published: NTA-IoU: project true boxes as the published score does, corners behind the camera included, instead of cutting them at the near plane.
         error_pictures: Write an image of the colour error at the middle view of every trajectory.
-        device: Device of the networks behind perceptual distance, LPIPS, FID, FVD, DINOv2 and CLIP: auto (CUDA if there is one), cpu, cuda, cuda:N. All other metrics run on the CPU.
+        device: Device of the networks behind perceptual distance, LPIPS, FID, FVD and CLIP: auto (CUDA if there is one), cpu, cuda, cuda:N. All other metrics run on the CPU.
     """
     ...
 
