@@ -25,7 +25,7 @@ from mudg.editing.settings import RenderConfig
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import StaticNode
 from mudg.scene.beams import beams_of, held_out, moving_tracks, training_sweeps, with_silent
-from mudg.scene.sweep_sets import read_sweep_sets
+from mudg.scene.observations import read_sweep_sets
 from mudg.scoring import sweeps as scores
 from mudg.sim.lidar import TABLES, BeamTable, LidarRequest, read_table, wanted_sweeps, write_sweeps
 from mudg.sim.returns import learn_returns, places_gone

@@ -18,7 +18,7 @@ from mudg.base.types import Camera, View
 from mudg.gaussians.model import compose
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.views import resized_view
-from mudg.scene.road import Road
+from mudg.scene.motion import Road
 from mudg.sim.optics import Pinhole
 from mudg.sim.session import CameraReply, CameraRequest, Instant, Layer, Session
 

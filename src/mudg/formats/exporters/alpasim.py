@@ -24,7 +24,7 @@ from mudg.formats.exporters.ncore import MICRO, PoseKeys, shutter_type
 from mudg.formats.splats import ply
 from mudg.formats.splats.cloud import SplatScene
 from mudg.formats.splats.usd import to_package
-from mudg.scene.road import Road
+from mudg.scene.motion import Road
 
 MOVES_M: Final = 1.0
 """Objects that go no farther stand."""
