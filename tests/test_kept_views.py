@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import torch
 from fit_settings import fit_to, interrupted, small_fit, written_street
-from pretend_device import pretend_device
 from scipy.spatial import cKDTree
 from toy_world import camera, view_at
 
@@ -99,18 +98,6 @@ def test_every_combination_of_fields_and_number_types_comes_back_to_the_bit(tmp_
     views = [replace(usual, depth=usual.depth.astype(np.float64)), replace(usual, depth=usual.depth.astype(np.float16))]
     for found, wanted in zip(filed(tmp_path, views), views, strict=True):
         assert_same(found, wanted)
-
-
-def test_views_grow_on_their_device(tmp_path):
-    stored = a_view(3)
-    with pretend_device() as there:
-        view, wanted = stored.as_tensors(there), stored.as_tensors()
-        given = [getattr(view, f.name) for f in fields(view) if isinstance(getattr(view, f.name), torch.Tensor)]
-        every = (*given, view.lidar.pixel, view.lidar.depth_m)
-        assert len(given) == 6 and all(tensor.device == there for tensor in every)
-        assert torch.equal(view.lidar.pixel.cpu(), wanted.lidar.pixel)
-        for name in ("rgb", "mask", "channels"):
-            assert torch.equal(getattr(view, name).cpu(), getattr(wanted, name))
 
 
 def test_a_mapped_array_keeps_its_values_and_has_no_name(tmp_path):
