@@ -205,19 +205,10 @@ def psnr(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float
         chosen = mask.expand_as(truth)
         prediction, truth = prediction[chosen], truth[chosen]
     pieces = zip(pieces_of(prediction, 3), pieces_of(truth, 3), strict=True)
-    return _decibels(sum(float(((made.clamp(0, 1) - true).double() ** 2).sum()) for made, true in pieces), truth)
-
-
-def psnr_of_errors(errors: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB from differences, of any sign, of values in [0, 1]; infinity without any, NaN of
-    nothing."""
-    return _decibels(sum(float(piece.double().square().sum()) for piece in pieces_of(errors)), errors)
-
-
-def _decibels(squared: float, of: Tensor) -> float:
-    if of.numel() == 0:
+    squared = sum(float(((made.clamp(0, 1) - true).double() ** 2).sum()) for made, true in pieces)
+    if truth.numel() == 0:
         return math.nan
-    return math.inf if squared == 0 else -10.0 * math.log10(squared / of.numel())
+    return math.inf if squared == 0 else -10.0 * math.log10(squared / truth.numel())
 
 
 def ssim(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
@@ -666,11 +657,8 @@ METRICS: Final[dict[str, MetricRow]] = {
     "lpips_vgg": MetricRow("LPIPS (VGG)", "", ("rgb", "LPIPS weights"), "lower", None),
     "fid": MetricRow("FID", "", ("rgb", "Inception weights"), "lower", None),
     "kid": MetricRow("KID", "", ("rgb", "Inception weights"), "lower", None),
-    "fd_dinov2": MetricRow("FD-DINOv2", "", ("rgb", "DINOv2 weights"), "lower", None),
-    "cmmd": MetricRow("CMMD", "", ("rgb", "CLIP weights"), "lower", None),
     "clip_f": MetricRow("CLIP-F", "", ("rgb", "CLIP weights"), "higher", None),
     "clip_v": MetricRow("CLIP-V", "", ("rgb", "CLIP weights"), "higher", None),
-    "subject_consistency": MetricRow("consistency (DINOv2)", "", ("rgb", "DINOv2 weights"), "higher", None),
     "fvd": MetricRow("FVD", "", ("rgb", "I3D weights"), "lower", None),
     "abs_rel": MetricRow("AbsRel", "", ("depth",), "lower", lambda: depth_error("abs_rel")),
     "rmse_m": MetricRow("RMSE", "m", ("depth",), "lower", lambda: depth_error("rmse_m")),
