@@ -28,7 +28,6 @@ from mudg.core import native_ops
 from mudg.core.raster import rasterize as place
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
-from mudg.editing.settings import RenderConfig, ScoreConfig
 from mudg.gaussians import fit
 from mudg.gaussians.corrections import Appearance
 from mudg.gaussians.densify import DensifySettings, DensifyStats, densify
@@ -37,9 +36,6 @@ from mudg.gaussians.nodes import StaticNode
 from mudg.gaussians.rendering import render_planes
 from mudg.gaussians.schedule import FiniteCheck
 from mudg.gaussians.settings import FitConfig
-from mudg.scene.observations import read_observations
-from mudg.scoring import score
-from mudg.steps.render import RenderViews, Score
 from mudg.steps.settings import RunConfig, with_device
 
 SIZE, FRAMES = (36, 24), 4
@@ -309,33 +305,3 @@ def test_steps_and_benchmarks_follow_the_device_of_a_run_unless_they_have_their_
     assert chain.at_once(config) == 1
     assert chain.at_once(replace(config, processes=3)) == 3
     assert chain.at_once(replace(config, device="cpu")) == os.cpu_count()
-
-
-# ---- render and score ----------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_render_and_score_on_another_device(world, plain_fit, tmp_path, monkeypatch):
-    drawn = RenderConfig(cameras=("front",), shifts_m=(0.0,), video=False, raster="torch", device="cpu")
-    step = RenderViews(scene=world["scene"], model=plain_fit, out=tmp_path / "here", settings=drawn)
-    with twins():
-        here = step.run()
-    step = replace(step, settings=replace(drawn, device="pretend"))
-    with pretend_device():
-        there = replace(step, out=tmp_path / "there").run()
-        assert step.run() == here  # a result is one on any device
-    mine, theirs = (read_observations(folder / "front_recorded") for folder in (there, here))
-    for index in range(len(mine)):
-        torch.testing.assert_close(mine[index].rgb, theirs[index].rgb, atol=1 / 254, rtol=0)
-    config = ScoreConfig(baseline=False, perceptual_views=2, error_pictures=False, device="cpu")
-    monkeypatch.setattr(score, "computed_ahead", lambda compute, count, threads: map(compute, range(count)))
-    scored = Score(scene=world["scene"], views={"fit": here}, out=tmp_path / "score_here", settings=config)
-    with twins():
-        scored.run()
-    with pretend_device(), transfers() as seen:
-        replace(scored, out=tmp_path / "score_there", settings=replace(config, device="pretend")).run()
-    assert {copy.where.partition(":")[0] for copy in seen if copy.values > NUMBERS} == {"networks/featnets.py"}
-    found = [store.read_json(tmp_path / name / "metrics.json") for name in ("score_here", "score_there")]
-    values = [document["by_distance"][0]["values"] for document in found]
-    assert values[0]["perceptual"] == pytest.approx(values[1]["perceptual"], rel=1e-5)
-    assert {**values[0], "perceptual": 0} == {**values[1], "perceptual": 0}

@@ -38,16 +38,6 @@ def test_psnr_known_value_mask_and_limits():
     assert metrics.psnr(truth - 5, truth) == math.inf  # clamped to [0, 1] first
 
 
-def test_psnr_of_errors_counts_too_dark_like_too_bright():
-    rng = torch.Generator().manual_seed(0)
-    truth, prediction = torch.rand(3, 9, 7, generator=rng), torch.rand(3, 9, 7, generator=rng)
-    expected = pytest.approx(metrics.psnr(prediction, truth), abs=1e-5)
-    assert metrics.psnr_of_errors(prediction - truth) == expected
-    assert metrics.psnr_of_errors(truth - prediction) == expected
-    assert metrics.psnr_of_errors(torch.zeros(4)) == math.inf
-    assert math.isnan(metrics.psnr_of_errors(torch.zeros(0)))
-
-
 def test_depth_errors_known_values():
     truth = torch.tensor([[[10.0, 20.0, 5.0, 0.0]]])
     prediction = torch.tensor([[[11.0, 30.0, 5.0, 7.0]]])

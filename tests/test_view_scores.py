@@ -137,7 +137,7 @@ def boxes_json(
 
 @pytest.mark.parametrize(
     ("moved", "confidence", "category", "expected", "cars"),
-    [(0.0, 0.9, 2, 1.0, 1.0), (0.0, 0.5, 2, 0.0, 0.0), (8.0, 0.9, 2, 0.0, 0.0), (0.0, 0.9, 7, 1.0, 0.0)],
+    [(0.0, 0.9, 2, 1.0, 1.0), (0.0, 0.5, 2, 0.0, 0.0), (0.0, 0.9, 7, 1.0, 0.0)],
 )
 def test_nta_iou_from_a_file_of_boxes(
     tmp_path: Path, log_scene: Path, moved: float, confidence: float, category: int, expected: float, cars: float

@@ -33,7 +33,6 @@ from mudg.core.weather.gbuffer import (
     from_render,
     normals_from_depth,
     openness_by_class,
-    steadied,
     world_points,
     world_rays,
 )
@@ -120,16 +119,6 @@ def test_near_kerbs_stay_steep_and_far_noise_of_the_ground_does_not() -> None:
     near, far = (normals_from_depth(view, np.full((HEIGHT, WIDTH), d, np.float32), classes) for d in (5.0, 30.0))
     np.testing.assert_allclose(near[20, 30], [-1, 0, 0], atol=1e-5)
     np.testing.assert_allclose(far[20, 30], [0, 0, 1], atol=1e-5)
-
-
-def test_guessed_light_does_not_exceed_what_a_camera_exposes_for() -> None:
-    view = forward_view()
-    scene = street(view)
-    color = np.where(scene.sky[..., None], 1.0, scene.color).astype(np.float32)
-    color[:, ::2][scene.classes[:, ::2] == ID["road"]] = 0.5
-    found = weather.estimate_surroundings([(view, replace(scene, color=color))])
-    assert float((found.ambient + found.sun).mean()) < 1.41
-    assert found.airlight.max() <= 0.8
 
 
 @pytest.mark.parametrize(("time", "share"), [("overcast", 1.0), ("dusk", 0.5)])
@@ -345,18 +334,6 @@ def test_a_drive_is_edited_image_by_image() -> None:
     haze = relight.srgb_encode(drive.surroundings.airlight[None])[0]
     assert np.abs(foggy - haze)[wall].mean() < 0.5 * np.abs(shown[0].rgb - haze)[wall].mean()
     refused("estimated from views", weather.drive_facts, [])
-
-
-def test_ripples_of_the_ground_are_smoothed_farther_than_those_of_walls() -> None:
-    """Normals that sway by ten degrees over 12 pixels: on the road they become level, on a wall not."""
-    sway = np.broadcast_to(np.radians(10) * np.sin(np.arange(96) * 2 * np.pi / 12), (64, 96))
-    normal = np.stack([np.sin(sway), np.zeros_like(sway), np.cos(sway)], -1).astype(np.float32)
-    found = {
-        name: steadied(normal, np.full((64, 96), ID[name], np.uint8), 2)[16:-16, 24:-24, 0]
-        for name in ("road", "building")
-    }
-    assert np.abs(found["road"]).max() < np.sin(np.radians(1.5))
-    assert np.abs(found["building"]).max() > np.sin(np.radians(6))
 
 
 # --- drops, flakes and LiDAR returns --------------------------------------------------------------

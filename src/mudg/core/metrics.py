@@ -205,19 +205,10 @@ def psnr(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float
         chosen = mask.expand_as(truth)
         prediction, truth = prediction[chosen], truth[chosen]
     pieces = zip(pieces_of(prediction, 3), pieces_of(truth, 3), strict=True)
-    return _decibels(sum(float(((made.clamp(0, 1) - true).double() ** 2).sum()) for made, true in pieces), truth)
-
-
-def psnr_of_errors(errors: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB from differences, of any sign, of values in [0, 1]; infinity without any, NaN of
-    nothing."""
-    return _decibels(sum(float(piece.double().square().sum()) for piece in pieces_of(errors)), errors)
-
-
-def _decibels(squared: float, of: Tensor) -> float:
-    if of.numel() == 0:
+    squared = sum(float(((made.clamp(0, 1) - true).double() ** 2).sum()) for made, true in pieces)
+    if truth.numel() == 0:
         return math.nan
-    return math.inf if squared == 0 else -10.0 * math.log10(squared / of.numel())
+    return math.inf if squared == 0 else -10.0 * math.log10(squared / truth.numel())
 
 
 def ssim(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
@@ -320,7 +311,7 @@ class Pair:
     mask: Tensor | None = None
     moving: Tensor | None = None
     view: View | None = None
-    facts: ViewFacts | None = None
+    facts: ViewFacts = ViewFacts()
 
 
 class Metric(Protocol):
@@ -470,7 +461,7 @@ class ExactMotion:
                 return None
             known = torch.isfinite(one.truth_depth) & (one.truth_depth > 0)
             frames.append(TrueFrame(one.view, torch.where(known, one.truth_depth, 1000.0), one.truth_semantics))
-        instance = before.facts and before.facts.instance
+        instance = before.facts.instance
         if instance is None:
             return pixel_motion(*frames)
         moved: dict[int, Tensor] = {}
@@ -504,7 +495,7 @@ def flicker_over_truth(motion: ExactMotion | None = None) -> Neighbours:
 def neighbour_of(pair: Pair) -> Pair:
     """What is kept of a view until the next one comes, to follow surfaces from one to the other: made and true colours,
     true depth and classes, and the instances. The rest would fill the memory at large sizes."""
-    facts = None if pair.facts is None else ViewFacts(instance=pair.facts.instance)
+    facts = ViewFacts(instance=pair.facts.instance)
     return replace(pair, depth=None, semantics=None, truth_depth_valid=None, mask=None, moving=None, facts=facts)
 
 
@@ -536,7 +527,7 @@ def _squares(apart: Tensor) -> tuple[float, int]:
 
 
 def _point_depths(pair: Pair) -> DepthErrors | None:
-    points = None if pair.facts is None else pair.facts.points
+    points = pair.facts.points
     if points is None or pair.depth is None:
         return None
     true = torch.from_numpy(points.depth)[None]
@@ -544,7 +535,7 @@ def _point_depths(pair: Pair) -> DepthErrors | None:
 
 
 def _point_colors(pair: Pair) -> tuple[float, int] | None:
-    points = None if pair.facts is None else pair.facts.points
+    points = pair.facts.points
     if points is None or pair.rgb is None or not points.colored.any():
         return None
     chosen = torch.from_numpy((points.depth > 0) & points.colored)
@@ -554,7 +545,7 @@ def _point_colors(pair: Pair) -> tuple[float, int] | None:
 
 
 def _point_classes(pair: Pair) -> Tensor | None:
-    points = None if pair.facts is None else pair.facts.points
+    points = pair.facts.points
     if points is None or pair.semantics is None:
         return None
     true = torch.from_numpy(np.where(points.depth > 0, points.classes, 255).astype(np.int64))
@@ -563,7 +554,7 @@ def _point_classes(pair: Pair) -> Tensor | None:
 
 def _agents(pair: Pair) -> tuple[float, int] | None:
     """Sum of ``street_scores.agent_ious`` and number of vehicles."""
-    agents = None if pair.facts is None else pair.facts.agents
+    agents = pair.facts.agents
     if agents is None or pair.semantics is None:
         return None
     ious = street_scores.agent_ious(agents, pair.semantics.numpy())
@@ -572,14 +563,14 @@ def _agents(pair: Pair) -> tuple[float, int] | None:
 
 def _markings(pair: Pair) -> tuple[float, float] | None:
     """Tolerant hits and union, in pixels, of the markings that a fixed rule finds with the exact ones."""
-    lanes = None if pair.facts is None else pair.facts.lanes
+    lanes = pair.facts.lanes
     if lanes is None or pair.rgb is None or not lanes.exact:
         return None
     return street_scores.tolerant_iou(street_scores.bright_stripes(pair.rgb.numpy(), lanes.road), lanes.marking)
 
 
 def _lane_edges(pair: Pair) -> float | None:
-    lanes = None if pair.facts is None else pair.facts.lanes
+    lanes = pair.facts.lanes
     if lanes is None or pair.rgb is None or not lanes.band.any():
         return None
     rows = street_scores.rows_of(lanes.band, 1)
@@ -590,7 +581,7 @@ def _lane_edges(pair: Pair) -> float | None:
 
 
 def _lane_colors(pair: Pair) -> tuple[float, int] | None:
-    lanes = None if pair.facts is None else pair.facts.lanes
+    lanes = pair.facts.lanes
     if lanes is None or pair.rgb is None or not lanes.band.any():
         return None
     band = torch.from_numpy(lanes.band)

@@ -306,7 +306,7 @@ def pair_of(
 ) -> metrics.Pair:
     """Bring a method's view to the truth's size; where it gives no depth, it counts as the depth limit (80 m).
     ``view``: of both; without it, the truth's. ``facts``: what is known of the view beside the truth."""
-    true = None if truth is None else truth.seen
+    true, facts = None if truth is None else truth.seen, facts or ViewFacts()
     view = view or (seen.view if true is None else true.view)
     height, width = view.camera.height, view.camera.width
     depth: Tensor | None = None
