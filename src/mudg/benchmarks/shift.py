@@ -87,10 +87,8 @@ class ShiftLog(Views):
         films = []
         if self.config.videos:
             films = self.film({"truth": self.truth, **{name: of[0] for name, of in views.items() if name in SHOWN}})
-        facts = city_logs.facts(self.log.seed, self.log.rules)
-        path = {"log": self.log.seed, "turn_deg": round(facts.turn_deg, 2), "length_m": round(facts.length_m, 1)}
-        movers = {"movers": facts.moving, "mover_share": round(facts.moving_share, 4), "words": facts.description}
-        return {**path, **movers, "films": films, "values": values, "seconds": seconds_of(self.out)}
+        facts = {"log": self.log.seed, **city_logs.facts(self.log.seed, self.log.rules)}
+        return {**facts, "films": films, "values": values, "seconds": seconds_of(self.out)}
 
 
 def run(
