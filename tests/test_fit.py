@@ -112,10 +112,9 @@ def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypat
     assert fitted_bytes(replace(step, out=parts).run()) == fitted_bytes(whole)
 
 
-@pytest.mark.parametrize("densify", ["gradient", "none"])
-def test_results_depend_neither_on_threads_nor_on_what_is_remembered(world, tmp_path, monkeypatch, densify):
+def test_results_depend_neither_on_threads_nor_on_what_is_remembered(world, tmp_path, monkeypatch):
     """Row counts kept between densifications, and any number of threads: the same bytes."""
-    config = settings(iterations=22, densify__kind=densify)
+    config = settings(iterations=22)
     first = fit_to(world, tmp_path / "a", config).run()
 
     def counted_again(model):
