@@ -112,10 +112,9 @@ def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypat
     assert fitted_bytes(replace(step, out=parts).run()) == fitted_bytes(whole)
 
 
-@pytest.mark.parametrize("densify", ["gradient", "none"])
-def test_results_depend_neither_on_threads_nor_on_what_is_remembered(world, tmp_path, monkeypatch, densify):
+def test_results_depend_neither_on_threads_nor_on_what_is_remembered(world, tmp_path, monkeypatch):
     """Row counts kept between densifications, and any number of threads: the same bytes."""
-    config = settings(iterations=22, densify__kind=densify)
+    config = settings(iterations=22)
     first = fit_to(world, tmp_path / "a", config).run()
 
     def counted_again(model):
@@ -210,8 +209,7 @@ def test_a_non_finite_loss_is_named_and_changes_nothing(world, tmp_path, monkeyp
     assert stepped == [1, 2, 3, 4]
 
 
-@pytest.mark.parametrize("at_once", [True, False])
-def test_a_non_finite_gradient_is_named_and_never_reaches_the_parameters(world, at_once):
+def test_a_non_finite_gradient_is_named_and_never_reaches_the_parameters(world):
     scene = read_scene(world["scene"])
     frames = fit_views.training_frames(scene, ())
     classes = fit_views.classes_of(scene, frames, {})
@@ -221,7 +219,7 @@ def test_a_non_finite_gradient_is_named_and_never_reaches_the_parameters(world, 
     model.table["log_scales"].grad[3, 1] = float("inf")
 
     def check_two_views():
-        check = FiniteCheck(9, at_once)
+        check = FiniteCheck(9)
         check.gradients("front/000001", model, Appearance({}))
         check.gradients("front/000002", model, Appearance({}))
         check.refuse()

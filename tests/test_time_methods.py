@@ -34,7 +34,7 @@ from mudg.gaussians.model import SceneModel, compose
 from mudg.gaussians.nodes import NodeRows, RigidNode, StaticNode
 from mudg.gaussians.recipes import RECIPES
 from mudg.gaussians.settings import METHODS, PUBLISHED, WEIGHTS
-from mudg.gaussians.start import columns_from_points
+from mudg.gaussians.start import StartPoints
 from mudg.scene import fuse
 from mudg.scene.clouds import read_fused
 from mudg.scene.read import read_scene
@@ -71,6 +71,11 @@ def world(tmp_path_factory) -> dict[str, Path]:
 def cars_that_walk(monkeypatch):
     """The one object of the toy street may deform, too."""
     monkeypatch.setattr(nodes, "LIMBED_LABELS", nodes.LIMBED_LABELS | {"car"})
+
+
+def black_points(xyz: np.ndarray) -> dict[str, torch.Tensor]:
+    black = np.zeros((len(xyz), 3), np.uint8)
+    return StartPoints(xyz, black, black[:, 0], np.full(len(xyz), 0.1, np.float32)).columns((), 0)
 
 
 # ---- vibration -----------------------------------------------------------------------------------
@@ -113,9 +118,7 @@ def test_vibration_agrees_with_a_plain_loop_and_its_slopes_with_differences():
 def test_what_changes_in_time_is_split_in_time(step, late, rows):
     """Of three Gaussians with small image gradients, one has a gradient of tau and a long life: it becomes two, late in
     the run three."""
-    columns = columns_from_points(
-        np.zeros((4, 3), np.float32), np.zeros((4, 3), np.uint8), None, (), 0, np.full(4, 0.1, np.float32)
-    )
+    columns = black_points(np.zeros((4, 3), np.float32))
     columns |= starting_columns(4, torch.zeros(4), 0.2) | {"log_beta": torch.tensor([0.1, 0.1, 0.1, 0.005]).log()}
     model = SceneModel(
         Table(columns, {"node": torch.zeros(4, dtype=torch.int32)}), (VibrationNode("b", 0.0, 0.1),), None, (), 0
@@ -179,9 +182,7 @@ def test_a_flat_network_is_the_network_it_stands_for():
 def test_a_deformed_object_stays_one_through_everything_a_scene_does():
     """At first it is rigid; then it moves as the field says, otherwise for other times and objects, saved and alone."""
     field, node = person()
-    columns = columns_from_points(
-        np.random.default_rng(1).random((4, 3), np.float32) - 0.5, np.zeros((4, 3), np.uint8), None, (), 0
-    )
+    columns = black_points(np.random.default_rng(1).random((4, 3), np.float32) - 0.5)
     scene = SceneModel(
         Table(columns, {"node": torch.ones(4, dtype=torch.int32)}), (StaticNode(), node, field), None, (), 0
     )

@@ -241,7 +241,7 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
         chosen = state.views.choose(config.seed, step, probability, config.virtual.beside)
         # The one way to the device; results come back in gaussians/rendering.py.
         seen = [sizes.sized(view, step).as_tensors(state.device) for view in chosen]
-        check = FiniteCheck(step, at_once=state.device.type == "cpu")
+        check = FiniteCheck(step)
         learn = partial(_learn_from, state, config=config, raster=raster, perception=perception, check=check)
         learnt = [learn(view, step=step, first=view is seen[0]) for view in seen]
         check.refuse()
