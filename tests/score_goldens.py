@@ -15,7 +15,7 @@ import toy_vit
 from test_i3d import made_up
 
 from mudg.base import store
-from mudg.networks import clip_image, dinov2, i3d, inception
+from mudg.networks import clip_image, i3d, inception
 
 PATH = Path(__file__).parent / "golden" / "score_networks.safetensors"
 KEPT = 48
@@ -48,14 +48,9 @@ def i3d_values() -> dict[str, np.ndarray]:
 
 @torch.no_grad()
 def vit_values() -> dict[str, np.ndarray]:
-    """Features of a small DINOv2 with resized positions, and of a small CLIP tower."""
+    """Features of a small CLIP tower."""
     tower = clip_image.ClipImageFeatures(toy_vit.clip_state())
-    return {
-        "dinov2": (
-            dinov2.DinoFeatures(toy_vit.dino_state())(torch.stack([dinov2.prepared(p) for p in pictures()])).numpy()
-        ),
-        "clip": tower(torch.stack([clip_image.prepared(p, tower.side) for p in pictures()])).numpy(),
-    }
+    return {"clip": tower(torch.stack([clip_image.prepared(p, tower.side) for p in pictures()])).numpy()}
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from mudg.core.native_ops import adam_columns
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table, torch_adam_columns
 from mudg.gaussians import fit
-from mudg.gaussians.appearance import Appearance, owner, rigid_motion
+from mudg.gaussians.corrections import Appearance, owner, rigid_motion
 from mudg.gaussians.model import SceneModel, compose
 from mudg.gaussians.nodes import StaticNode
 from mudg.gaussians.rendering import boxes_in_view, objects_only

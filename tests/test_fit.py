@@ -29,7 +29,7 @@ from mudg.gaussians import fit
 from mudg.gaussians import start as fit_start
 from mudg.gaussians import trust as fit_trust
 from mudg.gaussians import views as fit_views
-from mudg.gaussians.appearance import Appearance
+from mudg.gaussians.corrections import Appearance
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.schedule import FiniteCheck

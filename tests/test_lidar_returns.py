@@ -196,11 +196,9 @@ def test_held_out_and_shifted_sweeps_are_near_the_truth_and_nearer_than_moved_on
     assert set(read_sweep_sets(tmp_path)) == {"lidar_recorded", "lidar_shift+3.0"}
     rows = {(row["method"], row["shift_m"]): row["values"] for row in scores.sweep_scores(city, {"m": tmp_path})}
     for shift_m, most in ((0.0, 0.05), (3.0, 0.05)):
-        made, plain, moved = (rows[name, shift_m] for name in ("m", "m: constant", "nearest"))
+        made, moved = (rows[name, shift_m] for name in ("m", "nearest"))
         assert made["median_range_m"] < most and made["f1"] > 0.9
         assert made["median_range_m"] < 0.5 * moved["median_range_m"] and made["chamfer_m"] < moved["chamfer_m"]
-        assert made["f1"] >= plain["f1"] - 0.005 and made["intensity"] < 0.5 * plain["intensity"]
-        assert made["median_range_m"] < rows["fused", shift_m]["median_range_m"]
 
 
 def test_equal_requests_on_a_log_get_equal_bytes_and_objects_move_with_the_caller(
@@ -264,14 +262,6 @@ def test_scores_of_known_sweeps() -> None:
     perfect.add(beams, true, true)
     assert perfect.values() == {"median_range_m": 0.0, "chamfer_m": 0.0, "f1": 1.0, "intensity": 0.0}
     assert scores.SweepScores().values()["f1"] is None
-
-
-def test_points_behind_the_first_surface_do_not_answer() -> None:
-    beam = np.array([[1.0, 0.0, 0.0]])
-    points = np.array([[20.0, 0.0, 0.0], [10.0, 0.03, 0.0], [10.05, 0.0, 0.02]])
-    assert scores.first_points(beam, points, 1).tolist() == [0]
-    assert scores.first_points(beam, points, 3).tolist() == [2]
-    assert scores.first_points(-beam, points, 3).tolist() == [-1]
 
 
 def test_tables_come_by_name_and_from_files(tmp_path: Path) -> None:

@@ -272,3 +272,23 @@ def test_the_budget_makes_videos_smaller_and_without_an_encoder_pictures_stand_i
 def test_an_unscored_run_and_a_value_that_a_template_lacks_are_errors(tmp_path: Path) -> None:
     refused("file not found", written, tmp_path)
     refused("title", report_html.render, "labels.html.j2", raises=UndefinedError)
+
+
+def test_curves_are_those_of_the_logs_of_both_fits(tmp_path: Path) -> None:
+    assert report.fit_charts(tmp_path) == []
+    logs = {"street_gaussians": [(10, 20.0), (20, 24.0)], "mudg_s": [(20, 25.0), (40, 30.0)]}
+    for method, rows in logs.items():
+        (tmp_path / "fit" / method).mkdir(parents=True)
+        lines = [{"step": step, "psnr": psnr, "loss_color": 0.1} for step, psnr in rows]
+        text = "".join(json.dumps(line) + "\n" for line in [*lines, {"step": 15, "boxes_moved_m": 0.1}])
+        (tmp_path / "fit" / method / "log.jsonl").write_text(text)
+    psnr, loss = report.fit_charts(tmp_path)
+    assert [line["method"] for line in psnr["lines"]] == list(logs)
+    assert loss["title"].startswith("Loss")
+    scale = {tick["at"]: float(tick["text"]) for tick in psnr["y_ticks"]}
+    (a, va), *_, (b, vb) = scale.items()
+    steps = [(tick["at"], float(tick["text"])) for tick in psnr["x_ticks"]]
+    for line in psnr["lines"]:
+        for (x, y), (step, value) in zip(line["points"], logs[line["method"]], strict=True):
+            assert va + (y - a) * (vb - va) / (b - a) == pytest.approx(value, abs=0.05)
+            assert np.interp(x, *zip(*steps, strict=True)) == pytest.approx(step, abs=0.2)

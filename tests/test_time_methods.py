@@ -24,10 +24,9 @@ from mudg.baselines import emernerf as radiance_loop
 from mudg.baselines import emernerf as rays
 from mudg.baselines import pvg
 from mudg.baselines.bezier import BezierNode, bernstein, distance_change, fit_path
-from mudg.baselines.omnire import DeformationField, DeformedNode
+from mudg.baselines.omnire import DeformationField, DeformedNode, FlatNetwork, waves
 from mudg.baselines.pvg import VibrationNode, starting_columns
 from mudg.baselines.s3gaussian import HexPlaneNode, plane_smoothness
-from mudg.baselines.timed import FlatNetwork, waves
 from mudg.core import losses, metrics
 from mudg.core.grids import PlaneSizes
 from mudg.core.raster.rasterize import RasterConfig

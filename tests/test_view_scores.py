@@ -117,7 +117,7 @@ def test_a_still_video_does_not_flicker_and_missing_files_name_their_flags(log_s
     assert value(log_scores, "gray", HERE, "temporal_flickering") == 1.0
     assert 0.8 < value(log_scores, "right", HERE, "temporal_flickering") < 0.99
     text = score_tables.markdown(log_scores)
-    for flag in "detections lanes dino-weights clip-weights lpips-vgg-weights".split():
+    for flag in "detections lanes clip-weights lpips-vgg-weights".split():
         assert f"--{flag}" in text
 
 
@@ -187,7 +187,7 @@ def test_detected_lanes_of_a_log_are_refused(tmp_path: Path, log_scene: Path) ->
 def test_boxes_with_few_points_do_not_count(tmp_path: Path, log_scene: Path) -> None:
     scene = read_scene(log_scene)
     store.write_json(tmp_path / "boxes.json", [])
-    counting = detections.BoxDetections(scene, tmp_path / "boxes.json", as_published=False)
+    counting = detections.BoxDetections(scene, tmp_path / "boxes.json")
     view = scene.frames_of("front")[0].view
     assert [track.id for track in counting._tracks_at(view)] == ["car"]
     counting._counts[scene.sweeps[0].id]["car"] = 9
@@ -248,7 +248,7 @@ def test_ntl_iou_from_masks(city_run: tuple[Path, dict]) -> None:
     assert value(document, "right", HERE, "ntl_iou") == 100
     assert 45 < value(document, "gray", HERE, "ntl_iou") < 50
     (row,) = (r for r in document["results"] if r["method"] == "gray")
-    assert row["ntl"]["lanes"] == 0 and 45 < row["ntl"]["against_detector"] < 50
+    assert row["ntl"]["lanes"] == 0
     assert anchors(document, HERE, "ntl_iou") == {"trajectory": HERE, "metric": "ntl_iou", "truth": 100.0}
 
 

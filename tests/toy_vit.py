@@ -1,5 +1,4 @@
-"""Made-up weights under the names of DINOv2 and CLIP, small, for tests: no published numbers, but every part takes
-part."""
+"""Made-up weights under the names of CLIP, small, for tests: no published numbers, but every part takes part."""
 
 from __future__ import annotations
 
@@ -7,7 +6,7 @@ from collections.abc import Mapping
 
 import torch
 
-from mudg.networks import clip_image, dinov2
+from mudg.networks import clip_image
 
 
 def drawn(shapes: Mapping[str, tuple[int, ...]], seed: int) -> dict[str, torch.Tensor]:
@@ -18,18 +17,12 @@ def drawn(shapes: Mapping[str, tuple[int, ...]], seed: int) -> dict[str, torch.T
         noise = torch.randn(shape, generator=generator)
         if len(shape) > 1 and name.endswith(("weight", "proj")):
             noise *= (1.0 / noise[0].numel()) ** 0.5
-        elif name.endswith(("weight", "gamma")):
+        elif name.endswith("weight"):
             noise = 1 + 0.2 * noise
         else:
             noise *= 0.2
         made[name] = noise
     return made
-
-
-def dino_state(seed: int = 0, width: int = 128, blocks: int = 2, side: int = 37) -> dict[str, torch.Tensor]:
-    """All tensors of a small DINOv2, ``mask_token`` included."""
-    state = drawn(dinov2.tensor_shapes(width, blocks, side * side), seed)
-    return {**state, "mask_token": torch.zeros(1, width)}
 
 
 def clip_state(

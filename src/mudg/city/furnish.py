@@ -8,13 +8,10 @@ from mudg.city import layout as rec
 from mudg.city.config import CityConfig
 from mudg.city.layout import LEAF_COLORS, RENDER_COLORS, Color, Furnisher, Size, colors
 
-# overhead ------------------------------------------------------------------------------------------
-# What stands above a LiDAR's field of view: crowns over the road, bare trees, bridges, gantries, wires, arms, taller
-# buildings.
+# overhead -----------------------------------------------------------------------------------------
 #
-# Only in cities with ``overhead`` > 0. Nothing comes lower than `CLEARANCE_M` above the corridor of the shifted
-# cameras.
-
+# What stands above a LiDAR's field of view, in cities with ``overhead`` > 0. Nothing comes lower than `CLEARANCE_M`
+# above the corridor of the shifted cameras.
 
 CLEARANCE_M = 4.0
 BUILDING, WALL, FENCE, POLE, SIGN_CLASS, VEGETATION = 2, 3, 4, 5, 7, 8  # Cityscapes train ids
@@ -73,8 +70,10 @@ class Overhead:
 
 def add_overhead(f: Furnisher, amount: float) -> None:
     """Add what stands above the LiDAR to the records of a furnisher, in proportion to ``amount`` (0 to 1)."""
-    o = Overhead(f, amount)
-    _raise_buildings(f, amount)
+    o, tall_street = Overhead(f, amount), f.chance(0.5)
+    for row in f.rows:  # some buildings get more floors: facades that fill the image up to its upper edge
+        if row[0] == rec.BUILDING and row[7] > 7.5 and f.chance((0.7 if tall_street else 0.25) * amount):
+            row[7] += int(f.rng.integers(1, 9)) * row[16]
     for side in (-1, 1):
         if f.chance(0.75 * amount):
             _avenue(o, side)
@@ -96,14 +95,6 @@ def add_overhead(f: Furnisher, amount: float) -> None:
             _signal_arm(o, f.uniform(12, f.plan.drive_length + 50))
     if f.chance(0.3 * amount):
         _banner(o, f.uniform(15, f.plan.drive_length + 50))
-
-
-def _raise_buildings(f: Furnisher, amount: float) -> None:
-    """Some buildings of the rows get more floors: facades that fill the image up to its upper edge."""
-    tall_street = f.chance(0.5)
-    for row in f.rows:
-        if row[0] == rec.BUILDING and row[7] > 7.5 and f.chance((0.7 if tall_street else 0.25) * amount):
-            row[7] += int(f.rng.integers(1, 9)) * row[16]
 
 
 def _avenue(o: Overhead, side: int) -> None:
@@ -295,9 +286,6 @@ def _banner(o: Overhead, s: float) -> None:
     o.box((s, f.plan.ego_u, height), (0.03, f.uniform(4, 8), f.uniform(0.7, 1.3)), rgb, (BUILDING, PLAIN))
 
 
-# furnish -------------------------------------------------------------------------------------------
-
-
 # objects on the sidewalks: trees, lamps, poles, signs, bins, benches, bollards --------------------
 
 
@@ -326,10 +314,7 @@ class Sidewalk:
         parameters: tuple[float, ...] = (),
     ) -> None:
         """Place an object of half width ``across`` unless it stands in a crossing or there is no room beside the
-        corridor.
-
-        ``place``: metres along the street and from the kerb.
-        """
+        corridor. ``place``: metres along the street and from the kerb."""
         f, (s, from_kerb) = self.f, place
         if f.near_crossing(s, self.corner + across):
             return

@@ -1,9 +1,6 @@
-"""Whole generated logs for scoring scenes off the recorded path, in two lists; no model was ever trained on them.
-
-A list is not picked by eye: the seeds are walked upwards, and what has moving vehicles (`facts`) is kept. In 2.3 s the
-generator's streets turn little (half of 220 cities by less than 1.1 degrees, one in twenty by 4.7, the most by 9.6), so
-that "curved" means 5 degrees here, and half of each list is curved.
-"""
+"""A generated city as a scene directory; and whole logs for scoring scenes off the recorded path, in two lists. No
+model was ever trained on them, and they are not picked by eye: seeds are walked upwards, and what has moving vehicles
+(`facts`) is kept, half of it curved."""
 
 from __future__ import annotations
 
@@ -14,11 +11,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mudg.base import log
 from mudg.base.errors import UsageError
-from mudg.base.types import Scene, View
+from mudg.base.types import Scene
 from mudg.city.config import CityConfig
 from mudg.city.layout import plan_streets
 from mudg.city.traffic import ego_keys
@@ -26,31 +22,15 @@ from mudg.city.world import CityWorld
 from mudg.core.fusion import FusionRules, judge_track
 from mudg.scene.write import SceneWriter
 
-# records a generated city as a scene directory ----------------------------------------------------
-
-
 SENSOR = "lidar"
 
 
 def write_city(config: CityConfig, out_dir: Path | str, *, test_every: int = 4) -> Scene:
     """Generate the log of ``config`` and write it, as lossless PNG, with its exact labels (depth, semantics, sky,
-    dynamic, instance).
-
-    All cores work: the rays of a frame on the native threads, encoding and writing on the writer's. The scene is moved
-    into place when it is complete; an interrupted call leaves nothing, and the same call makes the same bytes again.
-
-    Args:
-        config: the city and its log.
-        out_dir: destination; must not hold a scene yet.
-        test_every: hold out every n-th frame of all cameras (n, 2n, ...; never the first); 0 = none.
-
-    Returns:
-        The scene, read back.
-
-    Raises:
-        ResourceError: no native library, or the folder cannot be written. InputError: there is a scene here already.
-        UsageError: ``test_every`` is negative.
-    """
+    dynamic, instance); returns the scene, read back. An interrupted call leaves nothing, and the same call makes the
+    same bytes again. ``test_every``: hold out every n-th frame of all cameras (never the first); 0 = none.
+    ResourceError: no native library, or the folder cannot be written. InputError: there is a scene here already.
+    UsageError: ``test_every`` is negative."""
     if test_every < 0:
         raise UsageError("test_every cannot be negative", got=str(test_every))
     world = CityWorld(config)
@@ -74,8 +54,11 @@ def write_world(world: CityWorld, out_dir: Path | str, test_every: int = 4) -> S
             for index in range(config.n_frames):
                 held_out = test_every > 0 and index > 0 and index % test_every == 0
                 for name in config.cameras:
-                    frame_id = f"{name}/{index:06d}"
-                    _write_frame(writer, world, frame_id, views[name][index], moving)
+                    frame_id, view = f"{name}/{index:06d}", views[name][index]
+                    truth = world.render(view, sensor_noise=config.sensor_noise)
+                    labels = {"depth": truth.depth, "semantics": truth.semantics, "sky": truth.sky}
+                    labels |= {"dynamic": moving[truth.instance], "instance": truth.instance}
+                    writer.add_frame(frame_id, view, truth.rgb_u8, labels)
                     split[frame_id] = "test" if held_out else "train"
                     progress.advance()
                 sweep = world.lidar_sweep(index)
@@ -83,13 +66,6 @@ def write_world(world: CityWorld, out_dir: Path | str, test_every: int = 4) -> S
                 progress.advance()
         writer.set_split(split)
         return writer.finish()
-
-
-def _write_frame(writer: SceneWriter, world: CityWorld, frame_id: str, view: View, moving: NDArray[np.bool_]) -> None:
-    truth = world.render(view, sensor_noise=world.config.sensor_noise)
-    labels = {"depth": truth.depth, "semantics": truth.semantics, "sky": truth.sky}
-    labels |= {"dynamic": moving[truth.instance], "instance": truth.instance}
-    writer.add_frame(frame_id, view, truth.rgb_u8, labels)
 
 
 # logs ---------------------------------------------------------------------------------------------

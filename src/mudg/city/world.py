@@ -1,7 +1,5 @@
-"""A generated city with exact truth at any view and time of its log.
-
-Needs the native library: without it, building a world raises ResourceError naming the remedy (there is no slow twin).
-"""
+"""A generated city with exact truth at any view and time of its log. Without the native library, building a world
+raises ResourceError naming the remedy (there is no slow twin)."""
 
 from __future__ import annotations
 
@@ -32,8 +30,6 @@ from mudg.city.light import draw_photos, lamp_places, light_numbers, weather_num
 from mudg.city.traffic import PosedObject, ego_keys, key_times, plan_traffic
 
 # native --------------------------------------------------------------------------------------------
-# Thin ctypes layer over the city's ray caster in the native library.
-
 
 _P, _I, _L, _U = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64, ctypes.c_uint32
 _F64, _F32, _U8, _I32 = (np.ctypeslib.ndpointer(kind, flags="C") for kind in ("f8", "f4", "u1", "i4"))
@@ -162,7 +158,6 @@ class CityHandle:
 
 # world ---------------------------------------------------------------------------------------------
 
-
 DATASET = "mudg procedural city"
 GENERATOR_VERSION = 1
 FAR_BELOW_M = 1000.0
@@ -171,15 +166,9 @@ FAR_BELOW_M = 1000.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CityTruth:
-    """Exact truth at a view. Depth, semantics and instance belong to the ray through the pixel's centre; rgb is
-    averaged over the pixel.
-
-    Args:
-        rgb: f32[H, W, 3], display values in [0, 1].
-        depth: f32[H, W], camera z in metres, +inf in the sky.
-        semantics: u8[H, W], Cityscapes train ids.
-        instance: i32[H, W], id of a vehicle or person (see ``CityWorld.tracks``), 0 = none.
-    """
+    """Exact truth at a view. ``rgb``: f32[H, W, 3], display values in [0, 1], averaged over the pixel. Of the ray
+    through the pixel's centre: ``depth`` f32[H, W], camera z in metres, +inf in the sky; ``semantics`` u8[H, W],
+    Cityscapes train ids; ``instance`` i32[H, W], id of a vehicle or person (see ``CityWorld.tracks``), 0 = none."""
 
     rgb: NDArray[np.float32]
     depth: NDArray[np.float32]
@@ -211,11 +200,8 @@ class CitySweep:
 
 
 class CityWorld:
-    """The world of one configuration. Immutable; ``render`` may be called from several threads.
-
-    Raises:
-        ResourceError: the native library is missing.
-    """
+    """The world of one configuration. Immutable; ``render`` may be called from several threads. ResourceError: the
+    native library is missing."""
 
     def __init__(self, config: CityConfig) -> None:
         self.config = config
@@ -252,11 +238,8 @@ class CityWorld:
 
     @classmethod
     def from_source(cls, source: Source) -> CityWorld:
-        """Rebuild the world a scene was recorded in, bit for bit, from the recipe in its ``source``.
-
-        Raises:
-            InputError: the source holds no recipe of this generator.
-        """
+        """Rebuild the world a scene was recorded in, bit for bit, from the recipe in its ``source``. InputError: the
+        source holds no recipe of this generator."""
         recipe = source.recipe
         if recipe is None or "city" not in recipe:
             what = "the scene was not generated, so there is no exact truth"
@@ -296,14 +279,8 @@ class CityWorld:
         return known.index(track_id)
 
     def recast(self, track_id: str, look: PosedObject) -> CityWorld:
-        """The same world, light and shadows included, with another object on the path of a vehicle or person.
-
-        Args:
-            look: whose shape, size and paint it gets, for example an object of another world.
-
-        Raises:
-            UsageError: the city has no such object.
-        """
+        """The same world, light and shadows included, with another object on the path of a vehicle or person; ``look``:
+        whose shape, size and paint it gets. UsageError: the city has no such object."""
         index = self._index_of(track_id)
         mine = self.objects[index]
         objects = list(self.objects)
@@ -318,8 +295,6 @@ class CityWorld:
         """What a scene of this world records about its origin."""
         recipe: Mapping[str, Any] = {"city": to_dict(self.config), "generator_version": GENERATOR_VERSION}
         return Source(DATASET, "CC0-1.0", recipe, (f"generated city, light: {self.light_name}",))
-
-    # --- facts ------------------------------------------------------------------------------------
 
     def describe(self) -> str:
         """One line about what was drawn."""
@@ -419,19 +394,10 @@ class CityWorld:
         """Road lines, road edges and crosswalks as a map has them: lines f64[N, 3] in the world, metres."""
         return rec.lane_lines(self.plan)
 
-    # --- truth ------------------------------------------------------------------------------------
-
     def render(self, view: View, *, supersample: int | None = None, sensor_noise: bool = False) -> CityTruth:
-        """Truth at any view whose time lies in ``span_s``.
-
-        Args:
-            view: any pinhole camera (distortion and rolling shutter are refused) at any pose.
-            supersample: rays per pixel and axis; None = the configuration's.
-            sensor_noise: add the camera noise of a recorded image; the same view gives the same noise.
-
-        Raises:
-            UsageError: time outside the log, or a camera model that is not simulated.
-        """
+        """Truth at any view whose time lies in ``span_s``. ``supersample``: rays per pixel and axis; None: the
+        configuration's. ``sensor_noise``: add the camera noise of a recorded image; the same view gives the same noise.
+        UsageError: time outside the log, or a camera with distortion or a rolling shutter."""
         camera = view.camera
         if camera.readout_s != 0 or any(camera.distortion):
             raise UsageError("the city renders undistorted global-shutter cameras", where=f"camera {camera.name!r}")
@@ -460,10 +426,7 @@ class CityWorld:
 
     def render_rolling(self, view: View, readout_s: float, strips: int = 8) -> CityTruth:
         """The image of a rolling shutter: vehicle and objects move while the rows are read, the middle row at the
-        view's time.
-
-        Rows are taken in strips of one time each. Times beyond the log's span keep the pose of its end.
-        """
+        view's time, in strips of one time each. Times beyond the log's span keep the pose of its end."""
         camera, parts = view.camera, []
         mount = geometry.invert(self.frame_pose(view.time_s)) @ view.world_from_cam
         edges = np.linspace(0, camera.height, min(strips, camera.height) + 1).round().astype(int)
@@ -481,13 +444,9 @@ class CityWorld:
     def ranges(
         self, places: NDArray[np.float64], directions: NDArray[np.float64], times_s: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Exact range f64[N] in metres and intensity f64[N] of single beams; NaN: nothing returns (glass and weak
-        surfaces lose beams as in a sweep). Without noise.
-
-        Args:
-            places, directions: f64[N, 3] in the world, directions of length 1. times_s: f64[N]; limbs of people keep
-                their pose of the middle.
-        """
+        """Exact range f64[N] in metres and intensity f64[N] of single beams without noise; NaN: nothing returns (glass
+        and weak surfaces lose beams as in a sweep). ``places``, ``directions``: f64[N, 3] in the world, of length 1.
+        ``times_s``: f64[N]; limbs of people keep their pose of the middle."""
         first, last = (float(np.clip(end, *self.span_s)) for end in (times_s.min(), times_s.max()))
         middle = (first + last) / 2
         share = ((times_s - first) / (last - first)).clip(0, 1) if last > first else np.zeros(len(times_s))
@@ -495,7 +454,12 @@ class CityWorld:
         turns = np.asarray(0.1 * (np.arange(len(times_s)) % 6), np.float64)
         cos, sin, zero = np.cos(turns), np.sin(turns), np.zeros(len(turns))
         back = np.stack([cos, sin, zero, -sin, cos, zero, zero, zero, zero + 1], 1).reshape(-1, 3, 3)
-        poses = np.concatenate([_axes_along(directions) @ back, places[:, :, None]], 2)
+        # rotations whose x axis is the direction
+        helper = np.where(np.abs(directions[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+        left = np.cross(helper, directions)
+        left /= np.linalg.norm(left, axis=1, keepdims=True)
+        axes = np.stack([directions, left, np.cross(directions, left)], 2)
+        poses = np.concatenate([axes @ back, places[:, :, None]], 2)
         objects = (self._object_keys_at(np.array([first, middle, last])), self._phases(middle))
         settings = (self.config.lidar_range_m, 0.0, 0.0, 0.55)
         key = seeds.key(self.config.seed, round(middle * 1e6), "exact beams")
@@ -540,14 +504,6 @@ class CityWorld:
             time_s -= scan.delay_s
             world_from_lidar = self.frame_pose(time_s) @ mount
         return CitySweep(time_s, world_from_lidar, points, semantics[hit], instance[hit])
-
-
-def _axes_along(directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotations f64[N, 3, 3] whose x axis is each of some unit vectors f64[N, 3]."""
-    helper = np.where(np.abs(directions[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
-    left = np.cross(helper, directions)
-    left /= np.linalg.norm(left, axis=1, keepdims=True)
-    return np.stack([directions, left, np.cross(directions, left)], 2)
 
 
 def _interpolated_poses(

@@ -295,33 +295,20 @@ def clipped_box(view: View, world_from_box: NDArray[np.float64], size_m: NDArray
     return np.concatenate([hull.points.min(0), hull.points.max(0)])
 
 
-def published_box(view: View, world_from_box: NDArray[np.float64], size_m: NDArray[np.float64]) -> ImageBox | None:
-    """The same as published scores compute it: all eight corners are divided by their depth, also those behind the
-    camera, so that a box beside the camera becomes one that means nothing. None if no corner lies ahead."""
-    corners = geometry.transform_points(view.cam_from_world @ world_from_box, geometry.box_corners(size_m))
-    if not (corners[:, 2] > 0).any():
-        return None
-    with np.errstate(divide="ignore", invalid="ignore"):
-        uv = np.stack(geometry.pinhole(view.camera.intrinsics, *corners.T), 1)
-    return np.concatenate([uv.min(0), uv.max(0)]) if np.isfinite(uv).all() else None
-
-
-def nta_truths(view: View, tracks: Sequence[Track], as_published: bool = False) -> list[tuple[Track, ImageBox]]:
+def nta_truths(view: View, tracks: Sequence[Track]) -> list[tuple[Track, ImageBox]]:
     """Boxes of the vehicles that a view shows, in whole pixels of an image of 480 x 320; only those that lie inside it
     whole.
 
     Args:
         tracks: candidates; those without a pose at the view's time or that are no vehicles are left out. Nothing is
             asked about what hides them.
-        as_published: boxes of corners behind the camera, too (``published_box``).
     """
-    box_of = published_box if as_published else clipped_box
     scale = np.array([NTA_WIDTH_PX / view.camera.width, NTA_HEIGHT_PX / view.camera.height] * 2)
     limit = np.array([NTA_WIDTH_PX, NTA_HEIGHT_PX])
     found = []
     for track in tracks:
         pose = track.pose_at(view.time_s) if track.label in VEHICLE_LABELS else None
-        box = None if pose is None else box_of(view, pose, track.size_m)
+        box = None if pose is None else clipped_box(view, pose, track.size_m)
         if box is None:
             continue
         whole = np.trunc(box * scale)

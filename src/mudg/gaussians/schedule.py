@@ -1,24 +1,88 @@
-"""When a fit does what: learning rates, densification and rounds of box corrections as functions of the step.
-
-Steps count from 1 to the length of the run; a fit that goes on with a finished one begins in the middle
-(``gaussians/storage.py``).
-"""
+"""The loop of a fit, and when it does what: learning rates, densification and rounds of box corrections as functions of
+the step. Steps count from 1; a fit that goes on with a finished one begins in the middle (``gaussians/storage.py``)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from mudg.base import checkpoint, log
 from mudg.base.errors import NumericsError
+from mudg.base.processes import Interruption
+from mudg.base.run_folder import RunDir
 from mudg.core.table import Table
-from mudg.gaussians.appearance import Appearance
+from mudg.gaussians.corrections import Appearance
 from mudg.gaussians.densify import DensifySettings
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.settings import DensifyConfig, FitConfig, StartConfig
+
+# the loop -----------------------------------------------------------------------------------------
+
+LOG_EVERY = 20
+
+
+@dataclass(kw_only=True)
+class Progress:
+    """How far a fit is: finished steps, their seconds, and the numbers of the last one that was logged."""
+
+    step: int = 0
+    seconds: float = 0.0
+    last: Mapping[str, float] | None = None
+
+    def facts(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return {"seconds": self.seconds, "last": dict(self.last or {})}
+
+    def resume(self, found: checkpoint.Checkpoint) -> None:
+        """Inverse of ``facts``."""
+        self.step, self.seconds, self.last = found.step, float(found.state["seconds"]), found.state["last"]
+
+    def summary(self) -> dict[str, Any]:
+        """For run.json; the first entry is the size of what is fitted."""
+        raise NotImplementedError
+
+
+def run_steps(
+    state: Progress,
+    config: FitConfig,
+    folder: RunDir,
+    take: Callable[[int], tuple[dict[str, Any], Callable[[], dict[str, float]]]],
+    save: Callable[[], None],
+    draw: Callable[[Path], None],
+) -> None:
+    """Take steps up to ``config.iterations``, with log, checkpoints and pictures. Ctrl-C (or SIGTERM) is taken at the
+    end of a step: checkpoint, then KeyboardInterrupt. ``take``: does a step and returns facts for the log and what
+    makes its numbers; ``rows`` among the facts, after densification, are always logged."""
+    pace = checkpoint.Pace()
+    with log.task(f"fit {config.method}", config.iterations, state.step) as bar, Interruption() as interruption:
+        while state.step < config.iterations:
+            began, step = time.perf_counter(), state.step + 1
+            facts, numbers = take(step)
+            state.step, state.seconds = step, state.seconds + time.perf_counter() - began
+            if step % LOG_EVERY == 0 or step == config.iterations or "rows" in facts:
+                state.last = numbers()
+                folder.log(step=step, seconds=round(state.seconds, 3), **facts, **state.last)
+                shown = f"psnr {state.last['psnr']:.1f}, " if "psnr" in state.last else ""
+                what, size = next(iter(state.summary().items()))
+                bar.update(f"{shown}{size} {what}")
+            if step % config.preview_every == 0 or step == config.iterations:
+                draw(folder.path / "preview" / f"{step:06d}.png")
+            if interruption.requested or (step % config.checkpoint_every == 0 and pace.due()):
+                with pace.saving():
+                    save()
+            bar.advance()
+            if interruption.requested:
+                folder.pause(state.summary())
+                interruption.stop_now()
+
 
 # finite -------------------------------------------------------------------------------------------
 #

@@ -143,7 +143,7 @@ class ClipImageFeatures(nn.Module):
 
 def prepared(rgb: NDArray[np.uint8], side: int = 336) -> Tensor:
     """An image u8[H, W, 3] as f32[3, side, side]: bicubic without antialiasing (aspect not kept), then CLIP's mean and
-    deviation, as CMMD's PyTorch code does it."""
+    deviation."""
     image = torch.from_numpy(np.array(rgb)).permute(2, 0, 1).float()[None] / 255
     image = F.interpolate(image, size=(side, side), mode="bicubic", align_corners=False)[0]
     mean, deviation = (torch.tensor(values).view(3, 1, 1) for values in (MEAN, DEVIATION))

@@ -55,9 +55,9 @@ def read_shown(folder: Path) -> GalleryEntry:
 
 def _read(folder: Path) -> GalleryEntry:
     if (folder / "bench.json").is_file():
-        found, own = store.read_json(folder / "bench.json"), {"page": "page.html", "tables": "bench.md"}
+        found = store.read_json(folder / "bench.json")
         name = str(found.get("bench", "")) if isinstance(found, dict) else ""
-        return GalleryEntry(folder, f"bench {name}".strip(), pages={title: folder / n for title, n in own.items()})
+        return GalleryEntry(folder, f"bench {name}".strip(), pages={"tables": folder / "bench.md"})
     state = store.read_json(folder / store.RUN_STATE) if (folder / store.RUN_STATE).is_file() else {}
     state = state if isinstance(state, dict) else {}
     asked = state.get("asked", {})

@@ -8,7 +8,7 @@ import base64
 import json
 import math
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -24,7 +24,7 @@ from mudg.base.processes import computed_ahead
 from mudg.base.records import understood
 from mudg.base.types import Observation
 from mudg.core.pictures import class_colors, depth_colors, error_image, resize_nearest, resize_rgb, to_bytes
-from mudg.formats.exporters.video import Encoding, jpeg_bytes, mp4_within, video_encoders
+from mudg.formats.exporters.video import jpeg_bytes, mp4_within, video_encoders
 from mudg.scene.observations import ObservationSet, list_observation_sets, read_observations
 from mudg.scoring.tables import (
     FLOOR,
@@ -91,11 +91,13 @@ GROUPS: Final = (
     ("Classes", ("miou", "accuracy")),
     ("At LiDAR points", ("lidar_abs_rel", "lidar_rmse_m", "lidar_delta1", "lidar_psnr", "agreement")),
     ("Vehicles and lanes", ("agent_iou", "lane_iou", "lane_correlation", "lane_psnr", "nta_iou", "ntl_iou")),
-    ("Steadiness", ("warp_error", "temporal_flickering", "subject_consistency", "clip_f")),
+    ("Steadiness", ("warp_error", "temporal_flickering", "clip_f")),
 )
 OPTIONAL: Final = frozenset({"At LiDAR points", "Vehicles and lanes", "Steadiness"})
 """Groups that are left out, and distances of them, where no method has a number."""
 CHARTED: Final = ("psnr", "abs_rel", "miou")
+CURVES: Final = (("psnr", "PSNR, dB", SENSES["higher"]), ("loss_color", "Loss of colour", SENSES["lower"]))
+"""Columns of the logs of fits that are drawn: title, and which way is better."""
 FIRST_M: Final = 2.0
 """The page begins beside the recorded path, as near to here as there are views."""
 NEAR_M: Final = 2.0
@@ -137,11 +139,12 @@ def page(
     columns: Sequence[str],
     viewer: str = "",
     out: Path = Path(),
+    curves: Sequence[Mapping[str, Any]] = (),
 ) -> str:
     """The text of the page. ``scores``: ``metrics.json``. ``ledger``: ``run.json`` of the chain. ``settings``:
     ``run.yaml``. ``videos``: one per trajectory. ``columns``: panel columns in the order in which they stand in the
     videos. ``viewer``: relative address of the page that shows the fitted scene, or empty. ``out``: folder of the run,
-    for commands."""
+    for commands. ``curves``: as of ``fit_charts``."""
     scene = scores["scene"]
     heading, lead = headline(scores)
     return html.render(
@@ -157,6 +160,7 @@ def page(
         methods=scores["methods"],
         settings=settings,
         provenance=_provenance(scores, ledger),
+        curves=curves,
         next_commands=next_commands(out, str(ledger.get("asked", {}).get("source", "LOG"))),
         **_player_values(scores, videos, columns),
         **_score_values(scores),
@@ -358,26 +362,59 @@ def _chart(scores: Mapping[str, Any], metric: Mapping[str, Any]) -> dict[str, An
     """Values of the macro ``chart``: one line per method over the lateral shift, left of the road on the left; None
     with fewer than two shifts."""
     points = chart_points(scores, metric["name"])
-    shifts = sorted({-shift for line in points.values() for shift, _ in line})
+    shifts = {s for line in points.values() for s, _ in line}
     if len(shifts) < 2:
         return None
-    numbers, better = [value for line in points.values() for _, value in line], SENSES[metric["better"]]
+    lines = {method: [(-shift, value) for shift, value in line] for method, line in points.items()}
+    better = SENSES[metric["better"]]
+    figure = _figure(lines, sorted(-shift for shift in shifts), lambda value: number_text(metric["name"], value))
+    return {
+        **figure,
+        "title": metric["title"] + (f", {metric['unit']}" if metric["unit"] else ""),
+        "better": better,
+        "label": f"{metric['title']} over the lateral shift, {better}",
+        "begin": "left" if max(shifts) > 0 else "",
+        "end": "right, m" if min(shifts) < 0 else "m",
+    }
+
+
+def fit_charts(out: Path) -> list[dict[str, Any]]:
+    """Values of the macro ``chart``: what the fits of a run logged of recorded views, over their steps; empty where
+    there is no log."""
+    rows: dict[str, list[dict[str, Any]]] = {}
+    for method in (WITHOUT, WITH):
+        path = out / "fit" / method / "log.jsonl"
+        if path.is_file():
+            found = (store.parse_json(line, str(path)) for line in store.read_text(path).splitlines())
+            rows[method] = [row for row in found if "step" in row]
+    made = []
+    for key, title, better in CURVES:
+        lines = {method: [(row["step"], row[key]) for row in own if key in row] for method, own in rows.items()}
+        lines = {method: line for method, line in lines.items() if len(line) > 1}
+        if lines:
+            steps = axis_ticks(0, max(x for line in lines.values() for x, _ in line))
+            figure = _figure(lines, steps, "{:g}".format)
+            words = {"title": title, "better": better, "label": f"{title} over the steps of the fits, {better}"}
+            made.append({**figure, **words, "begin": "", "end": "steps"})
+    return made
+
+
+def _figure(
+    lines: Mapping[str, Sequence[tuple[float, float]]], marks: Sequence[float], text: Callable[[float], str]
+) -> dict[str, Any]:
+    """Places of lines and axes in a chart; ``marks``: of the axis below, increasing."""
+    numbers = [value for line in lines.values() for _, value in line]
     ticks = axis_ticks(min(numbers), max(numbers))
     left, right, top, bottom = 40.0, 330.0, 8.0, 150.0
-    x = lambda value: round(left + (value - shifts[0]) / (shifts[-1] - shifts[0]) * (right - left), 1)
+    x = lambda value: round(left + (value - marks[0]) / (marks[-1] - marks[0]) * (right - left), 1)
     y = lambda value: round(bottom - (value - ticks[0]) / (ticks[-1] - ticks[0]) * (bottom - top), 1)
     return {
         "left": left,
         "right": right,
         "bottom": bottom,
-        "y_ticks": [{"at": y(value), "text": number_text(metric["name"], value)} for value in ticks],
-        "x_ticks": [{"at": x(value), "text": f"{abs(value):g}"} for value in shifts],
-        "lines": [{"method": m, "points": [(x(-a), y(b)) for a, b in line]} for m, line in points.items()],
-        "title": metric["title"] + (f", {metric['unit']}" if metric["unit"] else ""),
-        "better": better,
-        "label": f"{metric['title']} over the lateral shift, {better}",
-        "begin": "left" if shifts[0] < 0 else "",
-        "end": "right, m" if shifts[-1] > 0 else "m",
+        "y_ticks": [{"at": y(value), "text": text(value)} for value in ticks],
+        "x_ticks": [{"at": x(value), "text": f"{abs(value):g}"} for value in marks],
+        "lines": [{"method": m, "points": [(x(a), y(b)) for a, b in line]} for m, line in lines.items()],
     }
 
 
@@ -469,7 +506,7 @@ VIEWER: Final = "viewer.html"
 VIEWER_FOLDER: Final = "viewer_page/index.html"
 SAME_TIME_S: Final = 1e-4
 ROWS: Final = tuple(name for name, _ in PANEL_ROWS)
-ENCODING: Final = Encoding(FPS, first_crf=33, last_crf=45, preset="veryfast")
+QUALITY: Final = (33, 45)
 
 
 @dataclass(frozen=True)
@@ -510,7 +547,7 @@ def write_page(out: Path, videos: Sequence[TrajectoryVideo]) -> Path:
     with understood("a scored run", str(out)):
         scores, ledger = store.read_json(out / "score" / "metrics.json"), store.read_json(out / "run.json")
         columns = list(_folders(out, scores))
-        content = page(scores, ledger, text, videos, columns, viewer_address(out), out)
+        content = page(scores, ledger, text, videos, columns, viewer_address(out), out, fit_charts(out))
     store.write_text(out / "report.html", content)
     return out / "report.html"
 
@@ -540,7 +577,7 @@ def _video(trajectory: Mapping[str, Any], folders: Mapping[str, Mapping[str, Pat
     columns = _columns(trajectory, folders)
     size = panel_size(int(trajectory["width"]), int(trajectory["height"]), PANEL_WIDTH)
     order = list(folders)
-    video = mp4_within(lambda: _frames(columns, order, size), ENCODING, budget) if budget else b""
+    video = mp4_within(lambda: _frames(columns, order, size), FPS, QUALITY, budget) if budget else b""
     poster = jpeg_bytes(next(_frames(columns, order, size, first=columns.frames // 2)), quality=60)
     return TrajectoryVideo(
         name=trajectory["name"],
