@@ -348,6 +348,7 @@ def test_what_is_written(tmp_path: Path) -> None:
     record = store.read_json(out / "fuse.json")
     assert record["tracks"]["car-1"]["moving"] is True
     assert record["rules"]["min_object_points"] == 10
+    assert (out / "top.png").stat().st_size > 1000
 
 
 def test_a_changed_cloud_is_noticed(tmp_path: Path) -> None:
