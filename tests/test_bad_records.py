@@ -22,8 +22,8 @@ import pytest
 import write_av2
 import write_nuscenes
 from bad_logs import Change
-from pandas_pickles import frame_bytes, write_frame
 from roundtrip import needs_native
+from write_pandaset import frame_bytes, write_frame
 
 from mudg.formats.importers.common import ImportOptions
 from mudg.formats.importers.pandaset import gunzip, parse_frame, read_frame
