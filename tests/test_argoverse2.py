@@ -15,13 +15,11 @@ import roundtrip
 import write_av2 as made
 from bad_logs import refused
 from PIL import Image
-from tiny_networks import hide
 
-from mudg.base.errors import ResourceError, UsageError
+from mudg.base.errors import UsageError
 from mudg.base.geometry import invert, transform_points
 from mudg.base.types import Scene, Track
 from mudg.formats.importers import RECOGNISERS
-from mudg.formats.importers.argoverse2 import read_sweep
 from mudg.scene.read import read_points
 
 pytestmark = roundtrip.needs_native
@@ -158,12 +156,6 @@ def test_optional_parts(drive: Path, tmp_path: Path) -> None:
     bare = ingest(copy, tmp_path / "bare")
     assert (len(bare.sweeps), bare.tracks) == (0, ())
     assert len(bare.source.notes) == 3
-
-
-def test_without_pyarrow_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    hide(monkeypatch, "pyarrow")
-    caught = refused("pyarrow", read_sweep, tmp_path / "1.feather", np.eye(4), raises=ResourceError)
-    assert "mudg[data]" in caught.remedy
 
 
 # --- real data ------------------------------------------------------------------------------------

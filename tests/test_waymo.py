@@ -490,10 +490,10 @@ def test_range_images_are_unpacked_within_bounds(monkeypatch: pytest.MonkeyPatch
     assert range_image(whole, 4, "x").shape == (2, 3, 4)
     refused("wrong shape", range_image, whole, 6, "x")
     refused("cut off", range_image, whole[:-6], 4, "x")
-    refused("cannot be unpacked", range_image, b"nonsense", 4, "x")
+    refused("is damaged", range_image, b"nonsense", 4, "x")
     monkeypatch.setattr(logs, "MAX_UNPACKED_BYTES", 1 << 20)
     bomb = zlib.compress(bytes(2 << 20), 1)
-    refused("unpacks to more", range_image, bomb, 4, "x")
+    refused("unpacks to too much", range_image, bomb, 4, "x")
     lying = made.text(1, bytes(16)) + made.text(2, b"".join(made.number(1, n) for n in (1 << 20, 1 << 20, 4)))
     refused("wrong shape", range_image, zlib.compress(lying), 4, "x")
 

@@ -198,18 +198,7 @@ def _unpacked(packed: bytes, where: str) -> bytes:
     """An xz file that is not larger than such metadata can be."""
     most = max(_LEAST_UNPACKED, _MOST_GROWTH * len(packed))
     unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_XZ_MEMORY)
-    try:
-        content = unpacker.decompress(packed, most + 1)
-    except (lzma.LZMAError, EOFError) as error:
-        what = "compressed metadata are damaged"
-        raise InputError(what, where=where, got=str(error), remedy="copy the file again") from error
-    if len(content) > most:
-        what = "compressed metadata unpack to more than metadata can be"
-        raise InputError(what, where=where, got=f"{len(packed)} bytes", expected=f"at most {most} bytes when unpacked")
-    if not unpacker.eof:
-        what = "compressed metadata are cut off"
-        raise InputError(what, where=where, got=f"{len(packed)} bytes", remedy="copy the file again")
-    return content
+    return common.unpacked(unpacker, packed, most, "compressed metadata", where)
 
 
 def _cbor(content: bytes, where: str) -> Any:
