@@ -15,7 +15,8 @@ import toy_vit
 from test_i3d import made_up
 
 from mudg.base import store
-from mudg.networks import clip_image, i3d, inception
+from mudg.networks import clip as clip_image
+from mudg.networks import i3d, inception
 
 PATH = Path(__file__).parent / "golden" / "score_networks.safetensors"
 KEPT = 48

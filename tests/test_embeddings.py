@@ -16,7 +16,7 @@ from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Observation
 from mudg.editing.settings import ScoreConfig
-from mudg.networks import clip_image
+from mudg.networks import clip as clip_image
 from mudg.steps.render import Score
 
 

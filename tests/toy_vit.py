@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import torch
 
-from mudg.networks import clip_image
+from mudg.networks import clip as clip_image
 
 
 def drawn(shapes: Mapping[str, tuple[int, ...]], seed: int) -> dict[str, torch.Tensor]:

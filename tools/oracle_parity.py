@@ -108,7 +108,7 @@ def transformers() -> None:
     """CLIP's tower."""
     from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
-    from mudg.networks import clip_image
+    from mudg.networks import clip as clip_image
 
     state = toy_vit.clip_state(side=112)
     config = CLIPVisionConfig(

@@ -1,10 +1,6 @@
 """A picture of a whole scene for a first look: some frames of each camera with LiDAR and boxes drawn in, and a view
-from above.
-
-What to look for: points lie on the surfaces they belong to (edges of posts and cars), outlines of boxes sit on their
-objects, and standing things stay single lines from above. Near points are warm, far ones cold; boxes of vehicles are
-green, of people violet, of all else light blue, and from above the edges of their fronts red.
-"""
+from above. Points lie on the surfaces they belong to (near ones warm, far ones cold), outlines of boxes sit on their
+objects, and standing things stay single lines from above."""
 
 from __future__ import annotations
 

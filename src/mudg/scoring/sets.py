@@ -25,7 +25,7 @@ from mudg.core import feature_distances
 from mudg.core.feature_distances import frechet_distance
 from mudg.core.pictures import resize_rgb, to_bytes
 from mudg.editing.settings import ScoreConfig
-from mudg.networks import clip_image, i3d, inception
+from mudg.networks import clip, i3d, inception
 from mudg.networks.featnets import LpipsFeatures, LpipsTrunk, lpips_shapes
 from mudg.scene.observations import ObservationSet, read_observations
 from mudg.scene.read import read_image
@@ -57,7 +57,7 @@ _without_counts = lambda state: {name: own for name, own in state.items() if not
 NETWORKS: Final[Mapping[str, Network]] = {
     "inception": ("--fid-weights", inception.InceptionFeatures, _without_counts),
     "i3d": ("--fvd-weights", i3d.I3DFeatures, i3d.with_known_names),
-    "clip": ("--clip-weights", clip_image.ClipImageFeatures, clip_image.with_openai_names),
+    "clip": ("--clip-weights", clip.ClipImageFeatures, clip.with_openai_names),
     "lpips": _lpips("alex", "--lpips-weights"),
     "lpips-vgg": _lpips("vgg", "--lpips-vgg-weights"),
 }
@@ -388,9 +388,9 @@ class ClipScores:
     ``folder``: where features are kept."""
 
     def __init__(self, scene: Scene, weights: Path, folder: Path, device: torch.device) -> None:
-        network = clip_image.ClipImageFeatures(read_checkpoint(weights), str(weights)).to(device)
+        network = clip.ClipImageFeatures(read_checkpoint(weights), str(weights)).to(device)
         sha256 = store.sha256_file(weights)
-        prepare = functools.partial(clip_image.prepared, side=network.side)
+        prepare = functools.partial(clip.prepared, side=network.side)
         self._scene = scene
         self._files = EmbeddingFiles(network, prepare, network.out, f"CLIP {sha256}", folder, device)
         self._facts = {
