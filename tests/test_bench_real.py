@@ -7,14 +7,11 @@ import numpy as np
 import pytest
 import torch
 import write_custom
-import write_pandaset
 from tiny_networks import saved_mdm
-from write_pandaset import write_frame
 
 from mudg.base import store
 from mudg.base.camera_colors import ColorMap
 from mudg.base.errors import InputError, UsageError
-from mudg.base.palette import ID
 from mudg.base.types import Camera, Observation, SweepPoints, View
 from mudg.benchmarks import columns, places, real
 from mudg.benchmarks.chain import FillViews
@@ -29,7 +26,6 @@ from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing import render
 from mudg.editing.settings import RenderConfig
 from mudg.formats import ingest
-from mudg.formats.importers.pandaset import read_frame
 from mudg.formats.settings import IngestConfig
 from mudg.gaussians.settings import FitConfig
 from mudg.scene.labels import read_label
@@ -224,10 +220,10 @@ def test_a_color_map_is_found_under_noise_and_outliers():
     assert (few.gain, few.pairs) == ((1.0, 1.0, 1.0), 10)
 
 
-def sight(maps, *, depth=None, rgb=None, semantics=None, photo=None):
+def sight(maps, *, depth=None, rgb=None, photo=None):
     target = columns.Target("front", None, VIEW, maps, ColorMap())
     rgb = torch.full((3, 30, 40), 0.5) if rgb is None else rgb
-    return columns.Sight(target, rgb, depth, semantics, photo, None)
+    return columns.Sight(target, rgb, depth, photo, None)
 
 
 def test_columns_by_hand():
@@ -248,12 +244,6 @@ def test_columns_by_hand():
     upper = sight({}, photo=photo)
     assert columns.COLUMNS["psnr_upper"].of(upper)[0] == pytest.approx(20.0, abs=1e-4)
     assert columns.COLUMNS["psnr_dynamic"].of(upper) is None
-    classes = np.full((30, 40), 255, np.uint8)
-    classes[0, :4] = ID["road"]
-    made = torch.full((30, 40), ID["road"])
-    made[0, 3] = ID["car"]
-    labelled = sight({"classes": classes}, semantics=made)
-    assert columns.COLUMNS["accuracy"].close(columns.COLUMNS["accuracy"].of(labelled)) == 0.75
     assert columns.COLUMNS["psnr"].compared_text(20.5, 20.0) == "+0.50"
     assert columns.COLUMNS["perceptual"].compared_text(0.09, 0.1) == "x0.900"
 
@@ -354,7 +344,7 @@ def made(city, tmp_path_factory):
 def test_the_command_compares_methods_under_every_protocol(made, city):
     out, _ = made
     document = store.read_json(out / "bench.json")
-    assert list(document["protocols"]) == ["gap-1", "gap-3", "gap-5", "camera", "lidar", "classes"]
+    assert list(document["protocols"]) == ["gap-1", "gap-3", "gap-5", "camera", "lidar"]
     for name in ("gap-1", "gap-3", "camera", "lidar"):
         values = document["protocols"][name]["logs"]["city"]["values"]
         assert set(values) == {"nearest_fill", "street_gaussians"}
@@ -365,10 +355,9 @@ def test_the_command_compares_methods_under_every_protocol(made, city):
     difference = mean - gap["pooled"]["street_gaussians"]["psnr"]
     assert gap["against"]["nearest_fill"]["psnr"] == pytest.approx(difference, abs=1e-5)
     assert "too few" in document["protocols"]["gap-5"]["left_out"]["city"]
-    assert "no classes of LiDAR points" in document["protocols"]["classes"]["left_out"]["city"]
     assert document["logs"][0]["digest"] == store.digest(city)
     text = (out / "bench.md").read_text()
-    assert "city is left out: the log has no classes of LiDAR points" in text and "## gap-3" in text
+    assert "city is left out: its 6 frames are too few" in text and "## gap-3" in text
 
 
 @pytest.mark.slow
@@ -394,41 +383,6 @@ def test_finished_work_is_reused_and_a_method_can_be_added(made, city, model):
     assert [s["summary"]["steps"] for s in (guided, longer)] == [config.iterations * 3 // 2, config.iterations // 2]
     assert not [name for name in longer["inputs"] if "virtual" in name or "observations" in name]
     assert "fitted" not in store.read_json(split / "virtual" / "run.json")["inputs"]
-
-
-CLASS_NAMES = {"5": "Road", "7": "Building"}
-
-
-@pytest.fixture(scope="module")
-def pandaset(city, tmp_path_factory):
-    """The city as a PandaSet sequence whose points have classes: road below 0.3 m, building above."""
-    folder = write_pandaset.write_pandaset(read_scene(city), tmp_path_factory.mktemp("panda") / "001")
-    for path in sorted((folder / "lidar").glob("*.pkl.gz")):
-        low = np.asarray(read_frame(path)["z"]) - write_pandaset.SOURCE_FROM_WORLD[2, 3] < 0.3
-        write_frame(folder / "annotations" / "semseg" / path.name, {"class": np.where(low, 5, 7)})
-    store.write_json(folder / "annotations" / "semseg" / "classes.json", CLASS_NAMES)
-    return folder
-
-
-@pytest.mark.slow
-def test_classes_of_points_are_scored_where_a_log_has_them_and_hidden_from_methods(pandaset, tmp_path):
-    config = BenchConfig(methods=("nearest_fill",), protocols=("classes",), resolution="48", frames="0:3", processes=1)
-    out = real.run(config, [pandaset], tmp_path / "out")
-    document = store.read_json(out / "bench.json")
-    found = document["protocols"]["classes"]["pooled"]["nearest_fill"]
-    assert 0.3 < found["accuracy"] < 1 and 0.05 < found["miou"] < 1
-    log = out / "001"
-    whole = read_scene(log / "scene")
-    targets = columns.read_targets(log / "truth" / "classes")
-    target = targets.load(0, whole)
-    known = target.maps["classes"][target.maps["classes"] != 255]
-    assert set(np.unique(known)) == {ID["road"], ID["building"]} and len(known) > 100
-    road = target.maps["classes"] == ID["road"]
-    assert np.median(np.nonzero(road)[0]) > np.median(np.nonzero(target.maps["classes"] == ID["building"])[0])
-    assert read_points(whole, whole.sweeps[0]).classes is not None
-    for name in ("shown", "annotate", "scene"):
-        seen = read_scene(log / "all" / name)
-        assert seen.sweeps and all(read_points(seen, sweep).classes is None for sweep in seen.sweeps)
 
 
 def test_a_dataset_log_is_imported_with_the_settings_of_the_command(city, tmp_path):

@@ -24,7 +24,7 @@ from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, View
 from mudg.scene.check import check_scene
 from mudg.scene.labels import read_label, read_trusted_classes
-from mudg.scene.read import open_files, read_image, read_points, read_scene
+from mudg.scene.read import read_image, read_points, read_scene
 from mudg.scene.schema import ref_problem
 from mudg.scene.write import SceneWriter
 
@@ -168,17 +168,6 @@ def test_a_copy_refuses_what_is_damaged_with_hashes_and_without(tmp_path: Path) 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["scene"]
 
 
-def test_labels_are_stored_in_one_order(tmp_path: Path) -> None:
-    scene = small_scene(tmp_path / "scene")
-    arrays = {"sky": np.zeros((20, 32), bool), "depth": np.ones((20, 32), np.float32), "ego": np.ones((20, 32), bool)}
-    texts = set()
-    for number, names in enumerate((("sky", "depth", "ego"), ("ego", "sky", "depth"))):
-        copied(scene, tmp_path / str(number), {name: arrays[name] for name in names})
-        texts.add((tmp_path / str(number) / "scene.json").read_bytes())
-    assert len(texts) == 1
-    refused("no such label", copied, scene, tmp_path / "x", {"skyy": arrays["sky"]})
-
-
 def test_frames_come_in_time_order_whatever_the_order_of_writing(tmp_path: Path) -> None:
     side = replace(CAMERA, name="side")
     with open_writer(tmp_path / "s") as writer:
@@ -191,15 +180,6 @@ def test_frames_come_in_time_order_whatever_the_order_of_writing(tmp_path: Path)
         scene = writer.finish()
     assert [f.id for f in scene.frames] == [f"{c}/{n:06d}" for n in range(3) for c in ("front", "side")]
     assert set(scene.split.values()) == {"train"}
-
-
-def test_the_index_is_opened_once_and_again_after_a_change(tmp_path: Path) -> None:
-    small_scene(tmp_path / "scene")
-    first = open_files(tmp_path / "scene")
-    assert open_files(tmp_path / "scene") is first
-    index = tmp_path / "scene" / "scene.json"
-    os.utime(index, ns=(1, 1))
-    assert open_files(tmp_path / "scene") is not first
 
 
 # --- completely or not at all ---------------------------------------------------------------------
@@ -269,7 +249,7 @@ def test_every_byte_is_covered_by_the_manifest(tmp_path: Path) -> None:
 
 
 def bad_frames() -> dict[str, tuple[str, Callable[[SceneWriter], None]]]:
-    nan_pose, big_pose = np.eye(4), np.diag([2.0, 2, 2, 1])
+    nan_pose = np.eye(4)
     nan_pose[0, 3] = np.nan
     image, side, changed = random_image(0), replace(CAMERA, name="side"), replace(CAMERA, fx=50.0)
     doubled = np.full((20, 32), 2.0)
@@ -280,15 +260,12 @@ def bad_frames() -> dict[str, tuple[str, Callable[[SceneWriter], None]]]:
         "id that climbs": ("does not fit", lambda w: w.add_frame("front/../../x", view_at(0), image)),
         "twice": ("added twice", lambda w: w.add_frame("front/000000", view_at(9), image)),
         "float image": ("wrong form", lambda w: w.add_frame("front/000009", view_at(9), image / 255)),
-        "small image": ("wrong form", lambda w: w.add_frame("front/000009", view_at(9), image[:10])),
         "not an image": ("not a PNG or JPEG", lambda w: w.add_frame("front/000009", view_at(9), b"hello")),
         "label size": ("camera's size", lambda w: w.add_label("front/000000", "sky", np.zeros((3, 3)))),
         "label name": ("no such label", lambda w: w.add_label("front/000000", "skies", np.zeros((20, 32)))),
-        "label of no frame": ("not added", lambda w: w.add_label("front/000077", "sky", np.zeros((20, 32)))),
         "class 19": ("no train id", lambda w: w.add_label("front/000000", "semantics", np.full((20, 32), 19))),
         "confidence 2": ("outside 0..1", lambda w: w.add_label("front/000000", "depth_confidence", doubled)),
         "NaN sweep pose": ("rigid", lambda w: w.add_sweep("top/000009", "top", 9.0, nan_pose, some_points())),
-        "scaled sweep pose": ("rigid", lambda w: w.add_sweep("top/000009", "top", 9.0, big_pose, some_points())),
         "NaN point": ("not finite", lambda w: w.add_sweep("top/000009", "top", 9.0, np.eye(4), nan_points())),
         "camera name": ("folder name", lambda w: w.add_camera(replace(CAMERA, name="../x"))),
         "focal length": ("focal length", lambda w: w.add_camera(replace(CAMERA, name="b", fx=1e-4))),
@@ -348,7 +325,6 @@ EDITS: dict[str, tuple[str, str, Callable[[dict[str, Any]], object]]] = {
     "typo": ("unknown field", "frames[1]", lambda d: d["frames"][1].update(world_from_camera=IDENTITY)),
     "missing field": ("missing", "frames[0]", lambda d: d["frames"][0].pop("image")),
     "mirrored pose": ("rigid", "frames[0].world_from_cam", lambda d: d["frames"][0].update(world_from_cam=MIRRORED)),
-    "scaled pose": ("rigid", "sweeps[2].world_from_lidar", lambda d: d["sweeps"][2].update(world_from_lidar=SCALED)),
     "short pose": ("3x4", "frames[2].world_from_cam", lambda d: d["frames"][2].update(world_from_cam=IDENTITY[:11])),
     "text in pose": ("not a number", "from_cam[3]", lambda d: d["frames"][2]["world_from_cam"].__setitem__(3, "x")),
     "huge number": ("beyond what a number can be", "", lambda d: d["frames"][2].update(time_s=10**400)),
@@ -356,7 +332,6 @@ EDITS: dict[str, tuple[str, str, Callable[[dict[str, Any]], object]]] = {
     "zero focal length": ("focal length", "cameras.front.fx", lambda d: d["cameras"]["front"].update(fx=0)),
     "focal length in mm": ("focal length", "cameras.front.fy", lambda d: d["cameras"]["front"].update(fy=0.004)),
     "principal point": ("principal point", "cameras.front.cx", lambda d: d["cameras"]["front"].update(cx=9000)),
-    "width": ("image size", "cameras.front.width", lambda d: d["cameras"]["front"].update(width=0)),
     "unknown camera": ("does not have", "frames[0].camera", lambda d: d["frames"][0].update(camera="rear")),
     "no frames": ("no frames", "frames", lambda d: d.update(frames=[], split={})),
     "no cameras": ("no cameras", "cameras", lambda d: d.update(cameras={}, frames=[])),
@@ -368,10 +343,7 @@ EDITS: dict[str, tuple[str, str, Callable[[dict[str, Any]], object]]] = {
     "shared file": ("same file", "front/000001", lambda d: d["frames"][1].update(image="images/front/000000.png")),
     "climbing ref": ("'..'", "frames[1].image", lambda d: d["frames"][1].update(image="../../etc/passwd")),
     "absolute ref": ("absolute", "frames[1].image", lambda d: d["frames"][1].update(image="/etc/passwd")),
-    "drive letter": ("colon", "frames[1].image", lambda d: d["frames"][1].update(image="C:/x.png")),
-    "backslash": ("backslash", "frames[1].image", lambda d: d["frames"][1].update(image="images\\front\\000001.png")),
     "control character": ("control", "frames[1].image", lambda d: d["frames"][1].update(image="images/a\u0000.png")),
-    "label name": ("unknown field", "labels", lambda d: d["frames"][1].update(labels={"skyy": "a"})),
     "ego": ("pair up", "ego", lambda d: d["ego"]["times_s"].pop()),
     "ego order": ("do not increase", "ego", lambda d: d["ego"]["times_s"].reverse()),
     "notes": ("not a text", "source.notes[0]", lambda d: d["source"].update(notes=[1])),

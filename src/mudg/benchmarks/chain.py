@@ -1,10 +1,5 @@
 """How benchmarks of complete methods run: one loop over logs, side by side; the steps of a scene that they share, each
-in a folder that is verified and reused; and pictures of all methods side by side.
-
-    OUT/fuse  OUT/fit/<row>  OUT/start/<row>   clouds; every fit; what a variant with an own first fit goes on with
-    OUT/render/<row>  OUT/nearest_fill  OUT/exact   views to score (the benchmark says where generated ones lie)
-    OUT/repair/<step>  OUT/start/difix-<step>       repaired renders on the way to generated views; their fit
-    OUT/film/<trajectory>.jpg and .mp4              all methods side by side, of shift and paper"""
+in a folder that is verified and reused; and videos of all methods side by side."""
 
 from __future__ import annotations
 

@@ -1,15 +1,7 @@
-"""The columns of ``mudg bench real``: the truth that they are computed from, and a method's values under a protocol.
-
-The truth is one folder per log and protocol, made once and read by every method's score. Photographs are not copied:
-they are read from the log.
-
-    targets.json             the views, what each belongs to, and the colour maps of cameras
-    maps/000000.safetensors  per view: depth f32[H, W] metres of LiDAR points (0 = none), and as the protocol needs them
-                             seen u8, dynamic u8, color u8[H, W, 3] and colored u8, classes u8 (255 = none)
-
-A column adds up arrays of numbers over the views of a place (a camera, or a distance beside the path); its value is
-read from the sum. A method's value on a log is the mean over its places; or, under a protocol that pools, the value of
-the sum over all places."""
+"""The columns of ``mudg bench real``: the truth (targets.json, and maps per view: depth, seen, dynamic, color,
+colored), made once per log and protocol, and a method's values. A column adds up numbers over the views of a place (a
+camera, or a distance beside the path); its value is read from the sum. A log's value is the mean over its places, or
+pooled."""
 
 from __future__ import annotations
 
@@ -25,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mudg.base import log, palette, store
+from mudg.base import log, store
 from mudg.base.camera_colors import ColorMap
 from mudg.base.devices import choose_device
 from mudg.base.errors import InputError
@@ -188,8 +180,6 @@ class _Maker:
 
     def unsuitable(self, frames: Sequence[Frame]) -> str:
         """Why a camera cannot be scored, or nothing."""
-        if "classes" in self.protocol.maps and not any(self._classes(frame) for frame in frames):
-            return "the log has no classes of LiDAR points"
         if "photo" not in self.protocol.maps and all(self.points.of_moment(f.view.time_s) is None for f in frames):
             return "the log has no LiDAR sweep taken with an image"
         if "seen" in self.protocol.maps:
@@ -198,10 +188,6 @@ class _Maker:
             if share < LEAST_SEEN:
                 return f"the shown cameras saw {share:.1%} of its pixels"
         return ""
-
-    def _classes(self, frame: Frame) -> bool:
-        points = self.points.of_moment(frame.view.time_s)
-        return points is not None and bool((points.ids != palette.UNLABELLED).any())
 
     def maps(self, frame: Frame, shift_m: float) -> dict[str, NDArray[Any]] | None:
         """The maps of a view that the protocol needs; None if it needs points and there are none."""
@@ -218,8 +204,6 @@ class _Maker:
         if "dynamic" in wanted:
             moving = self._boxes(view, owner) if "photo" in wanted else owner != STATIC
             found["dynamic"] = moving.astype(np.uint8)
-        if "classes" in wanted:
-            found["classes"] = np.append(points.ids, np.uint8(palette.UNLABELLED))[index]
         if "color" in wanted:
             color, colored = self.points.colors(frame, points, world)
             found["color"], found["colored"] = color[index], colored[index].astype(np.uint8)
@@ -271,13 +255,12 @@ Distance = Callable[[metrics.Pair], float | None]
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
     """A method's view beside its truth: colour f32[3, H, W] as the target's camera would record it, depth f32[1, H, W]
-    metres (80 m where there is none), classes i64[H, W] or None; the photograph f32[3, H, W] or None; ``distance``:
+    metres (80 m where there is none); the photograph f32[3, H, W] or None; ``distance``:
     perceptual, or None at a view where it is not computed."""
 
     target: Target
     rgb: Tensor
     depth: Tensor | None
-    semantics: Tensor | None
     photo: Tensor | None
     distance: Distance | None
 
@@ -336,15 +319,6 @@ def _of_mean(of: Callable[[float], float]) -> Callable[[Sum], float | None]:
 
 _mean, _root = _of_mean(float), _of_mean(math.sqrt)
 _decibels = _of_mean(lambda mean: min(_MOST_DB, -10.0 * math.log10(max(mean, 1e-12))))
-
-
-def _mean_iou(total: Sum) -> float | None:
-    iou = metrics.iou_of(torch.from_numpy(total))
-    return sum(iou.values()) / len(iou) if iou else None
-
-
-def _accuracy(total: Sum) -> float | None:
-    return float(np.trace(total[:, : metrics.CLASS_COUNT]) / total.sum()) if total.sum() else None
 
 
 def _photo(compare: Callable[[Tensor, Tensor, Tensor | None], float], name: str = "") -> Measure:
@@ -412,13 +386,6 @@ def _point_color(error: Callable[[Tensor], Tensor], part: str) -> Measure:
     return of
 
 
-def _confusion(sight: Sight) -> Sum | None:
-    if sight.semantics is None or "classes" not in sight.target.maps:
-        return None
-    true = torch.from_numpy(sight.target.maps["classes"].astype(np.int64))
-    return metrics.confusion(sight.semantics, true).double().numpy()
-
-
 def _relative(generated: Tensor, true: Tensor) -> Tensor:
     return (generated - true).abs() / true
 
@@ -452,8 +419,6 @@ COLUMNS: Final[dict[str, Column]] = {
         f"point_abs_{of}": Column(f"colour error at points, {of}", 4, _point_color(torch.abs, of), _mean, ratio=True)
         for of in _PARTS[1:]
     },
-    "miou": Column("mIoU", 3, _confusion, _mean_iou),
-    "accuracy": Column("accuracy", 3, _confusion, _accuracy),
 }
 """All columns by name; a protocol lists its own."""
 
@@ -545,8 +510,7 @@ def sight_of(target: Target, seen: Observation, scene: Scene, protocol: Protocol
         depth = resize_nearest(seen.depth, height, width)
         given = torch.isfinite(depth) & (depth > 0)
         depth = torch.where(given, depth, DEPTH_LIMIT_M).clamp(max=DEPTH_LIMIT_M)
-    semantics = None if seen.semantics is None else resize_nearest(seen.semantics, height, width)
-    return Sight(target, rgb, depth, semantics, target.photo(scene) if "photo" in protocol.maps else None, distance)
+    return Sight(target, rgb, depth, target.photo(scene) if "photo" in protocol.maps else None, distance)
 
 
 class ViewFinder:

@@ -1,13 +1,6 @@
-"""``mudg bench loop``: pilots drive in the reconstruction of a generated log, off its recorded path.
-
-Every picture that they saw is scored against the exact city at the pose that they drove to. The same pilots drive in
-the exact city, too, and see exact pictures there. How far the two drives part, what they hit and whether they leave the
-road is what a simulator's user wants to know. Road users move as recorded in both, and both are judged by the exact
-city: its boxes, parked vehicles included, and its kerbs.
-
-    OUT/<log>/...   see ``benchmarks/places.py``     OUT/<log>/drives/<row>-<pilot>.json, .jpg   one drive
-    OUT/bench.json   every number                    OUT/bench.md   the tables
-"""
+"""``mudg bench loop``: pilots drive in the reconstruction of a generated log, off its recorded path, and in the exact
+city. Their pictures are scored against the exact city at the poses that they drove to; so is how far the two drives
+part, what they hit, and whether they leave the road. Road users move as recorded in both."""
 
 from __future__ import annotations
 

@@ -1,11 +1,6 @@
-"""``mudg bench paper``: a table of a paper (``papers.yaml``), filled with our numbers, on cities or recorded logs.
-
-In every table stand the truth (what it scores itself) and the fused points with holes filled. A cell is a number or the
-reason why there is none: a method that lacks a number on one log has no mean. FID, KID and FVD compare the views of all
-logs at a place, as one set as in papers; a mean of the distances of small sets is mostly bias.
-
-    OUT/<log>/...   see ``benchmarks/places.py``; views that fits learn from lie in OUT/<log>/virtual
-    OUT/bench.json   every number   OUT/bench.md   the table"""
+"""``mudg bench paper``: a table of a paper (``papers.yaml``), filled with our numbers, on cities or recorded logs. A
+cell is a number or the reason why there is none; a method that lacks a number on one log has no mean. FID, KID and FVD
+compare the views of all logs at a place, as one set: a mean of the distances of small sets is mostly bias."""
 
 from __future__ import annotations
 

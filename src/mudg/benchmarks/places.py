@@ -1,9 +1,5 @@
 """The logs of benchmarks: lists of generated cities and recorded logs, their scenes, what of a log the methods do not
-see, and the views of every row at the places of a table, with their scores.
-
-    OUT/<log>/imported   a dataset's log as a scene      OUT/<log>/shown   a table's frames, cameras and held-out rule
-    OUT/<log>/scene      the same with the labels that it lacks; of a city, the generated log itself
-    OUT/<log>/truth nearest_fill generated/<row> fit/<row> start/<row> render/<row> score/<row> film"""
+see, and the views of every row at the places of a table, with their scores. docs/bench_*.md list the folders."""
 
 from __future__ import annotations
 
@@ -237,7 +233,7 @@ class ShownFrames(Output):
 
 # ---- what is hidden of a real log, and scored ----
 
-MapName = Literal["photo", "depth", "seen", "dynamic", "color", "classes"]
+MapName = Literal["photo", "depth", "seen", "dynamic", "color"]
 
 
 @dataclass(frozen=True)
@@ -278,7 +274,7 @@ SPLITS: Final[dict[str, Split]] = {
     "gap-3": Split("gap-3", block=3),
     "gap-5": Split("gap-5", block=5),
     "camera": Split("camera", by_camera=True),
-    "all": Split("all", all_cameras=False, shifts_m=(0.0, 2.0, -2.0, 3.0, -3.0)),
+    "all": Split("all", all_cameras=False, shifts_m=(2.0, -2.0, 3.0, -3.0)),
 }
 _GAP: Final = ("psnr", "ssim", "perceptual", "psnr_dynamic", "psnr_upper", "abs_rel")
 _CAMERA: Final = ("psnr_seen", "perceptual_seen", "abs_rel_seen", "rmse_seen", "delta1_seen")
@@ -294,7 +290,6 @@ PROTOCOLS: Final[tuple[Protocol, ...]] = (
     Protocol("gap-5", "gap", "Blocks of 5 held-out frames", "gap-5", ("photo", "depth", "dynamic"), _GAP),
     Protocol("camera", "camera", "Cameras that the methods never saw", "camera", _SEEN, _CAMERA, every=2, pooled=True),
     Protocol("lidar", "lidar", "LiDAR beside the recorded path", "all", _POINTS, _LIDAR, (2.0, -2.0, 3.0, -3.0)),
-    Protocol("classes", "classes", "Classes of LiDAR points", "all", ("classes",), ("miou", "accuracy")),
 )
 
 

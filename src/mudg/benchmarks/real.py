@@ -1,17 +1,6 @@
-"""``mudg bench real``: complete methods on real logs, against what the log recorded and the methods did not see.
-
-A protocol (a row of ``places.PROTOCOLS``) says which frames, sweeps or cameras are hidden and what is scored. Per log
-and way of hiding, the verbs of the chain are run with folders of their own. They are given scenes from which what is
-hidden was removed (``scene/part.py``), so they cannot use it. Whatever is finished is verified and reused.
-
-    OUT/<log>/scene                                         the whole log; read by truth and scores alone
-    OUT/<log>/<split>/shown annotate scene asked            what the methods see; with labels; and places of held-out
-                                                            frames
-    OUT/<log>/<split>/fuse fit/<method> virtual           what methods make of it; generated views
-    OUT/<log>/<split>/nearest_fill generated render/<method>   the views to score
-    OUT/<log>/truth/<protocol>  OUT/<log>/score/<protocol>/<method>
-    OUT/bench.json  OUT/bench.md
-"""
+"""``mudg bench real``: complete methods on real logs, against what the log recorded and the methods did not see. A
+protocol (``places.PROTOCOLS``) says what is hidden and what is scored. Methods are given scenes from which the hidden
+part was removed, so they cannot use it. docs/bench_real.md lists the folders."""
 
 from __future__ import annotations
 

@@ -51,8 +51,8 @@ class BenchConfig:
     """shift, paper: also write videos of all methods side by side."""
     table: Literal[_Mudg, "recondreamer", "drivedreamer4d", "streetcrafter", "freesim", _Others] = "mudg1"
     """paper: the table to fill (docs/paper_tables.md)."""
-    protocols: tuple[str, ...] = ("gap", "camera", "lidar", "classes")
-    """real: protocols, out of the four of the default. Instead of gap also gap-1, gap-3 and gap-5 alone."""
+    protocols: tuple[str, ...] = ("gap", "camera", "lidar")
+    """real: protocols, out of the three of the default. Instead of gap also gap-1, gap-3 and gap-5 alone."""
     shown: tuple[str, ...] = ()
     """real: cameras that the methods see in protocol camera; the first one gives the views beside the recorded path
     (empty = front, or the first camera)."""

@@ -1,12 +1,5 @@
 """``mudg bench shift``: whole methods beside the recorded path, on lists of generated logs, against exact truth.
-
-Every log is ingested, fused and synthesized once; every method is fitted, rendered and scored on its own, by the
-ordinary verbs, so that whatever is finished is reused and another method costs only itself. Fits under virtual views
-go on with the one on recorded views, as in ``mudg run``.
-
-    OUT/<log>/...   see ``benchmarks/places.py``; generated views lie in OUT/<log>/synthesize
-    OUT/bench.json   every number        OUT/bench.md   the tables
-"""
+Methods are fitted, rendered and scored by the ordinary verbs, so that whatever is finished is reused."""
 
 from __future__ import annotations
 

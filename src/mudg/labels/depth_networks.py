@@ -1,16 +1,6 @@
-"""Dense depth by a pretrained network from a folder on disk, brought to the frame's LiDAR.
-
-| folder | what it gives | how |
-|---|---|---|
-| PromptDepthAnything | metric depth | image and a small map of depth from LiDAR |
-| Depth Anything, V1 and V2 | inverse depth up to scale and shift, or metric depth | image alone |
-| DepthLab (``labels.depthlab``) | depth, nearly metric | diffusion; completes LiDAR |
-
-The result is aligned to the visible LiDAR returns with one robust scale and shift per frame
-(``core.depth.fit_affine``), the sky gets its fixed distance, and the confidence follows from the error of the aligned
-depth at the returns near a pixel. There is no result where too few returns are visible, or where the network's depth
-does not fit them.
-"""
+"""Dense depth by a pretrained network from a folder (PromptDepthAnything, Depth Anything V1 and V2, DepthLab), aligned
+to the visible LiDAR returns with one robust scale and shift per frame. There is no result where too few returns are
+visible, or where the network's depth does not fit them."""
 
 from __future__ import annotations
 
@@ -106,10 +96,7 @@ def lidar_cue(inputs: DepthInput, longest_px: int = CUE_PX) -> Tensor:
     farthest.
 
     The network scales the map to 0..1 by its least and greatest value; the sky at its own distance would squeeze all
-    the rest.
-
-    Raises:
-        InputError: nothing was measured.
+    the rest. InputError: nothing was measured.
     """
     ground = np.isfinite(inputs.filled) & ~inputs.sky
     if not ground.any():
@@ -147,11 +134,8 @@ reads the folder, given a place to compute and the denoising steps."""
 
 
 def kind_of(folder: str | Path) -> str:
-    """Kind of network according to a folder's description; nothing else of it is read.
-
-    Raises:
-        ResourceError: no such folder, or it has no description. InputError: another kind of network.
-    """
+    """Kind of network according to a folder's description; nothing else of it is read. ResourceError: no such folder,
+    or it has no description. InputError: another kind of network."""
     path = Path(folder)
     for name, key in (("config.json", "model_type"), ("model.json", "kind")):
         if folder and (path / name).is_file():
@@ -168,10 +152,7 @@ def kind_of(folder: str | Path) -> str:
 
 def load_depth_network(folder: str | Path, device: torch.device = CPU, steps: int = 0) -> DepthNetwork:
     """A depth network of the table, read from its folder; ``steps``: of denoising, 0 = as the folder says.
-
-    Raises:
-        ResourceError: folder or package is missing. InputError: another kind of network, or not all of it.
-    """
+    ResourceError: folder or package is missing. InputError: another kind of network, or not all of it."""
     return KINDS[kind_of(folder)](Path(folder), device, steps)
 
 
@@ -179,12 +160,8 @@ def load_depth_network(folder: str | Path, device: torch.device = CPU, steps: in
 
 
 def align_to_lidar(prediction: Prediction, inputs: DepthInput) -> tuple[DenseDepth | None, AffineFit]:
-    """A network's depth brought to the frame's LiDAR: one scale and shift, the sky at ``SKY_M``, a confidence;
-    and the fit. None where the fit is not to be believed.
-
-    Raises:
-        InputError: prediction and image differ in size.
-    """
+    """A network's depth brought to the frame's LiDAR: one scale and shift, the sky at ``SKY_M``, a confidence; and the
+    fit. None where the fit is not to be believed. InputError: prediction and image differ in size."""
     if prediction.values.shape != inputs.measured.shape:
         what, where = "a network's depth and its image differ in size", "depth network"
         raise InputError(what, where=where, expected=str(inputs.measured.shape), got=str(prediction.values.shape))

@@ -1,16 +1,6 @@
-"""Dense depth from an image and LiDAR by DepthLab (Liu et al., "DepthLab: from partial to complete", 2024): depth
-inpainting by latent diffusion, from a folder that ``mudg convert`` writes.
-
-Two U-Nets of one layout: the reference U-Net sees the image's latent once, and what its self-attentions read is kept;
-each self-attention of the denoising U-Net reads that beside its own features. The denoising U-Net sees the noisy latent
-of depth, the latent of the mask (1 = missing) and the latent of known depth, interpolated. Both are conditioned on one
-vector: the image's CLIP embedding through a linear layer.
-
-Depth is scaled by the least and greatest known depth to -1..1. Denoising starts part of the way (``strength``) at known
-depth filled by the nearest; after every step but the last, latent cells that are known get that depth's latent with the
-noise of the step (Avrahami et al., "Blended diffusion", 2022): known depth is kept nearly, not exactly. The noise is
-the same for every image.
-"""
+"""Dense depth from an image and LiDAR by DepthLab (Liu et al., "DepthLab: from partial to complete", 2024), from a
+folder that ``mudg convert`` writes: depth inpainting by latent diffusion, where a second U-Net sees the image and hands
+its features over. docs/reference/labels.md says how it is run."""
 
 from __future__ import annotations
 

@@ -1,13 +1,6 @@
 """Measured facts about each pixel, from LiDAR, calibration, driven path and boxes, as input planes for a segmentation
-network.
-
-Unlike colours, these numbers mean the same in a generated city and in a recorded log: height above the ground, distance
-to the camera and to the driven path, whether a kerb lies between, surface orientation, roughness of the returns,
-distance to the nearest return, elevation of the ray, and the tracked boxes that contain the pixel.
-
-Depth is filled from the returns at the size of the given view, also in the sky; ``away_deg`` says how far the nearest
-return is.
-"""
+network. Unlike colours, these numbers mean the same in a generated city and in a recorded log. Depth is filled from the
+returns, also in the sky; ``away_deg`` says how far the nearest return is."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
-"""Classes by a pretrained segmentation network from a folder on disk: SegFormer or Mask2Former with Cityscapes classes.
-
-The networks come from the ``transformers`` package (see ``networks.folders``); nothing is downloaded: the folder holds
-``config.json``, ``preprocessor_config.json`` and ``model.safetensors`` as that package writes them. Class names of the
-folder are matched with ours by name. Large images are cut into overlapping tiles whose probabilities are averaged.
-"""
+"""Classes by a pretrained segmentation network from a folder on disk, as transformers writes it: SegFormer or
+Mask2Former with Cityscapes classes, matched with ours by name. Large images are cut into overlapping tiles whose
+probabilities are averaged."""
 
 from __future__ import annotations
 
@@ -70,12 +67,8 @@ class Segmenter:
 
     @classmethod
     def load(cls, folder: str | Path, device: torch.device = CPU) -> Segmenter:
-        """Read a network from a folder.
-
-        Raises:
-            ResourceError: the folder or the transformers package is missing. InputError: another kind of
-            network, one that lacks weights, or none of its class names is one of ours.
-        """
+        """Read a network from a folder. ResourceError: the folder or the transformers package is missing. InputError:
+        another kind of network, one that lacks weights, or none of its class names is one of ours."""
         path = Path(folder)
         if not folder or not (path / "config.json").is_file():
             expected = "a folder with config.json and model.safetensors"
@@ -127,11 +120,8 @@ class Segmenter:
 
 
 def match_classes(names: Mapping[str, str], where: str) -> NDArray[np.intp]:
-    """Our train id of each class of a network by its name, UNLABELLED where we have none; i64[C].
-
-    Raises:
-        InputError: none of the names is one of ours.
-    """
+    """Our train id of each class of a network by its name, UNLABELLED where we have none; i64[C]. InputError: none of
+    the names is one of ours."""
     wanted = {name.replace(" ", "").lower(): index for index, name in enumerate(CLASSES)}
     ordered = [names[key] for key in sorted(names, key=int)]
     found = [wanted.get(str(name).replace(" ", "").replace("_", "").lower(), UNLABELLED) for name in ordered]

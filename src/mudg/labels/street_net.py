@@ -1,9 +1,6 @@
-"""Labels by the network that comes with the package: ``mudg annotate --labeller embedded``.
-
-Images of a longer focal length than in training are made smaller, so that objects have the size they had there; the
-measured evidence of ``evidence.py`` has the same size. Rules then correct what evidence and colour decide
-(``settled``, ``settled_by_color``), and the probabilities are resampled to the image's size.
-"""
+"""Labels by the network that comes with the package: ``mudg annotate --labeller embedded``. Images of a longer focal
+length than in training are made smaller first. Rules then correct what evidence and colour decide (``settled``,
+``settled_by_color``)."""
 
 from __future__ import annotations
 
@@ -145,12 +142,9 @@ def save(net: StreetNet, folder: Path, card: str, facts: Mapping[str, Any]) -> N
 
 
 def load(folder: Path | str = EMBEDDED) -> StreetNet:
-    """Read a network written by ``save``; without a folder, the one that comes with the package.
-
-    Raises:
-        ResourceError: no such folder. InputError: another kind of model, or other weights than its shape implies.
-        IntegrityError: the weights do not match their recorded hash.
-    """
+    """Read a network written by ``save``; without a folder, the one that comes with the package. ResourceError: no such
+    folder. InputError: another kind of model, or other weights than its shape implies. IntegrityError: the weights do
+    not match their recorded hash."""
     where = _described(folder)
     content = store.parse_json(store.read_bytes(where), str(where))
     if not isinstance(content, dict) or content.get("schema") != 1 or content.get("kind") != "street_net":
@@ -165,11 +159,7 @@ def load(folder: Path | str = EMBEDDED) -> StreetNet:
 
 
 def digest(folder: Path | str = EMBEDDED) -> str:
-    """Digest of a network's description, which holds the hash of its weights.
-
-    Raises:
-        ResourceError: no such folder.
-    """
+    """Digest of a network's description, which holds the hash of its weights. ResourceError: no such folder."""
     return store.digest(_described(folder))
 
 

@@ -1,8 +1,5 @@
-"""The latent code of the small models: images, depth and semantics to small latent maps and back.
-
-`PatchCodec`: 2x2 pixel patches, a principal component basis for colour, an exact basis for log depth, class shares for
-semantics, and a small convolutional decoder that puts back what the basis lost.
-"""
+"""The latent code of the small models (`PatchCodec`): 2x2 pixel patches, a principal component basis for colour, an
+exact basis for log depth, class shares, and a small convolutional decoder that puts back what the basis lost."""
 
 from __future__ import annotations
 

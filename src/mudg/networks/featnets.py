@@ -1,18 +1,5 @@
-"""Feature extractors for perceptual comparison: a fixed filter bank, the shipped codec's network, the trunk of LPIPS.
-
-By default fits use the filter bank and scores the codec.
-
-Each takes an image and returns a list of feature maps. ``FilterBank`` needs no weights; it follows what is known of
-early vision (Gabor-like energy at several scales and orientations, divisive contrast normalisation, opponent colours):
-
-* opponent colours: luminance and two chroma axes, compared on blurred images only (the eye resolves colour coarsely);
-* per scale (1, 1/2, 1/4 of the size): first-derivative responses in four orientations, divided by the local contrast,
-  so that a weak texture in shadow counts as much as a strong one in the sun;
-* the responses' *energy*, pooled over a few pixels: two images of the same texture that are misaligned by a
-  pixel are close, where L1 sees two different images and answers with blur.
-
-The bank is differentiable, deterministic, and costs about as much as SSIM.
-"""
+"""Feature extractors for perceptual comparison, from an image to a list of feature maps: a fixed filter bank (fits),
+the shipped codec's network (scores), the trunk of LPIPS."""
 
 from __future__ import annotations
 

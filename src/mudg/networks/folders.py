@@ -1,10 +1,6 @@
-"""Pretrained networks in folders, as the packages transformers and diffusers write them: nothing is downloaded, and a
-folder is read completely or not at all.
-
-The packages are extras, imported at first use. Which class reads a folder is decided by our tables: no name in a file
-becomes an import, and code that lies in a folder never runs. Weights come from safetensors only. A weight that the
-network has and the folder lacks is an error, where the packages would leave it random and say so in a log.
-"""
+"""Pretrained networks in folders, as transformers and diffusers (extras) write them, completely or not at all. Nothing
+is downloaded; our tables name the class that reads a folder, code in it never runs, and weights come from safetensors.
+A weight that the folder lacks is an error, where the packages would leave it random."""
 
 from __future__ import annotations
 

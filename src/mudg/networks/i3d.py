@@ -1,10 +1,6 @@
-"""FVD's feature extractor: the I3D network trained on Kinetics-400, from tensors under either of the names in use.
-
-The two files that hold it (``i3d_torchscript.pt`` and ``i3d_pretrained_400.pt``) name their tensors differently, and
-their packages use different epsilons in the norms; features at 1e-5 differ by a percent from those at 1e-3. Paddings
-follow TensorFlow's rule SAME, which depends on the size and is not symmetric. How frames get to 224x224 is part of the
-definition (``VideoRule``).
-"""
+"""FVD's feature extractor: I3D trained on Kinetics-400, from tensors under either of the names in use, with epsilon
+1e-3 in its norms and TensorFlow's rule SAME of padding. How frames get to 224x224 is part of the definition
+(``VideoRule``)."""
 
 from __future__ import annotations
 

@@ -1,11 +1,6 @@
-"""FID's feature extractor: the Inception-v3 network of the TensorFlow release of 2015, from tensors under their usual
-names.
-
-It differs from torchvision's Inception-v3: averages leave padding out of their count, the last block takes maxima where
-the one before averages, there are 1008 classes and no auxiliary head, and the weights are others. Numbers made with
-another network are not FID. How an image is brought to 299x299 is part of the definition, too; five rules are in use
-(``ResizeRule``).
-"""
+"""FID's feature extractor: the Inception-v3 network of the TensorFlow release of 2015, which differs from
+torchvision's. How an image is brought to 299x299 is part of the definition, too; five rules are in use
+(``ResizeRule``)."""
 
 from __future__ import annotations
 

@@ -110,12 +110,8 @@ def _write_cloud(folder: Path, name: str, cloud: PointCloud) -> dict[str, Any]:
 
 
 def read_fused(folder: Path | str) -> FusedCloud:
-    """Read a fused cloud.
-
-    Raises:
-        InputError: not the output folder of ``fuse``.
-        IntegrityError: a cloud differs from what was written.
-    """
+    """Read a fused cloud. InputError: not the output folder of ``fuse``. IntegrityError: a cloud differs from what was
+    written."""
     folder = Path(folder)
     index = store.read_json(folder / "fuse.json")
     if not isinstance(index, dict) or index.get("format") != "mudg-fused" or index.get("schema_version") != 1:

@@ -1,8 +1,5 @@
-"""``mudg fuse``: scene -> one static coloured cloud and one cloud per moving object. The rules are in
-``core/fusion.py``.
-
-Images of held-out frames give no colours, so that nothing of what is scored later leaks into the clouds.
-"""
+"""``mudg fuse``: scene -> one static coloured cloud and one per moving object, by the rules of ``core/fusion.py``.
+Images of held-out frames give no colours, so that nothing of what is scored later leaks into the clouds."""
 
 from __future__ import annotations
 

@@ -72,10 +72,7 @@ def label_ref(name: str, frame_id: str) -> str:
 
 def encode_label(name: str, array: NDArray[Any], camera: Camera, where: str) -> bytes:
     """File bytes of a label; see ``read_label`` for the arrays. Depth that is not finite or not positive is missing.
-
-    Raises:
-        InputError: no such label, another size than the camera's, or values out of range.
-    """
+    InputError: no such label, another size than the camera's, or values out of range."""
     array = np.asarray(array)
     _check_label_name(name, where)
     _check_size(array, camera, f"{where}: {name}")

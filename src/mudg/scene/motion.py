@@ -1,9 +1,5 @@
-"""What keys of poses tell about a motion: gaps between them, headings that flip, jumps and turns that no vehicle makes;
-and the recorded path as a road.
-
-Poses between two keys lie on the straight line through both (``geometry.pose_at``). Where keys are missing, the path
-between was another: a cubic curve with the velocities on either side says how far off the line may be.
-"""
+"""What keys of poses tell about a motion: gaps between them (a cubic curve says how far off a straight line may be),
+headings that flip, jumps and turns that no vehicle makes; and the recorded path as a road."""
 
 from __future__ import annotations
 

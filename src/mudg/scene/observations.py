@@ -188,11 +188,8 @@ class ObservationSet:
 
 
 def read_observations(path: Path) -> ObservationSet:
-    """Open a folder of observations; nothing but the index is read.
-
-    Raises:
-        InputError: the folder has no index (unfinished or not an observation folder) or a record is malformed.
-    """
+    """Open a folder of observations; nothing but the index is read. InputError: the folder has no index (unfinished or
+    not an observation folder) or a record is malformed."""
     index = Path(path) / _INDEX
     if not index.is_file():
         raise InputError("not a finished folder of observations", where=str(path), expected=f"a file {_INDEX}")
@@ -292,11 +289,8 @@ def write_index(sweeps: SweepSet) -> None:
 
 
 def read_sweep_sets(folder: Path) -> dict[str, SweepSet]:
-    """The sets below ``folder/lidar``, by trajectory; none where that folder is not there.
-
-    Raises:
-        InputError: a malformed index.
-    """
+    """The sets below ``folder/lidar``, by trajectory; none where that folder is not there. InputError: a malformed
+    index."""
     places = sorted((Path(folder) / "lidar").iterdir()) if (Path(folder) / "lidar").is_dir() else []
     return {place.name: _read_set(place) for place in places if (place / SWEEPS_INDEX).is_file()}
 

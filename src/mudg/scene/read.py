@@ -154,11 +154,8 @@ def all_refs(scene: Scene) -> list[tuple[str, Ref]]:
 
 
 def read_image(scene: Scene, frame: Frame) -> NDArray[np.uint8]:
-    """The recorded image, u8[H, W, 3] RGB. Grey images are repeated on three channels.
-
-    Raises:
-        InputError: missing, truncated, not 8-bit, or not of the camera's size.
-    """
+    """The recorded image, u8[H, W, 3] RGB. Grey images are repeated on three channels. InputError: missing, truncated,
+    not 8-bit, or not of the camera's size."""
     content = open_files(scene.root).read(frame.image.path)
     return decode_image(content, f"{scene.root}: {frame.image.path}", frame.view.camera)
 
@@ -234,10 +231,7 @@ def _explained(content: bytes, where: str) -> Iterator[None]:
 
 def read_points(scene: Scene, sweep: Sweep) -> SweepPoints:
     """The points of a sweep in the LiDAR frame. A sweep with zero points is a sweep with zero points, not an error.
-
-    Raises:
-        InputError: missing, truncated, wrong tensors, or NaN coordinates.
-    """
+    InputError: missing, truncated, wrong tensors, or NaN coordinates."""
     where = f"{scene.root}: {sweep.points.path}"
     arrays = store.parse_safetensors(open_files(scene.root).read(sweep.points.path), where)
     for name in ("xyz", "intensity", "dt_s"):
@@ -266,11 +260,8 @@ def spread(records: Sequence[Record], count: int) -> list[Record]:
 
 
 def checked_points(arrays: Mapping[str, NDArray[Any]], where: str) -> SweepPoints:
-    """Points from the arrays ``xyz``, ``intensity``, ``dt_s`` and, if there, ``classes``.
-
-    Raises:
-        InputError: wrong shape or type, values that are not finite, or classes that are no train ids.
-    """
+    """Points from the arrays ``xyz``, ``intensity``, ``dt_s`` and, if there, ``classes``. InputError: wrong shape or
+    type, values that are not finite, or classes that are no train ids."""
     count, classes = len(arrays["xyz"]), arrays.get("classes")
     wanted = {"xyz": ((count, 3), "float32"), **dict.fromkeys(("intensity", "dt_s"), ((count,), "float32"))}
     wanted |= {} if classes is None else {"classes": ((count,), "uint8")}

@@ -1,10 +1,6 @@
 """``scene.json`` and ``tracks.json``: what a record may hold, parsing into the types of ``base/types.py``, and the text
-written.
-
-Every refusal is an ``InputError`` that names file, record and field, says what was expected and found, and what to do.
-Parsers take ``complain``: the reader passes a function that raises at the first problem, ``mudg doctor`` passes one
-that collects them all, so that a person sees every mistake of a hand-made scene at once.
-"""
+written. Every refusal names file, record and field. ``complain`` takes each problem: the reader raises at the first,
+``mudg doctor`` collects them all."""
 
 from __future__ import annotations
 

@@ -18,7 +18,6 @@ def annotate(
     device: str = 'auto',
     sweeps: int = 6,
     dynamic: bool = True,
-    ego: bool = False,
     processes: int = 0,
 ) -> Any:
     """Add missing labels to a scene: semantics, sky and depth, with confidences.
@@ -36,7 +35,6 @@ def annotate(
         device: Device of the networks of labeller and `depth_network`: auto (CUDA if there is one), cpu, cuda, cuda:N, mps.
         sweeps: Number of sweeps per LiDAR, nearest in time, whose points are merged for dense depth.
         dynamic: Write masks of dynamic objects, from the tracked boxes.
-        ego: Write masks of the own vehicle: pixels at the bottom of the image that stay the same while it drives. Use it if the bonnet is visible.
         processes: Number of frames labelled at the same time (0 = one per core; one if a pretrained network computes on another device).
     """
     ...
@@ -60,7 +58,7 @@ def bench(
     processes: int = 0,
     videos: bool = True,
     table: Literal['mudg1', 'mudg2', 'mudg3', 'recondreamer', 'drivedreamer4d', 'streetcrafter', 'freesim', 'recam', 'spvc', 'panda', 'dist'] = 'mudg1',
-    protocols: tuple[str, ...] = ('gap', 'camera', 'lidar', 'classes'),
+    protocols: tuple[str, ...] = ('gap', 'camera', 'lidar'),
     shown: tuple[str, ...] = (),
     resolution: str = '',
     frames: str = '',
@@ -90,7 +88,7 @@ def bench(
         processes: Number of logs (real: also ways of hiding frames) processed at the same time, with one thread each (0 = one per core). Results do not depend on it.
         videos: shift, paper: also write videos of all methods side by side.
         table: paper: the table to fill (docs/paper_tables.md).
-        protocols: real: protocols, out of the four of the default. Instead of gap also gap-1, gap-3 and gap-5 alone.
+        protocols: real: protocols, out of the three of the default. Instead of gap also gap-1, gap-3 and gap-5 alone.
         shown: real: cameras that the methods see in protocol camera; the first one gives the views beside the recorded path (empty = front, or the first camera).
         resolution: real, paper: image size of logs that are imported, as for ingest (empty = as recorded; paper: as the table says). paper with a list of cities: WIDTHxHEIGHT (empty = 384x256).
         frames: real, paper: frames of logs that are imported, FIRST:END without END itself, as for ingest (empty = all; paper: as the table says). paper with a list of cities: 0:END (empty = 0:24).
