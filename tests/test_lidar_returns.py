@@ -189,8 +189,10 @@ def test_learning_does_not_read_held_out_sweeps(city: Scene, session: Session) -
 
 
 def test_held_out_and_shifted_sweeps_are_near_the_truth_and_nearer_than_moved_ones(
-    city: Scene, session: Session, tmp_path: Path
+    city: Scene, session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Only sweeps of held-out frames are scored, so no others are simulated."""
+    monkeypatch.setattr("mudg.sim.lidar.read_scene", lambda _: replace(city, sweeps=city.sweeps[4:5]))
     write_sweeps(RenderConfig(lidar="lidar", shifts_m=(0.0, 3.0)), Path(city.root), session, tmp_path)
     assert set(read_sweep_sets(tmp_path)) == {"lidar_recorded", "lidar_shift+3.0"}
     rows = {(row["method"], row["shift_m"]): row["values"] for row in scores.sweep_scores(city, {"m": tmp_path})}

@@ -111,7 +111,7 @@ def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: boo
         run_report.write_page(out, reels)
         ledger.steps["report"]["written_bytes"] = folder_bytes(page)
         ledger.save("complete")
-    text = _closing_text(out, str(source), page, ledger)
+    text = _closing_text(out, page, ledger)
     return {"report": page, "metrics": out / "score" / "metrics.json", "seconds": ledger.seconds(), "text": text}
 
 
@@ -221,7 +221,7 @@ def steps_of(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> dict
     return {name: replace(step, overwrite=overwrite) for name, step in steps.items()}
 
 
-def _closing_text(out: Path, source: str, report: Path, ledger: _Ledger) -> str:
+def _closing_text(out: Path, report: Path, ledger: _Ledger) -> str:
     """Scores, what the steps took, where the pages lie, and what to do next."""
     from mudg.scoring import score
     from mudg.viewer.report import next_commands
@@ -238,7 +238,7 @@ def _closing_text(out: Path, source: str, report: Path, ledger: _Ledger) -> str:
     viewer = out / "viewer.html"
     pages = [f"report: {report.resolve()}", *([f"viewer: {viewer.resolve()}"] if viewer.is_file() else [])]
     wanted = {"view": "fly through it", "export": "take it elsewhere", "dataset": "train on it", "run": "your own log"}
-    lines = [line for _, block in next_commands(out, source) for line in block]
+    lines = [line for _, block in next_commands(out) for line in block]
     first = {verb: next(line for line in lines if line.startswith(f"mudg {verb} ")) for verb in wanted}
     after = ["next:", *(f"  {first[verb]:<58}  {what}" for verb, what in wanted.items())]
     return "\n".join([score.summary_table(out / "score"), "", head, *rows, total, "", *pages, "", *after])
