@@ -18,6 +18,7 @@ def annotate(
     device: str = 'auto',
     sweeps: int = 6,
     dynamic: bool = True,
+    ego: bool = False,
     processes: int = 0,
 ) -> Any:
     """Add missing labels to a scene: semantics, sky and depth, with confidences.
@@ -35,6 +36,7 @@ def annotate(
         device: Device of the networks of labeller and `depth_network`: auto (CUDA if there is one), cpu, cuda, cuda:N, mps.
         sweeps: Number of sweeps per LiDAR, nearest in time, whose points are merged for dense depth.
         dynamic: Write masks of dynamic objects, from the tracked boxes.
+        ego: Write masks of the own vehicle: pixels at the bottom of the image that stay the same while it drives. Use it if the bonnet is visible.
         processes: Number of frames labelled at the same time (0 = one per core; one if a pretrained network computes on another device).
     """
     ...

@@ -120,7 +120,7 @@ class Annotate(Output):
     result = "scene"
     version, files = 4, (*SCENE_FILES, "labels.html", "pictures/*.jpg", "labelled/")
     idle = ("processes",)
-    short = ("labeller", "weights", "depth_network", "device", "sweeps", "processes")
+    short = ("labeller", "weights", "depth_network", "device", "sweeps", "ego", "processes")
     scene: Annotated[Path, SCENE]
     """Scene directory written by ingest, or folder of mudg run."""
     settings: AnnotateConfig
