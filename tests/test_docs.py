@@ -36,6 +36,7 @@ FLAGS: dict[str, list[str]] = {
 }
 
 FOREIGN_FLAGS = {
+    "--local-dir": "hf",
     f"--{flag}": program
     for program, flags in {
         "torchrun": "nproc-per-node nnodes standalone rdzv-conf rdzv-backend rdzv-endpoint rdzv-id max-restarts"
