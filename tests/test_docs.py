@@ -36,7 +36,6 @@ FLAGS: dict[str, list[str]] = {
 }
 
 FOREIGN_FLAGS = {
-    "--local-dir": "hf",
     f"--{flag}": program
     for program, flags in {
         "torchrun": "nproc-per-node nnodes standalone rdzv-conf rdzv-backend rdzv-endpoint rdzv-id max-restarts"
@@ -45,6 +44,7 @@ FOREIGN_FLAGS = {
         "pytest": "dist",
         "zensical": "strict",
         "docker": "rm network gpus build-arg user",
+        "hf": "local-dir",
         "sbatch": "nodes ntasks-per-node signal",
     }.items()
     for flag in flags.split()
