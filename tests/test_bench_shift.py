@@ -53,7 +53,7 @@ def test_a_list_is_what_the_rule_gives(first, name):
     kept, half, seed = {True: [], False: []}, len(city_logs.LISTS[name]) // 2, first
     while min(map(len, kept.values())) < half:
         curved = city_logs.turn_deg(city_logs.log_config(seed)) >= city_logs.CURVED_DEG
-        if len(kept[curved]) < half and city_logs.facts(seed).moving >= city_logs.MOVING:
+        if len(kept[curved]) < half and city_logs.facts(seed)["movers"] >= city_logs.MOVING:
             kept[curved].append(seed)
         seed += 1
     assert tuple(sorted(kept[True] + kept[False])) == city_logs.LISTS[name]

@@ -220,7 +220,7 @@ def test_what_is_not_finite_is_found_in_one_look(world):
     with pretend_device() as there:
         table = Table({"means": torch.zeros(3, 3), "logits": torch.zeros(3)}).to(there)
         model = SceneModel(table, (StaticNode(),), None, (), 0)
-        check = FiniteCheck(7, at_once=False)
+        check = FiniteCheck(7)
         with transfers() as seen:
             table["means"].grad = torch.zeros(3, 3, device=there)
             table["logits"].grad = torch.full((3,), torch.inf, device=there)

@@ -127,12 +127,12 @@ def world(tmp_path_factory) -> dict[str, Path]:
 
 
 def settings():
-    few = {"start__gaussians": 600, "densify__max_gaussians": 1000, "preview_every": 12}
-    return small_fit("mudg_s", **few, poses__learn=True)
+    few = {"start__gaussians": 600, "densify__max_gaussians": 1000, "preview_every": 8}
+    return small_fit("mudg_s", iterations=16, **few, poses__learn=True)
 
 
 def result_of(folder: Path) -> dict[str, bytes]:
-    names = ("gaussians.safetensors", "nodes.safetensors", "model.json", "preview/000012.png", "preview/000024.png")
+    names = ("gaussians.safetensors", "nodes.safetensors", "model.json", "preview/000008.png", "preview/000016.png")
     return {name: (folder / name).read_bytes() for name in names}
 
 

@@ -29,12 +29,11 @@ from mudg.base import geometry
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.types import Camera, EgoPath, Frame, Scene, SweepPoints
 from mudg.formats.exporters.messages import LogRecords
-from mudg.formats.exporters.ncore import sensor_ids, write_ncore
+from mudg.formats.exporters.ncore import PoseKeys, package, sensor_ids, write_ncore
 from mudg.formats.importers import RECOGNISERS
 from mudg.formats.importers import ncore as importer
 from mudg.formats.importers.common import ImportOptions
 from mudg.formats.importers.images import brown_conrady, equidistant, fit_images
-from mudg.formats.ncore import PoseKeys, package
 from mudg.scene.labels import read_label
 from mudg.scene.read import open_files, read_points
 
@@ -311,7 +310,7 @@ def test_a_path_that_is_too_short_goes_on_and_then_stands() -> None:
 
 
 def test_the_package_is_asked_for_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ncore.data", None)
+    monkeypatch.setitem(sys.modules, "ncore.data.v4", None)
     (tmp_path / "a.ncore4.zarr.itar").write_bytes(b"")
     refused(r"mudg\[ncore\]", ingest, tmp_path, tmp_path / "out", raises=ResourceError)
     assert app.main(["export", "ncore", str(tmp_path), "--out", str(tmp_path / "out")]) != 0

@@ -113,7 +113,7 @@ def test_a_still_video_does_not_flicker_and_missing_files_name_their_flags(log_s
     assert value(log_scores, "gray", HERE, "temporal_flickering") == 1.0
     assert 0.8 < value(log_scores, "right", HERE, "temporal_flickering") < 0.99
     text = score_tables.markdown(log_scores)
-    for flag in "detections lanes clip-weights lpips-vgg-weights".split():
+    for flag in "detections lanes lpips-vgg-weights".split():
         assert f"--{flag}" in text
 
 

@@ -92,14 +92,6 @@ def run_step(step: Result) -> Path:
         return step.run()
 
 
-def finished(path: Path, measure: Callable[[], Any]) -> Any:
-    """What a part of a benchmark wrote; it is measured if there is no such file yet, so an interrupted benchmark goes
-    on."""
-    if not path.is_file():
-        store.write_json(path, measure())
-    return store.read_json(path)
-
-
 def refuse_foreign(out: Path, bench: str, table: str = "", may_be: Callable[[Path], bool] = Path.is_dir) -> None:
     """UsageError if a folder, which need not exist, holds anything that a benchmark (under a table of a paper) does not
     write. ``may_be``: whether an entry may belong to it that is none of ``PAGES``."""

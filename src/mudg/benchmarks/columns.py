@@ -427,23 +427,11 @@ def _within(generated: Tensor, true: Tensor) -> Tensor:
     return (torch.maximum(generated.clamp_min(1e-6) / true, true / generated.clamp_min(1e-6)) < 1.25).double()
 
 
-def _part_columns(part: str) -> dict[str, Column]:
-    squared = lambda made, true: (made - true) ** 2
-    return {
-        f"abs_rel_{part}": Column(f"AbsRel, {part}", 4, _depth(_relative, part), _mean, ratio=True),
-        f"rmse_{part}": Column(f"RMSE m, {part}", 2, _depth(squared, part), _root, ratio=True),
-        f"delta1_{part}": Column(f"delta1, {part}", 4, _depth(_within, part), _mean),
-    }
+def _squared(generated: Tensor, true: Tensor) -> Tensor:
+    return (generated - true) ** 2
 
 
-def _point_columns(part: str) -> dict[str, Column]:
-    difference = _point_color(torch.abs, part)
-    return {
-        f"point_psnr_{part}": Column(f"PSNR at points, {part}", 2, _point_color(torch.square, part), _decibels),
-        f"point_abs_{part}": Column(f"colour error at points, {part}", 4, difference, _mean, ratio=True),
-    }
-
-
+_PARTS: Final = ("seen", "static", "dynamic")
 COLUMNS: Final[dict[str, Column]] = {
     "psnr": Column("PSNR dB", 2, _photo(metrics.psnr), _mean),
     "ssim": Column("SSIM", 3, _photo(metrics.ssim), _mean),
@@ -453,8 +441,17 @@ COLUMNS: Final[dict[str, Column]] = {
     "psnr_seen": Column("PSNR dB, seen", 2, _seen_color, _decibels),
     "perceptual_seen": Column("perceptual, seen", 4, _perceptual("seen"), _mean, ratio=True),
     "abs_rel": Column("AbsRel", 4, _depth(_relative), _mean, ratio=True),
-    **{name: column for part in ("seen", "static", "dynamic") for name, column in _part_columns(part).items()},
-    **{name: column for part in ("static", "dynamic") for name, column in _point_columns(part).items()},
+    **{f"abs_rel_{of}": Column(f"AbsRel, {of}", 4, _depth(_relative, of), _mean, ratio=True) for of in _PARTS},
+    **{f"rmse_{of}": Column(f"RMSE m, {of}", 2, _depth(_squared, of), _root, ratio=True) for of in _PARTS},
+    **{f"delta1_{of}": Column(f"delta1, {of}", 4, _depth(_within, of), _mean) for of in _PARTS},
+    **{
+        f"point_psnr_{of}": Column(f"PSNR at points, {of}", 2, _point_color(torch.square, of), _decibels)
+        for of in _PARTS[1:]
+    },
+    **{
+        f"point_abs_{of}": Column(f"colour error at points, {of}", 4, _point_color(torch.abs, of), _mean, ratio=True)
+        for of in _PARTS[1:]
+    },
     "miou": Column("mIoU", 3, _confusion, _mean_iou),
     "accuracy": Column("accuracy", 3, _confusion, _accuracy),
 }

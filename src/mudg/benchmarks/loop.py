@@ -27,7 +27,7 @@ from mudg.base.errors import UsageError
 from mudg.base.html import markdown_table
 from mudg.base.run_folder import refuse_overlap
 from mudg.base.types import Camera, View
-from mudg.benchmarks.chain import Facts, compare, finished, refuse_foreign
+from mudg.benchmarks.chain import Facts, compare, refuse_foreign
 from mudg.benchmarks.places import Views, listed_cities, score_settings
 from mudg.benchmarks.rows import (
     BASE,
@@ -47,8 +47,8 @@ from mudg.city.logs import STANDARD, LogRules
 from mudg.city.world import CityWorld
 from mudg.core import metrics
 from mudg.diffusion import model_files
+from mudg.scene.motion import Road
 from mudg.scene.read import read_scene
-from mudg.scene.road import Road
 from mudg.sim.drive import Cockpit, Drive, Following, RoadUser, beginning
 from mudg.sim.lidar import LidarRequest, MountedLidar, mounted
 from mudg.sim.pilots import DriverView, EdgePilot, RoutePilot
@@ -95,6 +95,13 @@ class LoopLog(Views):
         self.chain.fuse()
         course = Course.of(CityWorld(city_logs.log_config(int(self.log.name), self.rules)))
         drives = self.out / "drives"
+
+        def finished(path: Path, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+            """What an interrupted benchmark wrote, else measured now."""
+            if not path.is_file():
+                store.write_json(path, measure())
+            return store.read_json(path)
+
         exact = {
             pilot: finished(drives / f"exact-{pilot.replace(' ', '_')}.json", partial(measure_drive, course, pilot))
             for pilot in PILOTS

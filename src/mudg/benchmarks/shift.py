@@ -83,10 +83,8 @@ class ShiftLog(Views):
             (metrics,) = self.scores(name, folders).values()
             values[name] = {f"{entry['distance_m']:g}": entry["values"] for entry in metrics["by_distance"]}
         self.film({name: folders for name, folders in views.items() if name in SHOWN})
-        facts = city_logs.facts(self.log.seed, self.log.rules)
-        path = {"log": self.log.seed, "turn_deg": round(facts.turn_deg, 2), "length_m": round(facts.length_m, 1)}
-        movers = {"movers": facts.moving, "mover_share": round(facts.moving_share, 4), "words": facts.description}
-        return {**path, **movers, "values": values, "seconds": seconds_of(self.out)}
+        facts = {"log": self.log.seed, **city_logs.facts(self.log.seed, self.log.rules)}
+        return {**facts, "values": values, "seconds": seconds_of(self.out)}
 
 
 def run(
@@ -215,94 +213,60 @@ def virtual_fits_of(settings: Facts) -> str:
     return f"{settings['guided_share']:g} times as many under virtual views"
 
 
-def _summary(settings: Facts) -> str:
-    return f"{settings['iterations']} iterations per fit, {virtual_fits_of(settings)}"
-
-
 def markdown(doc: Facts) -> str:
     """The tables for people."""
-    settings = doc["settings"]
-    width, height = settings["size_px"]
-    size = f"{width}x{height}, {len(settings['cameras'])} cameras"
+    settings, logs, names = doc["settings"], doc["logs"], [row["name"] for row in doc["methods"]]
+    size = "{}x{}".format(*settings["size_px"]) + f", {len(settings['cameras'])} cameras"
+    facts = [
+        [str(e["log"]), f"{e['turn_deg']:.1f}", f"{e['length_m']:.0f}", str(e["movers"]), f"{e['mover_share']:.1%}"]
+        + [e["words"]]
+        for e in logs
+    ]
     lines = [
-        f"# Off the recorded path: {_logs_text(doc)} of the {settings['list']} list",
+        f"# Off the recorded path: {len(logs)} log{'s' if len(logs) != 1 else ''} of the {settings['list']} list",
         "",
         f"{settings['frames']} frames at 10 Hz, {size}, every {settings['held_out_every']}th frame held out;"
-        f" {_summary(settings)}; seed {settings['seed']}. Means over both sides and all logs, +- the standard error"
-        " over logs. Flicker: 1 = as steady as the truth. Perceptual: features of the shipped codec, not LPIPS.",
+        f" {settings['iterations']} iterations per fit, {virtual_fits_of(settings)}; seed {settings['seed']}. Means"
+        " over both sides and all logs, +- the standard error over logs. Flicker: 1 = as steady as the truth."
+        " Perceptual: features of the shipped codec, not LPIPS.",
         "",
-        *markdown_table(FACTS, map(_facts, doc["logs"])),
+        *markdown_table(
+            ["log", "turn, degrees", "length, m", "dynamic vehicles in view", "their share of the image", "city"], facts
+        ),
         "",
     ]
-    headings = [heading for heading, _ in COLUMNS.values()]
-    names = [row["name"] for row in doc["methods"]]
-    for place in _places(doc):
+    headings, shifted = [heading for heading, _ in COLUMNS.values()], [f"{d:g}" for d in sorted(doc["distances_m"])]
+    titles = {RECORDED: "Recorded path, held-out frames", **{d: f"{d} m to either side" for d in shifted}}
+    for place, title in {**titles, SHIFTED: f"Mean over {', '.join(shifted)} m"}.items():
         rows = [[name, *_cells(doc["pooled"][name][place])] for name in names]
-        lines += [f"## {_place_title(doc, place)}", "", *markdown_table(["method", *headings], rows), ""]
-    lines += ["## Comparisons", "", *_comparison_table(doc["comparisons"]), ""]
-    logs = doc["logs"]
+        lines += [f"## {title}", "", *markdown_table(["method", *headings], rows), ""]
+    heads = ["", "value", "standard error", "as", "logs", "each log"]
+    lines += ["## Comparisons", "", *markdown_table(heads, map(_compared, doc["comparisons"])), ""]
     rows = [[str(entry["log"]), name, *_cells(entry["values"][name][SHIFTED])] for entry in logs for name in names]
-    steps = dict.fromkeys(step for entry in logs for step in entry["seconds"])
-    seconds = [[step, *(f"{entry['seconds'].get(step, math.nan):.0f}" for entry in logs)] for step in steps]
-    lines += ["## Each log, mean off the recorded path", "", *markdown_table(["log", "method", *headings], rows), ""]
-    heads = ["step", *(str(entry["log"]) for entry in logs)]
-    return "\n".join([*lines, "## Seconds per log", "", *markdown_table(heads, seconds), ""])
+    each = markdown_table(["log", "method", *headings], rows)
+    return "\n".join([*lines, "## Each log, mean off the recorded path", "", *each, ""])
 
 
-def _places(doc: Facts) -> list[str]:
-    """The recorded path, the distances from it, and their mean."""
-    return [RECORDED, *(f"{d:g}" for d in sorted(doc["distances_m"])), SHIFTED]
-
-
-def _logs_text(doc: Facts) -> str:
-    count = len(doc["logs"])
-    return f"{count} log{'s' if count != 1 else ''}"
-
-
-def _place_title(doc: Facts, place: str) -> str:
-    if place == RECORDED:
-        return "Recorded path, held-out frames"
-    if place == SHIFTED:
-        return "Mean over " + ", ".join(f"{d:g}" for d in sorted(doc["distances_m"])) + " m"
-    return f"{place} m to either side"
-
-
-def _cells(values: Facts, with_error: bool = False) -> list[str]:
-    """Values by metric as text, pooled (with the standard error where that is wanted and known) or of one log; or the
-    reason for none."""
+def _cells(values: Facts) -> list[str]:
+    """Values by metric as text, of one log or pooled, with the standard error where it is known; or the reason for
+    none."""
     cells = []
     for metric, (_, digits) in COLUMNS.items():
         value = values[metric]
         if isinstance(value, Mapping):
             error = value["standard_error"]
-            more = f" +- {error:.{digits}f}" if with_error and error is not None else ""
-            cells.append(f"{value['mean']:.{digits}f}{more}")
+            cells.append(f"{value['mean']:.{digits}f}" + ("" if error is None else f" +- {error:.{digits}f}"))
         else:
             cells.append(value if isinstance(value, str) else f"{value:.{digits}f}")
     return cells
 
 
-FACTS: Final = ("log", "turn, degrees", "length, m", "dynamic vehicles in view", "their share of the image", "city")
-
-
-def _facts(entry: Facts) -> list[str]:
-    """Cells of a log's row under ``FACTS``."""
-    numbers = [f"{entry['turn_deg']:.1f}", f"{entry['length_m']:.0f}", str(entry["movers"])]
-    return [str(entry["log"]), *numbers, f"{entry['mover_share']:.1%}", entry["words"]]
-
-
-def _compared(comparison: Facts) -> tuple[str, str]:
-    """A comparison's value and standard error as text."""
-    is_difference, error = comparison["kind"] == "difference", comparison["standard_error"]
-    digits, sign = (COLUMNS[comparison["metric"]][1], "+") if is_difference else (3, "")
-    if comparison["value"] is None:
-        return "no number", ""
-    return f"{comparison['value']:{sign}.{digits}f}", "-" if error is None else f"{error:.{digits}f}"
-
-
-def _comparison_table(rows: Sequence[Facts]) -> list[str]:
-    cells = []
-    for row in rows:
-        each = " ".join("-" if v is None else f"{v:.3g}" for v in row["per_log"])
-        cells.append([row["title"], *_compared(row), row["kind"], str(row["logs"]), each])
-    return markdown_table(["", "value", "standard error", "as", "logs", "each log"], cells)
+def _compared(row: Facts) -> list[str]:
+    """A comparison's line."""
+    is_difference, error, value = row["kind"] == "difference", row["standard_error"], row["value"]
+    digits, sign = (COLUMNS[row["metric"]][1], "+") if is_difference else (3, "")
+    texts = ["no number", ""]
+    if value is not None:
+        texts = [f"{value:{sign}.{digits}f}", "-" if error is None else f"{error:.{digits}f}"]
+    each = " ".join("-" if one is None else f"{one:.3g}" for one in row["per_log"])
+    return [row["title"], *texts, row["kind"], str(row["logs"]), each]

@@ -657,8 +657,6 @@ METRICS: Final[dict[str, MetricRow]] = {
     "lpips_vgg": MetricRow("LPIPS (VGG)", "", ("rgb", "LPIPS weights"), "lower", None),
     "fid": MetricRow("FID", "", ("rgb", "Inception weights"), "lower", None),
     "kid": MetricRow("KID", "", ("rgb", "Inception weights"), "lower", None),
-    "clip_f": MetricRow("CLIP-F", "", ("rgb", "CLIP weights"), "higher", None),
-    "clip_v": MetricRow("CLIP-V", "", ("rgb", "CLIP weights"), "higher", None),
     "fvd": MetricRow("FVD", "", ("rgb", "I3D weights"), "lower", None),
     "abs_rel": MetricRow("AbsRel", "", ("depth",), "lower", lambda: depth_error("abs_rel")),
     "rmse_m": MetricRow("RMSE", "m", ("depth",), "lower", lambda: depth_error("rmse_m")),

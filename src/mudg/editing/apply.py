@@ -303,7 +303,7 @@ FACT = "edits"
 @dataclass(frozen=True, slots=True, eq=False)
 class EditedDrive:
     """What a script made of a drive. ``plan``: what was done. ``scene``, ``cloud``: edited; None where they were not
-    given. ``notes``: what the reader should know (``plan.check``)."""
+    given. ``notes``: what the reader should know, each with ``kind``, ids, numbers and a sentence ``text``."""
 
     script: EditScript
     plan: EditPlan
@@ -348,8 +348,8 @@ def carry_out(
         plan.notes.append({"kind": "street not closed", "ids": names, "text": text})
     made = None if scene is None else edited_scene(scene, plan)
     views = tuple([frame.view for frame in s.frames] if s else [] for s in (scene, made))
-    plan.sides = plans.shown_anew(plan, *views)
-    notes = plans.check(plan, *views)
+    seldom, plan.sides = plans.shown_sides(plan, *views)
+    notes = [*plan.notes, *plans.collisions(plan), *seldom]
     for note in notes:
         log.warn(f"edit: {note['text']}")
     return EditedDrive(script, plan, made, None if cloud is None else edited_cloud(cloud, plan), notes)

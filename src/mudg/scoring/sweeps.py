@@ -18,7 +18,7 @@ from mudg.base.errors import InputError
 from mudg.base.types import Scene
 from mudg.city.world import CityWorld
 from mudg.scene.beams import Beams, beams_of, held_out, moving_tracks, placed, returns_of, training_sweeps, with_silent
-from mudg.scene.sweep_sets import SimulatedSweep, SweepSet, read_sweep_sets
+from mudg.scene.observations import SimulatedSweep, SweepSet, read_sweep_sets
 
 Floats = NDArray[np.float64]
 MATCH_RAD: Final = float(np.radians(0.4))

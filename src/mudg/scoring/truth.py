@@ -36,7 +36,7 @@ from mudg.core.street_scores import VEHICLE_LABELS, visible_agents
 from mudg.core.trajectory import points_as_read
 from mudg.editing.settings import ScoreConfig
 from mudg.labels.annotate import nearest_sweeps
-from mudg.labels.ground import driven_path, ground_near
+from mudg.labels.evidence import driven_path, ground_near
 from mudg.labels.inputs import box_outline
 from mudg.scene.labels import read_label
 from mudg.scene.observations import ObservationSet, ObservationWriter, list_observation_sets, read_observations

@@ -7,6 +7,7 @@ OUT/report.html  OUT/viewer.html  OUT/run.yaml (settings)  OUT/run.json (state, 
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any
 from mudg.base import config as configuration
 from mudg.base import log, store
 from mudg.base.errors import InputError, IntegrityError, MudgError, UsageError, similar_path
-from mudg.base.memory import Meter, Usage, folder_bytes, in_words
+from mudg.base.memory import Usage, folder_bytes, in_words
 from mudg.base.records import ForeignRecord, Number, parse_record
 from mudg.base.run_folder import is_temporary, locked, refuse_overlap
 from mudg.base.versions import environment
@@ -330,25 +331,23 @@ class _Ledger:
         return f"{standing}, about {left_min:.0f} min left" if share >= FORECAST_FROM and left_min >= 1 else standing
 
     def timed(self, name: str, result: Path, run: Callable[[], Any]) -> Any:
-        """Do one step, which makes a folder or file, and add its seconds, also when it is interrupted; a reused result
-        adds none. The next step begins with the memory that this one took given back."""
+        """Do one step, which makes a folder or file, and note what it took: of a folder, what its own record says. The
+        next step begins with the memory that this one took given back."""
         from mudg.core.raster.cpu import release_memory
 
-        known = self.steps.get(name, {})
-        finished = known.get("state") == "complete" and result.exists()
-        meter, state = Meter(), "interrupted"
         log.info(f"== {self._standing(name)}")
+        began_s, self.steps[name] = time.monotonic(), {"state": "interrupted"}
         try:
             made = run()
             release_memory()
-            state = "complete"
+            self.steps[name] = {"state": "complete"}
+            return made
         finally:
-            spent, earlier = meter.stop(), Usage.of_record(known)
-            if not (finished and state == "complete" and spent.seconds < earlier.seconds):
-                spent = spent if finished else earlier.then(spent)
-                self.steps[name] = {"state": state, **spent.record(), "written_bytes": folder_bytes(result)}
+            done = self.steps[name]["state"] == "complete"
+            taken = store.json_object(result / store.RUN_STATE) if done else {}
+            spent = Usage.of_record({"seconds": time.monotonic() - began_s, **taken})
+            self.steps[name] |= {**spent.record(), "written_bytes": folder_bytes(result)}
             self.save("running")
-        return made
 
     def seconds(self) -> dict[str, float]:
         """Seconds per step, in order."""

@@ -1,8 +1,6 @@
-"""The report: one self-contained page of a finished run. Needs no network and works by double click.
-
-Each trajectory becomes one H.264 video that holds all panels (columns: truth and methods; rows: colour, depth, classes,
-colour error), so that the panels can never run apart; the page cuts them out of it.
-"""
+"""The report: one self-contained page of a finished run, without a network, by double click. Each trajectory becomes
+one H.264 video that holds all panels (columns: truth and methods; rows: colour, depth, classes, colour error), so that
+they never run apart; the page cuts them out of it."""
 
 from __future__ import annotations
 
@@ -93,7 +91,7 @@ GROUPS: Final = (
     ("Classes", ("miou", "accuracy")),
     ("At LiDAR points", ("lidar_abs_rel", "lidar_rmse_m", "lidar_delta1", "lidar_psnr", "agreement")),
     ("Vehicles and lanes", ("agent_iou", "lane_iou", "lane_correlation", "lane_psnr", "nta_iou", "ntl_iou")),
-    ("Steadiness", ("warp_error", "temporal_flickering", "clip_f")),
+    ("Steadiness", ("warp_error", "temporal_flickering")),
 )
 OPTIONAL: Final = frozenset({"At LiDAR points", "Vehicles and lanes", "Steadiness"})
 """Groups that are left out, and distances of them, where no method has a number."""

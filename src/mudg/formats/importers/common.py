@@ -125,8 +125,7 @@ class ImportOptions:
     Args:
         frames: source frame numbers ``(first, end)``, end not included; None takes all.
         cameras: the dataset's camera names; empty takes the importer's default.
-        sequence: which sequence or frame of a folder that holds many.
-        poses, boxes: files to use instead of those found by looking.
+        sequence: which sequence of a folder that holds many. poses, boxes: files to use instead of those found.
         skip_missing: leave out frames of which an image, scan or vehicle pose is missing, instead of refusing.
         untwist: undo the distortion of scans by the vehicle's motion; auto decides by what the dataset documents.
         test_every: hold out every n-th frame of all cameras (n, 2n, ...); 0 holds out none.
