@@ -91,7 +91,7 @@ def basis_rows(x: Any, y: Any, z: Any, degree: int) -> list[Any]:
 
 def basis(directions: Array, degree: int) -> Array:
     """Values f64[N, (degree + 1)^2] at unit directions [N, 3]."""
-    return np.stack(basis_rows(*np.asarray(directions, np.float64).T, degree), 1)
+    return np.stack(basis_rows(*np.asarray(directions, np.float64).T, degree=degree), 1)
 
 
 def rotated(coefficients: NDArray[np.float32], rotation: Array) -> NDArray[np.float32]:

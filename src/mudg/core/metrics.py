@@ -463,13 +463,13 @@ class ExactMotion:
             frames.append(TrueFrame(one.view, torch.where(known, one.truth_depth, 1000.0), one.truth_semantics))
         instance = before.facts.instance
         if instance is None:
-            return pixel_motion(*frames)
+            return pixel_motion(frames[0], frames[1])
         moved: dict[int, Tensor] = {}
         for number, track in self._tracks:
             first, last = (track.pose_at(frame.view.time_s) for frame in frames)
             if first is not None and last is not None:
                 moved[number] = torch.from_numpy(last @ geometry.invert(first))
-        return pixel_motion(*frames, moved, torch.from_numpy(instance.astype(np.int64)))
+        return pixel_motion(frames[0], frames[1], moved, torch.from_numpy(instance.astype(np.int64)))
 
 
 def change_of(motion: ExactMotion, per: Callable[[Pair, Pair, PixelMotion], float | None]) -> Neighbours:

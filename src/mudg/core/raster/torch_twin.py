@@ -129,7 +129,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """Real spherical harmonics of unit directions [N, 3]: [N, (degree + 1)^2]."""
-    return torch.stack(basis_rows(*directions.unbind(1), degree), 1)
+    return torch.stack(basis_rows(*directions.unbind(1), degree=degree), 1)
 
 
 def sh_colors(sh: Tensor, directions: Tensor) -> Tensor:
