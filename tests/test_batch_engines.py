@@ -21,7 +21,7 @@ import pytest
 import slurm_here
 
 from mudg import app
-from mudg.fleet import status
+from mudg.fleet import records as status
 from mudg.fleet.plan import Entry, plan_of
 from mudg.fleet.records import BatchFolder, Ended
 

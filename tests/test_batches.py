@@ -18,14 +18,15 @@ import pytest
 
 from mudg import app
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.fleet import engines, status, work
+from mudg.fleet import engines, work
+from mudg.fleet import records as status
 from mudg.fleet.engines import LocalRun
 from mudg.fleet.plan import Entry, command_of, parse_shard, plan_of, read_list, shard_of
 from mudg.fleet.records import BatchFolder, Ended, this_host
 from mudg.fleet.settings import BatchConfig
 from mudg.fleet.work import Job, Stop, last_words, run_step
 from mudg.steps import batching
-from mudg.steps.batch import stage_lines
+from mudg.steps.run import stage_lines
 from mudg.steps.settings import RunConfig
 
 STEP = """

@@ -237,8 +237,10 @@ def test_a_repaired_view_is_the_mean_of_render_and_generated_view(run: Path, tmp
     inputs, loaded = JobInputs(run / "scene", run / "fuse", run / FITTED), files.load(model)
     result = step.run()
     for name, factor in (("front_recorded", 0.5), ("front_shift+1.5", 1.5)):
-        for render, one in zip(views_of(plain, name), views_of(result, name), strict=True):
-            view = view_maker(again, inputs, [render.view], loaded, None).make([render.view], 0, None)[2][0]
+        pairs = list(zip(views_of(plain, name), views_of(result, name), strict=True))
+        maker = view_maker(again, inputs, [pairs[0][0].view], loaded, None)
+        for render, one in pairs:
+            view = maker.make([render.view], 0, None)[2][0]
             weight = factor * view.confidence
             share = (weight / (1 + weight)).numpy()
             wanted = (1 - share) * render.rgb.numpy() + share * view.rgb.numpy()

@@ -87,7 +87,7 @@ def city(tmp_path_factory: pytest.TempPathFactory) -> Any:
         {"seed": 1},
         {"seed": 10**18},
         {"light": "no"},
-        {"textures": "photographs"},
+        {"textures": "/nowhere"},
         {},
     ],
     ids=str,

@@ -68,7 +68,7 @@ def test_short_clips_and_other_sizes_are_refused(state) -> None:
     for shape in ((1, 3, 8, 224, 224), (1, 3, 16, 256, 256), (1, 16, 3, 224, 224)):
         with pytest.raises(InputError, match="clips of one size"):
             network(torch.zeros(shape))
-    with pytest.raises(InputError, match="mine: Mixed_4e.b2a.bn.bias"):
+    with pytest.raises(InputError, match="missing: Mixed_4e.b2a.bn.bias"):
         i3d.I3DFeatures({name: value for name, value in state.items() if name != "Mixed_4e.b2a.bn.bias"}, "mine")
     refused("extra", i3d.I3DFeatures, {**state, "extra": torch.zeros(1)})
 

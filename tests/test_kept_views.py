@@ -18,7 +18,7 @@ from fit_settings import fit_to, interrupted, small_fit, written_street
 from scipy.spatial import cKDTree
 from toy_world import camera, view_at
 
-from mudg.base import scratch
+from mudg.base import memory
 from mudg.base.errors import ResourceError
 from mudg.gaussians import fit, trust
 from mudg.gaussians import views as fit_views
@@ -101,10 +101,10 @@ def test_every_combination_of_fields_and_number_types_comes_back_to_the_bit(tmp_
 
 
 def test_a_mapped_array_keeps_its_values_and_has_no_name(tmp_path):
-    array = scratch.mapped_array(tmp_path, (3, 5000), np.float32)
+    array = memory.mapped_array(tmp_path, (3, 5000), np.float32)
     assert not array.any()
     array[:] = np.arange(15000).reshape(3, 5000)
-    scratch.rest_mapped()
+    memory.rest_mapped()
     assert np.array_equal(array, np.arange(15000).reshape(3, 5000))
     assert not list(tmp_path.iterdir())
 
@@ -113,9 +113,9 @@ def test_a_mapped_array_that_the_disk_has_no_room_for_is_an_error_in_words(tmp_p
     def full(*_: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(scratch.os, "posix_fallocate", full, raising=False)
+    monkeypatch.setattr(memory.os, "posix_fallocate", full, raising=False)
     with pytest.raises(ResourceError, match=r"cannot make a scratch file[\s\S]*No space left"):
-        scratch.mapped_array(tmp_path, (100,), np.uint8)
+        memory.mapped_array(tmp_path, (100,), np.uint8)
 
 
 # ---- whole fits ----------------------------------------------------------------------------------

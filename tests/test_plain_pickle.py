@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas_pickles
 import pytest
+import write_pandaset
 from refusals import Asks, refused
 
 from mudg.base import plain_pickle
@@ -189,7 +189,7 @@ def test_deep_nesting_neither_recurses_nor_hashes() -> None:
 
 
 def test_a_row_index_of_any_length_costs_nothing() -> None:
-    table = pandas_pickles.frame_bytes({"x": np.arange(3.0)}).replace(b"\x8c\x04stop", b"\x8c\x04stop", 1)
+    table = write_pandaset.frame_bytes({"x": np.arange(3.0)}).replace(b"\x8c\x04stop", b"\x8c\x04stop", 1)
     assert b"stop\x94K\x03" in table
     for stop in (2**40, 10**30):
         long = pickle.encode_long(stop)

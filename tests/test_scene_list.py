@@ -155,7 +155,7 @@ def test_the_command_takes_an_address_of_clips(address, tmp_path, capsys):
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text(configuration.dump_yaml(tiny(address.text, steps=2)))
     assert app.main(["learn", "--config", str(recipe), "--out", str(tmp_path / "a"), "--quiet"]) == 0
-    assert app.main(["learn", "--start", "s3://bucket/model", "--out", str(tmp_path / "c"), "--quiet"]) == 2
+    assert app.main(["learn", "--data.textures", "s3://bucket/textures", "--out", str(tmp_path / "c"), "--quiet"]) == 2
     assert "a path of this machine" in capsys.readouterr().err
 
 

@@ -15,8 +15,7 @@ from mudg.base import staging, store
 from mudg.base.errors import ResourceError
 from mudg.base.location import Location
 from mudg.editing.settings import ScoreConfig
-from mudg.steps.render import Score
-from mudg.steps.view import Report
+from mudg.steps.render import Report, Score
 
 fsspec = pytest.importorskip("fsspec", reason="the store in memory is fsspec's")
 

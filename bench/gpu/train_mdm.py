@@ -24,10 +24,10 @@ from mudg.diffusion.settings import LearnCodec, LearnConfig
 from mudg.steps.synthesize import Learn
 
 NO_LONGER = ("textures",)
-"""Of the recipe: photographs, which cities have no more."""
+"""Of the recipe: photographs that are not part of the repository, unless --textures names them."""
 
 
-def recipe(steps: int, device: str, workers: int) -> LearnConfig:
+def recipe(steps: int, textures: str, device: str, workers: int) -> LearnConfig:
     """The recipe of the shipped model, for so many steps on a device, by processes that make its clips.
 
     The recipe itself has none: its clips were made before.
@@ -35,7 +35,11 @@ def recipe(steps: int, device: str, workers: int) -> LearnConfig:
     given = dict(model_files.facts("embedded")["recipe"])
     given["data"] = {name: value for name, value in given["data"].items() if name not in NO_LONGER}
     config = configuration.load(LearnConfig, None, None, {**given, "steps": steps})
-    return replace(config, compute=replace(config.compute, device=device, workers=workers))
+    return replace(
+        config,
+        data=replace(config.data, textures=textures),
+        compute=replace(config.compute, device=device, workers=workers),
+    )
 
 
 def small(config: LearnConfig) -> LearnConfig:
@@ -78,10 +82,11 @@ def main(words: Sequence[str] | None = None) -> dict[str, Any]:
     """Read the flags, train, print scores."""
     parser = flags(__doc__)
     parser.add_argument("--steps", type=int, default=20_000)
+    parser.add_argument("--textures", default="", help="folder of CC0 photographs (see the model card)")
     parser.add_argument("--workers", type=int, default=1, help="processes that make clips")
     options = parser.parse_args(words)
     device = device_of(options)
-    config = recipe(options.steps, str(device), options.workers)
+    config = recipe(options.steps, options.textures, str(device), options.workers)
     if options.small:
         config = small(replace(config, steps=2))
     began = time.perf_counter()

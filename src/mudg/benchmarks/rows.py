@@ -3,8 +3,7 @@ which methods, with what settings of their fits."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -210,23 +209,21 @@ MIXED: Final = "mudg_f"
 REPAIRED: Final = "difix"
 PLACES: Final = ("cameras", "shifts_m", "paths", "condition", "processes")
 """Settings of generated views that are the benchmark's matter, not the user's."""
-_METHODS: Final = (FILL, "gs3d", BASE, LONGER, *PUBLISHED, DIFFUSION, FULL)
-_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
+SCENES: Final = (FILL, "gs3d", BASE, LONGER, *PUBLISHED, DIFFUSION, FULL)
+"""Methods that every benchmark of complete methods knows, in the order of the tables."""
 
 
 @dataclass(frozen=True)
 class Row:
     """A row that is computed. ``method``: of `METHODS`; empty = fused points, holes filled. ``fit``: settings of its
     fit (those of the first fit where it is ``LONGER``); None = no fit. ``changes``: other settings of its fit or of
-    synthesize; ``model: ""`` = there is no model, so the row has no numbers. ``varied``: its settings stand in the
-    table."""
+    synthesize; ``model: ""`` = there is no model, so the row has no numbers."""
 
     name: str
     title: str
     method: str = ""
     fit: FitConfig | None = None
     changes: Mapping[str, Any] = field(default_factory=dict)
-    varied: bool = False
 
     @property
     def left_out(self) -> bool:
@@ -325,20 +322,11 @@ def refuse_unfit(
 # ---- rows ----
 
 
-def shift_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row, ...]:
-    """The methods and variants of ``mudg bench shift``, in the order of the tables. UsageError: an unknown method, one
-    that does not know a setting beyond the preset, or a malformed or repeated variant."""
-    return _without_twins([*_method_rows(config, preset, (*_METHODS, MIXED)), *_variants(config)])
-
-
-def real_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row, ...]:
-    """The methods and variants of ``mudg bench real``. Raises as `shift_rows`."""
-    variants = (replace(row, title=title_of(row.name)) for row in _variants(config))
-    return _without_twins([*_method_rows(config, preset, _METHODS), *variants])
-
-
-def _method_rows(config: BenchConfig, preset: PresetName, known: Sequence[str]) -> list[Row]:
-    """Rows of the methods that are asked for, in the order of ``known``."""
+def method_rows(
+    config: BenchConfig, preset: PresetName = "default", known: Sequence[str] = (*SCENES, MIXED)
+) -> tuple[Row, ...]:
+    """Rows of the methods that are asked for, in the order of ``known``. UsageError: an unknown method, or one that
+    does not know a setting beyond the preset."""
     _refuse_unknown(config.methods, known)
     usual, rows = usual_fit(config), list[Row]()
     for name in (name for name in known if name in config.methods):
@@ -347,7 +335,7 @@ def _method_rows(config: BenchConfig, preset: PresetName, known: Sequence[str]) 
             continue
         method, title = {LONGER: BASE, MIXED: FULL}.get(name, name), LONGER_TITLE if name == LONGER else title_of(name)
         rows.append(Row(name, title, method, method_fit(usual, method, preset)))
-    return rows
+    return tuple(rows)
 
 
 def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "default") -> tuple[Row, ...]:
@@ -381,33 +369,7 @@ def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "def
     return tuple(complete)
 
 
-def _variants(config: BenchConfig) -> Iterator[Row]:
-    """Rows of ``mudg_s`` from ``NAME=FIELD:VALUE,FIELD:VALUE``; values as in YAML, a dot between a group and its field.
-    UsageError if malformed or no field of ``FitConfig``."""
-    for text in config.variant:
-        name, separator, rest = text.partition("=")
-        fields: dict[str, Any] = {}
-        for part in rest.split(","):
-            setting, colon, value = part.partition(":")
-            if not (separator and colon and setting and _NAME.fullmatch(name)):
-                expected = "NAME=FIELD:VALUE,FIELD:VALUE"
-                raise UsageError("malformed variant", where="--variant", expected=expected, got=text)
-            try:
-                fields[setting.strip()] = parse_yaml(value, setting)
-            except InputError as error:
-                raise UsageError("malformed value", where=f"--variant {name}: {setting}", got=value) from error
-        changed = configuration.load(FitConfig, usual_fit(config), overrides=configuration.nested(fields))
-        yield Row(name, f"{name}: {rest}", FULL, changed, varied=True)
-
-
 def _refuse_unknown(names: Iterable[str], known: Sequence[str], some: bool = True) -> None:
     unknown = sorted(set(names) - set(known))
     if unknown or (some and not names):
         raise UsageError("unknown method", where="--methods", expected=", ".join(known), got=", ".join(unknown))
-
-
-def _without_twins(rows: Sequence[Row]) -> tuple[Row, ...]:
-    names = [row.name for row in rows]
-    if len(set(names)) < len(names):
-        raise UsageError("two rows have the same name", where="--variant", got=", ".join(names))
-    return tuple(rows)

@@ -46,6 +46,9 @@ class CitySettings:
     skies: Literal["plain", "varied"] = "plain"
     """varied = more kinds of sky: white and near saturation, hazy, deep blue, scattered clouds, sunset, before a
     storm."""
+    textures: str = ""
+    """Folder with photographs of surfaces (textures/*.jpg, *.png) and panoramas of skies (sky/*.hdr) to use; empty =
+    none. A scene made with it can only be rebuilt while the folder is there."""
     supersample: Annotated[int, Limits(ge=1, le=4)] = 2
     """Rays per pixel along each axis of the recorded images; more gives smoother edges and takes longer."""
 

@@ -9,6 +9,7 @@ import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from mudg.city import sensors
 from mudg.city.config import CityConfig
 from mudg.city.furnish import furnish
 from mudg.city.layout import Array, StreetPlan, plan_streets
-from mudg.city.light import lamp_places, light_numbers, weather_numbers
+from mudg.city.light import draw_photos, lamp_places, light_numbers, weather_numbers
 from mudg.city.traffic import PosedObject, ego_keys, key_times, plan_traffic
 
 # native --------------------------------------------------------------------------------------------
@@ -36,6 +37,7 @@ _SIGNATURES: tuple[tuple[str, Any, list[Any]], ...] = (
     ("number_counts", _I, [_I]),
     ("create", _P, [_F64, _L, _F64, _L, _F64, _L, _F64, _L, _F64, _F64, _I]),
     ("destroy", None, [_P]),
+    ("set_texture", _I, [_P, _I, _F32, _I, _I, ctypes.c_float]),
     ("set_weather", _I, [_P, _F64, _F64, _L]),
     ("planes", _I, [_P, _F64, _F64, _F64, _I, _I, _F64, _F32]),
     ("shape_count", _L, [_P]),
@@ -76,6 +78,12 @@ class CityHandle:
         if not self._handle:
             raise ResourceError("not enough memory to build the city")
         self.shape_count = int(self._lib.mudg_city_shape_count(self._handle))
+
+    def set_texture(self, slot: int, rgb: NDArray[np.float32], metres: float) -> None:
+        """Give a surface or the sky a photograph f32[H, W, 3]; before anything is rendered."""
+        pixels = np.ascontiguousarray(rgb, np.float32)
+        if self._lib.mudg_city_set_texture(self._handle, slot, pixels, pixels.shape[1], pixels.shape[0], metres):
+            raise ResourceError("not enough memory for a texture of the city")
 
     def set_weather(self, numbers: Array, lamps: Array) -> None:
         """Wet ground, snow and lamps f64[N, 3]; before anything is rendered. Numbers as in native/city_weather.cpp."""
@@ -214,6 +222,8 @@ class CityWorld:
         handle = CityHandle(
             records, self.plan, _road_numbers(config, self.plan), self._light, _seed31(config, "city surfaces")
         )
+        for slot, rgb, metres in draw_photos(Path(config.textures), config.seed) if config.textures else ():
+            handle.set_texture(slot, rgb, metres)
         numbers = weather_numbers(config)
         if numbers is not None:
             handle.set_weather(numbers, self.lamps)
@@ -235,9 +245,7 @@ class CityWorld:
             what = "the recipe of a generated city is no object"
             raise InputError(what, where="source.recipe.city", got=str(recipe["city"]))
         try:
-            # scenes of the first builds name a folder of photographs, an empty one as a rule
-            settings = {name: value for name, value in recipe["city"].items() if (name, value) != ("textures", "")}
-            return cls(build(CityConfig, settings, "source.recipe.city"))
+            return cls(build(CityConfig, recipe["city"], "source.recipe.city"))
         except UsageError as error:  # nobody asked for these settings: a file states them
             what, remedy = error.what, "generate it again"
             raise InputError(what, where=error.where, expected=error.expected, got=error.got, remedy=remedy) from error

@@ -97,12 +97,15 @@ def sized(width: int, height: int, city: int, multiple: int = 16) -> tuple[int, 
     return columns * multiple, rows * multiple
 
 
-def draw_city(seed: int, city: int, plain: CityConfig, side_cameras: float = SIDE_CAMERAS) -> CityConfig:
+def draw_city(
+    seed: int, city: int, plain: CityConfig, textures: str = "", side_cameras: float = SIDE_CAMERAS
+) -> CityConfig:
     """Configuration of a training city.
 
     Args:
         seed, city: fix everything.
         plain: seed, length and image size; the rest is drawn here.
+        textures: folder of photographs for `CityConfig.textures`; four fifths of the cities use it.
         side_cameras: share of the cities with two cameras beside the front one.
     """
     rng = seeds.numpy_rng(seed, city, "varied city")
@@ -125,6 +128,7 @@ def draw_city(seed: int, city: int, plain: CityConfig, side_cameras: float = SID
         shift_margin_m=MARGIN_M if rng.random() < 0.55 else float(rng.uniform(1.2, 3.2)),
         overhead=float(rng.choice([0.0, rng.uniform(0.25, 1.0)], p=[0.12, 0.88])),
         skies="varied" if rng.random() < 0.85 else "plain",
+        textures=textures if rng.random() < 0.8 else "",
     )
 
 
@@ -332,6 +336,8 @@ class CityClipRules:
     fitted: bool = False
     """Clips have renders of a scene fitted to the recorded images (which the maker of the clips supplies), and a patch
     at a higher resolution; recorded images are 2 to 4 times larger than the clips."""
+    textures: str = ""
+    """Varied cities: folder of photographic textures and skies, used by most cities (empty = none)."""
 
     @property
     def frames(self) -> int:
@@ -374,7 +380,7 @@ def city_config(rules: CityClipRules, city: int) -> CityConfig:
         return plain
     if is_varied(rules, city):
         share = SIDE_CAMERAS if rules.side_cameras is None else rules.side_cameras
-        return draw_city(rules.seed, city, plain, share)
+        return draw_city(rules.seed, city, plain, rules.textures, share)
     rng = seeds.numpy_rng(rules.seed, city, "city configuration")
     side_cameras = rng.random() < (0.4 if rules.side_cameras is None else rules.side_cameras)
     return replace(

@@ -32,7 +32,7 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
 
-from mudg.base import geometry, palette, scratch
+from mudg.base import geometry, memory, palette
 from mudg.base.errors import InputError
 from mudg.base.types import Condition, FusedCloud, Photo, RenderPlanes, SparseDepth, Track, View
 from mudg.core.pictures import resize_area, to_bytes
@@ -490,7 +490,7 @@ def build_conditions(
     for n, (view, there, found) in enumerate(zip(small, far_ids, warped, strict=True)):
         here = points.look(view, there[0], None if renders is None else renders.map(lambda x, n=n: x[n]))
         own.append(here.with_hole(here.color, here.ids, found[0])[0])
-    scratch.rest_mapped()
+    memory.rest_mapped()
     depth, valid = (torch.stack([getattr(o, name) for o in own])[:, None] for name in ("depth", "measured"))
     color, backdrop = reduced(color), reduced(backdrop)
     return Condition(tuple(small), color, depth, valid, reference, warped, backdrop, ids, far_ids, renders), fine
@@ -718,11 +718,11 @@ def stacked(rows: Iterable[Sequence[Tensor]], count: int, folder: Path | None) -
         stacks = stacks or [_empty((count, *x.shape), x.dtype, folder) for x in row]
         for stack, x in zip(stacks, row, strict=True):
             stack[number] = x
-        scratch.rest_mapped()
+        memory.rest_mapped()
     return stacks
 
 
 def _empty(shape: tuple[int, ...], dtype: torch.dtype, folder: Path | None) -> Tensor:
     if folder is None or shape[-2] * shape[-1] <= LARGE_PIXELS:
         return torch.empty(shape, dtype=dtype)
-    return torch.from_numpy(scratch.mapped_array(folder, shape, torch.empty(0, dtype=dtype).numpy().dtype))
+    return torch.from_numpy(memory.mapped_array(folder, shape, torch.empty(0, dtype=dtype).numpy().dtype))

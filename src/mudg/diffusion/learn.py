@@ -237,6 +237,7 @@ def city_rules(config: LearnConfig, points_alone: bool = False, fitted: bool = F
         data.clips_per_city,
         published=points_alone,
         realism=data.realism,
+        textures=data.textures,
         fitted=fitted,
         log_frames=data.log_frames,
         side_cameras=data.side_cameras,

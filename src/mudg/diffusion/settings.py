@@ -148,6 +148,9 @@ class LearnData:
     """Generated cities: fit a scene to each city's images for a few hundred steps and give its renders in the
     condition, with patches at the camera's resolution. Takes about half a minute per city. Not done for models that use
     no renders. Without it, or on recorded logs, no model learns to use renders or gets a finisher."""
+    textures: str = ""
+    """Varied cities: folder with photographs of surfaces (textures/*.jpg, *.png) and panoramas of skies (sky/*.hdr) to
+    use (empty = none)."""
     held_out: int = setting(default=6, ge=1)
     """Number of additional cities that are used for scoring only."""
     scenes: tuple[str, ...] = ()

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -57,6 +57,7 @@ SIDE_VIEWS: Final = 16
 """Views that say which sides of objects the recording did not show, at most."""
 MOST_NAMED: Final = 4
 """More objects than these are counted in a message."""
+Thing = TypeVar("Thing")
 
 
 def street_left(model: SceneModel, plan: EditPlan, *, close: bool = True) -> SceneModel:
@@ -130,10 +131,10 @@ def _erased(plan: EditPlan, xyz: NDArray[np.floating]) -> NDArray[np.bool_]:
     return gone
 
 
-def spread(views: Sequence[View], most: int = edited.MOST_VIEWS) -> list[View]:
-    """At most so many of some views, evenly."""
-    which = np.unique(np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int))
-    return [views[int(index)] for index in which] if views else []
+def spread(things: Sequence[Thing], most: int = edited.MOST_VIEWS) -> list[Thing]:
+    """At most so many of some things, evenly."""
+    which = np.unique(np.linspace(0, len(things) - 1, min(most, len(things))).round().astype(int))
+    return [things[int(index)] for index in which] if things else []
 
 
 def views_of(actors: Sequence[Actor], views: Sequence[View]) -> list[View]:
@@ -505,9 +506,8 @@ def weather_of(draw: Drawer, conditions: Conditions, scene: Scene) -> InWeather:
     """Weather for all views of a drive, with its light and ground. ``draw``: the views as they are, with depth and
     classes. ``scene``: its recorded views tell the light of the drive, its path how fast the cameras are. InputError:
     views without depth or classes."""
-    frames = sorted(scene.frames, key=lambda frame: (frame.view.time_s, frame.view.camera.name))
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(WITNESSES, len(frames))).round().astype(int))
-    witnesses = [_shown(draw(frames[int(index)].view)) for index in chosen]
+    views = sorted((frame.view for frame in scene.frames), key=lambda view: (view.time_s, view.camera.name))
+    witnesses = [_shown(draw(view)) for view in spread(views, WITNESSES)]
     return InWeather(conditions, drive_facts(witnesses), SEED, functools.partial(trajectory.velocity, scene.ego))
 
 

@@ -9,8 +9,8 @@ time. A box is turned about x, then y, then z of the fixed frame.
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
@@ -41,25 +41,18 @@ EULER: Final = "xyz"
 """Axes about which a box is turned; small letters: fixed ones."""
 
 
-@dataclass(frozen=True, slots=True)
-class NCorePackage:
-    """The modules of the package ``nvidia-ncore``: ``data`` (types), ``v4`` (files), ``sensors`` (projection)."""
-
-    data: Any
-    v4: Any
-    sensors: Any
-    transformations: Any
-
-
-def package() -> NCorePackage:
-    """The package, loaded when it is first asked for. Raises ResourceError: it is not installed."""
+def package() -> Any:
+    """The modules of the package ``nvidia-ncore``, loaded when they are first asked for: ``data`` (types), ``v4``
+    (files), ``sensors`` (projection), ``transformations``. Raises ResourceError: it is not installed."""
     try:
-        data, files = importlib.import_module("ncore.data"), importlib.import_module("ncore.data.v4")
-        sensors = importlib.import_module("ncore.sensors")
-        return NCorePackage(data, files, sensors, importlib.import_module("ncore.impl.common.transformations"))
+        import ncore.data.v4
+        import ncore.impl.common.transformations
+        import ncore.sensors
     except ImportError as error:
         what = "NCore files need the package nvidia-ncore, which is not installed"
         raise ResourceError(what, got=str(error), remedy="pip install 'mudg[ncore]'") from error
+    transformations = ncore.impl.common.transformations
+    return SimpleNamespace(data=ncore.data, v4=ncore.data.v4, sensors=ncore.sensors, transformations=transformations)
 
 
 def close(reader: Any) -> None:

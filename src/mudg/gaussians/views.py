@@ -20,9 +20,9 @@ from torch import Tensor
 from mudg import native
 from mudg.base import geometry, log, seeds
 from mudg.base.errors import InputError, UsageError
+from mudg.base.memory import mapped_array
 from mudg.base.palette import ID, UNLABELLED
 from mudg.base.processes import GIB, computed_ahead
-from mudg.base.scratch import mapped_array
 from mudg.base.types import Frame, FusedCloud, ObservationKind, Scene, Sweep, Track, View
 from mudg.core.fusion import largest_beam_gap
 from mudg.core.pictures import resize_area, resize_nearest

@@ -11,7 +11,6 @@ stopped.
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,7 +26,7 @@ from scipy import ndimage
 from mudg import native
 from mudg.base import geometry, html, log, store
 from mudg.base.devices import NETWORK_KINDS, choose_device
-from mudg.base.errors import ResourceError, UsageError
+from mudg.base.errors import UsageError
 from mudg.base.processes import one_torch_thread, run_in_processes
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Frame, Scene, Sweep
@@ -42,7 +41,6 @@ from mudg.labels.ground import driven_path
 from mudg.labels.inputs import DepthInput, DepthNetwork, LabelInput, Labeller, Labels
 from mudg.labels.segmenters import Segmenter
 from mudg.labels.settings import AnnotateConfig
-from mudg.networks.folders import find, title
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points, read_scene, spread
 from mudg.scene.write import SceneWriter
@@ -89,12 +87,9 @@ def placed(config: AnnotateConfig) -> AnnotateConfig:
 
 
 def folders(config: AnnotateConfig) -> dict[str, Path]:
-    """Flag that names a network's folder -> that folder, where one is named and lies on this machine."""
-    found: dict[str, Path] = {}
-    for name, text in (("weights", config.weights), ("depth-network", config.depth_network)):
-        with contextlib.suppress(ResourceError):  # said when it is read, if it is
-            found |= {name: find(text)} if text else {}
-    return found
+    """Flag that names a network's folder -> that folder, where one is named."""
+    named = {"weights": config.weights, "depth-network": config.depth_network}
+    return {flag: Path(text) for flag, text in named.items() if text}
 
 
 def digests(config: AnnotateConfig) -> dict[str, str]:
@@ -105,8 +100,8 @@ def digests(config: AnnotateConfig) -> dict[str, str]:
             kind.
     """
     found: dict[str, str] = {}
-    if config.labeller == "network" and config.weights and (weights := find(config.weights)).is_dir():
-        found["weights"] = store.digest(weights)
+    if config.labeller == "network" and config.weights and Path(config.weights).is_dir():
+        found["weights"] = store.digest(Path(config.weights))
     if config.labeller == "embedded":
         found["weights"] = street_net.digest(config.weights or street_net.EMBEDDED)
     if config.depth_network:
@@ -114,7 +109,7 @@ def digests(config: AnnotateConfig) -> dict[str, str]:
             what, remedy = "--depth-network contradicts --no-depth", "leave out one of them"
             raise UsageError(what, where="--depth-network", remedy=remedy)
         kind_of(config.depth_network)
-        found["depth_network"] = store.digest(find(config.depth_network))
+        found["depth_network"] = store.digest(Path(config.depth_network))
     return found
 
 
@@ -149,7 +144,7 @@ def depth_origin(config: AnnotateConfig, networks: Mapping[str, str], made: Sequ
 
 def describe_folder(folder: str, digest: str) -> str:
     """Name (of one that the package does not ship) and digest of a network's folder, for the scene's notes."""
-    where = f" in folder '{title(find(folder))}'" if folder else ""
+    where = f" in folder '{Path(folder).name}'" if folder else ""
     return f"{where} (sha256 {digest[:16]})"
 
 

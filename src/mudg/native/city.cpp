@@ -151,6 +151,17 @@ MUDG_API void* mudg_city_create(const double* records, int64_t n, const double* 
   }
 }
 
+// rgb f32 [height][width][3]; to be called before anything is rendered. Slots are TextureSlot in city_world.h. 0 = done.
+MUDG_API int mudg_city_set_texture(void* handle, int slot, const float* rgb, int width, int height, float metres) {
+  if (slot < 0 || slot >= kTexSlots || width < 1 || height < 1 || !(metres > 0)) return 1;
+  try {
+    fill_texture(static_cast<World*>(handle)->textures[slot], rgb, width, height, metres);
+    return 0;
+  } catch (const std::bad_alloc&) {
+    return 1;
+  }
+}
+
 MUDG_API void mudg_city_destroy(void* handle) { delete static_cast<World*>(handle); }
 
 MUDG_API int64_t mudg_city_shape_count(void* handle) { return static_cast<int64_t>(static_cast<World*>(handle)->shapes.size()); }

@@ -316,6 +316,8 @@ Moment::Sample Moment::look(Vec3 origin, Vec3 direction, float fraction, float p
     GroundPart part = ground.part;
     const float footprint = ground.t * pixel_angle / std::sqrt(std::max(0.02f, -direction.z));
     surface.albedo = ground_albedo(world_.road, part, point, footprint, surface.gloss);
+    const TextureSlot slot = part == kGroundRoad ? kTexRoad : (part == kGroundTerrain ? kTexTerrain : kTexWalk);
+    if (!world_.textures[slot].empty()) surface.albedo = surface.albedo * textured(world_, slot, point, {0, 0, 1}, footprint);
     surface.normal = ground.normal;
     surface.cls = part == kGroundRoad ? kRoad : (part == kGroundTerrain ? kTerrain : kSidewalk);
     surface.occlusion = ground_openness(point, fraction);

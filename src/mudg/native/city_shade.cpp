@@ -395,11 +395,26 @@ Surface shade_surface(const World& world, const Hit& hit, Vec3 point, Vec3 d, fl
       break;
     default: break;
   }
+  const auto wear = [&](TextureSlot slot, Vec3 at) {
+    if (!world.textures[slot].empty()) s.albedo = s.albedo * textured(world, slot, at, hit.normal, fp);
+  };
+  switch (look.material) {
+    case kMatFacade:
+      if (hit.part == kPartWall && hit.face < 4) wear(look.p0 > 0.5f ? kTexBrick : kTexPlaster, point);
+      break;
+    case kMatBrick: wear(kTexBrick, point); break;
+    case kMatConcrete: wear(kTexConcrete, point); break;
+    case kMatBark: wear(kTexBark, point); break;
+    case kMatRoofTiles: wear(kTexRoof, point); break;
+    case kMatCargo: wear(kTexCargo, p); break;
+    default: break;
+  }
   return s;
 }
 
 Vec3 sky_radiance(const World& world, Vec3 d, bool with_sun) {
   const Light& light = world.light;
+  if (!world.textures[kTexSky].empty()) return world.textures[kTexSky].toward(d);
   const float up = std::max(d.z, 0.0f);
   Vec3 color = mix(light.horizon, light.zenith, 1 - std::exp(-3.2f * up));
   const float toward = dot(d, light.sun_dir);

@@ -72,6 +72,21 @@ struct SunGrid {
 };
 constexpr float kSunReach = 160.0f;  // longest shadow ray, metres
 
+// A photographic surface: albedo relative to its mean, repeated every `metres`, with halved copies for what is far away; or the sky.
+enum TextureSlot { kTexRoad, kTexWalk, kTexTerrain, kTexPlaster, kTexBrick, kTexConcrete, kTexBark, kTexRoof, kTexCargo, kTexSky, kTexSlots };
+struct Texture {
+  struct Level {
+    int width = 0, height = 0;
+    std::vector<Vec3> texels;
+  };
+  std::vector<Level> levels;
+  float metres = 1;
+  bool empty() const { return levels.empty(); }
+  Vec3 at(float u, float v, float footprint_m) const;  // u, v in metres
+  Vec3 toward(Vec3 direction) const;                   // of a panorama; v = 0 at the zenith, 1 at the horizon
+};
+void fill_texture(Texture& texture, const float* rgb, int width, int height, float metres);
+
 // Wet ground, snow and street lamps; the same rules as core/weather/ground.py and relight.py. A world without them is never asked.
 struct Weather {
   bool any = false;
@@ -102,9 +117,11 @@ struct World {
   std::vector<std::vector<int>> contact_cells;
   Road road;
   Light light;
+  Texture textures[kTexSlots];
   Weather weather;
   int seed = 0;
 };
+Vec3 textured(const World& world, TextureSlot slot, Vec3 point, Vec3 normal, float footprint_m);
 
 // Row layout of the records handed over by Python (city/layout.py keeps the same list).
 enum RecordKind {

@@ -22,6 +22,7 @@ from mudg.base.errors import UsageError
 from mudg.base.types import Scene, Sweep
 from mudg.core.returns import Met, Returns, first_surface
 from mudg.core.rows import Rows
+from mudg.editing.apply import spread
 from mudg.scene.beams import WORLD, Beams, beams_of, moving_tracks, placed, returns_of, training_sweeps, with_silent
 
 Floats = NDArray[np.float64]
@@ -99,9 +100,9 @@ class LogReturns:
         self._read: dict[str, tuple[Beams, dict[str, Returns]]] = {}
         self._rows: Rows | None = None
         self._seen_from: dict[str, Floats] = {}
-        tested = _evenly(self.sweeps[1:-1], MOST_TESTED) if len(sweeps) >= 4 else ()
+        tested = spread(self.sweeps[1:-1], MOST_TESTED) if len(sweeps) >= 4 else ()
         others = [sweep for sweep in self.sweeps if sweep not in tested]
-        self.looks = Looks([self.measured(sweep)[0] for sweep in _evenly(others, MOST_LOOKS)])
+        self.looks = Looks([self.measured(sweep)[0] for sweep in spread(others, MOST_LOOKS)])
         self.weights = _regression(*_samples(tested, self)) if tested else None
         """Of ``features``; None: too little to learn from, and a beam returns where it meets something."""
 
@@ -146,7 +147,7 @@ class LogReturns:
                 order = (k for k in np.argsort(apart, kind="stable") if np.isfinite(apart[k]))
                 sweeps = [self.sweeps[k] for k in order if self.sweeps[k] is not without]
                 near += [(number, sweep, TRUST**k) for k, sweep in enumerate(sweeps[:NEAREST])]
-                far += [(number, sweep, 1.0) for sweep in _evenly(sweeps[NEAREST:], NEAREST)]
+                far += [(number, sweep, 1.0) for sweep in spread(sweeps[NEAREST:], NEAREST)]
         return near, far
 
     def _places(self, name: str) -> Floats:
@@ -232,11 +233,6 @@ def learn_returns(scene: Scene, sensor: str = "", gone: Gone | None = None) -> L
         return None
     log.info(f"LiDAR: surfaces, intensity and lost beams from {len(sweeps)} sweeps of {sweeps[0].sensor}")
     return LogReturns(scene, sweeps, gone)
-
-
-def _evenly(sweeps: Sequence[Sweep], most: int) -> tuple[Sweep, ...]:
-    at = np.unique(np.linspace(0, len(sweeps) - 1, min(most, len(sweeps))).round().astype(int))
-    return tuple(sweeps[k] for k in at)
 
 
 def _samples(sweeps: Sequence[Sweep], returns: LogReturns) -> tuple[Floats, NDArray[np.bool_]]:

@@ -242,6 +242,16 @@ class Session:
         """Cameras of the log, by name; none without a log."""
         return {} if self.scene is None else dict(self.scene.cameras)
 
+    def mounts(self) -> dict[str, Matrix]:
+        """Poses vehicle-from-camera f64[4, 4] of the log's cameras, by their first frames of which the log knows the
+        vehicle's pose."""
+        found: dict[str, Matrix] = {}
+        for frame in () if self.scene is None else self.scene.frames:
+            ego = self.ego_pose(frame.view.time_s)
+            if frame.view.camera.name not in found and ego is not None:
+                found[frame.view.camera.name] = geometry.invert(ego) @ frame.view.world_from_cam
+        return found
+
     @property
     def time_range_s(self) -> tuple[float, float]:
         """First and last time of the log, or of the objects' tracks, seconds; (0, 0) if there is neither."""

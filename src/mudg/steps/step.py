@@ -195,6 +195,7 @@ class Step:
 HOMES: Final[Mapping[str, str]] = {
     "AnnotateConfig": "mudg.labels.settings",
     "BatchConfig": "mudg.fleet.settings",
+    "BenchConfig": "mudg.benchmarks.settings",
     "ConvertConfig": "mudg.diffusion.settings",
     "DatasetConfig": "mudg.datasets.settings",
     "FuseConfig": "mudg.scene.settings",
@@ -203,7 +204,6 @@ HOMES: Final[Mapping[str, str]] = {
     "FitConfig": "mudg.gaussians.settings",
     "ServeConfig": "mudg.sim.settings",
     "SynthesizeConfig": "mudg.diffusion.settings",
-    **dict.fromkeys(("BenchConfig", "BenchOwn"), "mudg.benchmarks.settings"),
     **dict.fromkeys(("EditConfig", "RenderConfig", "ScoreConfig"), "mudg.editing.settings"),
     **dict.fromkeys(("ExportConfig", "ImportConfig"), "mudg.exporting.settings"),
     **dict.fromkeys(("PageConfig", "ViewConfig"), "mudg.viewer.settings"),

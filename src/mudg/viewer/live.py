@@ -58,16 +58,6 @@ STREETS: Final = 3
 """Streets that objects have left, kept in memory for each fit."""
 
 
-@dataclass(frozen=True, slots=True)
-class EditFiles:
-    """The script that a page begins with, where edits are saved (None: beside the run), and whether a foreign file may
-    be replaced."""
-
-    script: Path | None = None
-    out: Path | None = None
-    overwrite: bool = False
-
-
 class EditRequest(StrictRecord):
     """A script, as ``assets/viewer/edits.js`` writes it; ``save`` also writes the file."""
 
@@ -82,7 +72,7 @@ class EditDesk:
     Args:
         models: the fits, on the CPU. scene, cloud: the log; the cloud may be unknown. begin: the script that the page
             begins with.
-        place: file to save to. overwrite: even if it is not one of ours.
+        place: file to save to.
         run: the finished run that is shown, whose objects a page may insert; empty where it is a fit alone.
     """
 
@@ -91,7 +81,6 @@ class EditDesk:
     cloud: FusedCloud | None
     place: Path
     begin: EditScript | None = None
-    overwrite: bool = False
     run: str = ""
     _planned: dict[str, EditedDrive] = field(default_factory=dict)
     _made: dict[str, list[SceneModel]] = field(default_factory=dict)
@@ -186,8 +175,8 @@ class EditDesk:
         """Write the script. InputError: there is nothing to save, or the file belongs to somebody else."""
         if not text.strip():
             raise InputError("there are no edits to save", remedy="hide, move or remove an object first")
-        if self.place.exists() and not self.overwrite and not store.read_bytes(self.place).startswith(MARK.encode()):
-            remedy = "start mudg view with another --edits-out, or add --overwrite"
+        if self.place.exists() and not store.read_bytes(self.place).startswith(MARK.encode()):
+            remedy = "start mudg view with another --edits-out"
             raise InputError("the file was not written by mudg view", where=str(self.place), remedy=remedy)
         store.atomic_write(self.place, (MARK + text).encode())
         return self.place
@@ -199,13 +188,19 @@ def _last(kept: dict[Any, Any], count: int) -> dict[Any, Any]:
 
 
 def desk_for(
-    models: Sequence[SceneModel], scene: Scene, cloud: FusedCloud | None, run: Path, files: EditFiles
+    models: Sequence[SceneModel],
+    scene: Scene,
+    cloud: FusedCloud | None,
+    run: Path,
+    script: Path | None = None,
+    out: Path | None = None,
 ) -> EditDesk:
-    """What carries out the edits of a page. InputError: the script cannot be carried out. UsageError: edits would be
-    saved into a finished result."""
-    begin = None if files.script is None else read_edits(files.script)
+    """What carries out the edits of a page. ``script``: that it begins with. ``out``: where edits are saved (None:
+    beside the run). InputError: the script cannot be carried out. UsageError: edits would be saved into a finished
+    result."""
+    begin = None if script is None else read_edits(script)
     own = str(Path(run).resolve()) if find_run(run).whole else ""
-    desk = EditDesk(models, scene, cloud, place_for(run, files.out), begin, files.overwrite, own)
+    desk = EditDesk(models, scene, cloud, place_for(run, out), begin, own)
     if begin is not None:
         carry_out(begin, models[0], scene, cloud)
     return desk

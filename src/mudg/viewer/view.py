@@ -5,7 +5,6 @@ machine, with exact frames where the camera rests. The page is ``assets/viewer``
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -21,7 +20,7 @@ from mudg.base.types import FusedCloud, Scene
 from mudg.core.edit import HeightMap
 from mudg.core.raster.rasterize import drawing_device
 from mudg.diffusion.synthesize import JobInputs
-from mudg.editing.apply import SEED, ground_of
+from mudg.editing.apply import ground_of
 from mudg.editing.render import RenderMixer, check_as_recorded
 from mudg.editing.runs import RunParts, find_run
 from mudg.gaussians.model import SceneModel
@@ -29,7 +28,7 @@ from mudg.gaussians.storage import load_model, model_of_scene
 from mudg.scene.clouds import read_fused
 from mudg.scene.read import read_scene
 from mudg.viewer import page as pages
-from mudg.viewer.live import LAYERS, EditFiles, FrameSource, desk_for
+from mudg.viewer.live import LAYERS, FrameSource, desk_for
 from mudg.viewer.page import CHUNK, ONE_FILE_BYTES, Packed, PageFile, ViewerPage
 from mudg.viewer.server import Site, SiteServer, open_server, show, token_for
 from mudg.viewer.settings import PageConfig, ViewConfig
@@ -106,48 +105,35 @@ def run_page(
 
 
 def write_page(page: ViewerPage, out: Path, folder: Path) -> dict[str, Any]:
-    """Write a page: one file where it is small enough, else a folder. At most `ONE_FILE_BYTES` of it are held at a
-    time.
+    """Write a page: one file where it is small enough, else a folder, completely or not at all. At most
+    `ONE_FILE_BYTES` of it are held at a time.
 
     Returns:
         ``page``, ``bytes`` and ``gaussians``, as ``run_page``.
     """
     facts: dict[str, Any] = {}
-    made, held = page.files(facts), list[PageFile]()
+    made, held, size = page.files(facts), list[PageFile](), 0
     for file in made:
         held.append(file)
-        if sum(len(one.content) for one in held) * 4 // 3 > ONE_FILE_BYTES:
-            path, size = _write_folder(page, folder, held, made, facts)
-            store.remove(out)
+        size += len(file.content)
+        if size * 4 // 3 > ONE_FILE_BYTES:
             break
-    else:
+    if size * 4 // 3 <= ONE_FILE_BYTES:
         content = page.one_file(held, facts)
-        log.info(needs_text(page, "to be written", f"{len(content) / 1e6:.1f} MB"))
         store.atomic_write(out, content)
-        path, size = out, len(content)
-    return {"page": path, "bytes": size, "gaussians": [packed.kept for _, packed in page.scenes]}
-
-
-def _write_folder(
-    page: ViewerPage, folder: Path, begun: list[PageFile], more: Iterable[PageFile], facts: dict[str, Any]
-) -> tuple[Path, int]:
-    """Write a page as a folder, file by file, completely or not at all; its ``index.html`` and the bytes of
-    everything."""
+        return {"page": out, "bytes": len(content), "gaussians": [packed.kept for _, packed in page.scenes]}
     page = replace(page, report=f"../{page.report}") if page.report else page  # the run's report lies beside the folder
-    # only chunks are many and large, and the first ones tell about all
-    chunks = [len(file.content) for file in begun if file.name.count("-") == 2]
-    size = sum(len(file.content) for file in begun)
-    size += (page.chunks() - len(chunks)) * (sum(chunks) // max(1, len(chunks)))
-    log.info(needs_text(page, "to be written", f"about {size / 1e6:.0f} MB in {page.chunks()} chunks"))
-    size = 0
     with store.atomic_directory(folder) as place:
-        for file in chain(begun, more):
+        size = 0
+        for file in chain(held, made):
             store.write_in_tree(place / file.url, file.content)
             size += len(file.content)
         index = page.html(facts, size)
         store.write_in_tree(place / "index.html", index)
         store.sync_tree(place)
-    return folder / "index.html", size + len(index)
+    store.remove(out)
+    gaussians = [packed.kept for _, packed in page.scenes]
+    return {"page": folder / "index.html", "bytes": size + len(index), "gaussians": gaussians}
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +193,7 @@ def page_of(config: PageConfig, shown: Shown, report: str = "", live: dict[str, 
     packed = [(name, pages.pack_scene(model, begin, path, config.budget, CHUNK)) for name, model in shown.fits]
     width = PAGE_IMAGE_PX if live is None else LIVE_IMAGE_PX
     facts = pages.log_facts(scene, shown.fits[0][1].colors, width, config.images)
-    facts = pages.with_particles(pages.with_ground(facts, shown.ground()), SEED)
+    facts = pages.with_ground(facts, shown.ground())
     counted = lambda things, noun: f"{len(things)} {noun}{'' if len(things) == 1 else 's'}"
     about = (
         f"{kept_text(packed[0][1])}, {len(scene.frames)} recorded frames of {counted(scene.cameras, 'camera')},"
@@ -236,27 +222,19 @@ def kept_text(packed: Packed) -> str:
     return f"{len(layout.rows):,} Gaussians" + (f" of {layout.given:,} ({'; '.join(parts)})" if parts else "")
 
 
-def needs_text(page: ViewerPage, out: Path | str, size: str) -> str:
-    """What a page takes, before it is written or served."""
-    kept = "; ".join(kept_text(packed) for _, packed in page.scenes)
-    return (
-        f"page {out}: {kept}; {size}; in the browser {page.graphics_bytes() / 1e6:.1f} MB of graphics memory and "
-        f"{page.heap_bytes() / 1e6:.1f} MB of memory for sorting"
-    )
-
-
 def run_view(
     config: ViewConfig,
     run: Path,
     compare: Path | None = None,
     *,
     scene: Path | None = None,
-    files: EditFiles | None = None,
+    edits: Path | None = None,
+    edits_out: Path | None = None,
 ) -> dict[str, Any]:
-    """Serve the page of a run until it is interrupted. ``files``: the script that it begins with, and where edits are
-    saved. UsageError: an address that other machines reach, without a token. ResourceError: the port is taken. As
-    ``run_page``."""
-    server, site = server_of(config, run, compare, scene, files)
+    """Serve the page of a run until it is interrupted. ``edits``: the script that it begins with. ``edits_out``: where
+    edits are saved. UsageError: an address that other machines reach, without a token. ResourceError: the port is
+    taken. As ``run_page``."""
+    server, site = server_of(config, run, compare, scene, edits, edits_out)
     host, port = server.server_address[:2]
     address = f"http://{host!s}:{port}/?token={site.token}"
     log.info(f"viewer: {address}   (Ctrl-C ends it)")
@@ -271,7 +249,12 @@ def run_view(
 
 
 def server_of(
-    config: ViewConfig, run: Path, compare: Path | None, scene: Path | None, files: EditFiles | None = None
+    config: ViewConfig,
+    run: Path,
+    compare: Path | None,
+    scene: Path | None,
+    edits: Path | None = None,
+    edits_out: Path | None = None,
 ) -> tuple[SiteServer, Site]:
     """The server of a run's page, listening, and what it serves."""
     token, sources = token_for(config.host, config.token), find_sources(config, run, scene, compare)
@@ -283,13 +266,12 @@ def server_of(
         for (folder, _), (_, fitted) in zip(sources.fits, shown.fits, strict=True):
             check_as_recorded(fitted, "--repair")
             mixers.append(RenderMixer(JobInputs(sources.scene, sources.cloud, folder), device=config.device))
-    desk = desk_for([model for _, model in shown.fits], shown.scene, shown.cloud, Path(run), files or EditFiles())
+    desk = desk_for([model for _, model in shown.fits], shown.scene, shown.cloud, Path(run), edits, edits_out)
     live = {"layers": list(LAYERS), "token": token, "edits": desk.entries(), "place": desk.place.name, "run": desk.run}
     page, facts = replace(page_of(config, shown, live=live), effort=1), dict[str, Any]()  # nothing leaves this machine
     served = {file.url: file.content for file in page.files(facts)}
     size = sum(map(len, served.values()))
     served[""] = page.html(facts, size)
-    log.info(needs_text(page, "served", f"{size / 1e6:.1f} MB in {page.chunks()} chunks"))
     report = Path(run) / "report.html"
     if report.is_file():
         served["report.html"] = store.read_bytes(report)

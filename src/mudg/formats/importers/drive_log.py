@@ -36,7 +36,7 @@ from mudg.formats.importers import common
 from mudg.formats.importers.common import ImportOptions
 from mudg.formats.importers.images import ImageFit, Lens, fit_images, image_notes
 from mudg.scene import motion
-from mudg.scene.clouds import FLOAT32_SPACING_M, at_sensor, float32_spacing_m
+from mudg.scene.clouds import at_sensor
 from mudg.scene.write import SceneWriter
 
 Matrix = NDArray[np.float64]
@@ -109,8 +109,8 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
     dataset = content.source.dataset
     types.foreign_name(content.name, f"{dataset}: name of the log")
     moments: list[tuple[int, str]] = []
-    rows: dict[str, list[tuple[int, int, float]]] = {}
-    """Sensor -> rows without return, all rows, and how far apart float32 numbers are at the farthest point, a sweep."""
+    lost: dict[str, list[tuple[int, int]]] = {}
+    """Sensor -> rows without a return, and all rows, of its sweeps."""
 
     def convert(item: Item) -> None:
         for part in content.convert(item):
@@ -121,8 +121,7 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
                     classes = None if points.classes is None else points.classes[~zeros]
                     xyz, intensity, dt_s = (values[~zeros] for values in (points.xyz, points.intensity, points.dt_s))
                     points = SweepPoints(xyz, intensity, dt_s, classes, points.no_returns + int(zeros.sum()))
-                counts = points.no_returns, points.no_returns + len(points.xyz), float32_spacing_m(points.xyz)
-                rows.setdefault(part.sensor, []).append(counts)
+                lost.setdefault(part.sensor, []).append((points.no_returns, points.no_returns + len(points.xyz)))
                 if len(points.xyz) == 0:
                     log.warn(f"{dataset}: {part.where or sweep_id} has no points")
                 writer.add_sweep(sweep_id, part.sensor, part.time_s, part.world_from_lidar, points)
@@ -136,19 +135,16 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
     with SceneWriter(out, content.name, content.source) as writer:
         for fit in content.fits.values():
             writer.add_camera(fit.camera)
-        title, total, workers = f"importing {dataset}", content.total, options.workers
-        common.for_each(content.items, convert, title=title, total=total, workers=workers, name=content.item_name)
+        total = content.total or (len(content.items) if isinstance(content.items, Sequence) else 0)
+        common.for_each(content.items, convert, f"importing {dataset}", total, options.workers, content.item_name)
         tracks, notes = content.tracks()
         tracks, turned = turned_back(tracks)
         notes = [*notes, *turned]
-        for sensor, counts in sorted(rows.items()):
-            without, total = sum(one[0] for one in counts), sum(one[1] for one in counts)
+        for sensor, counts in sorted(lost.items()):
+            without, total = (sum(numbers) for numbers in zip(*counts, strict=True))
             if without:
                 share = f"{without} of {total} points ({without / total:.1%})"
                 notes.append(f"{sensor}: {share} mark beams without a return and were left out")
-            if (spacing_m := max(one[2] for one in counts)) > FLOAT32_SPACING_M:
-                far = f"points reach so far from the sensor that float32 rounds them to {spacing_m * 1e3:.3g} mm"
-                log.warn(f"{sensor}: {far}; are they in the sensor's frame?")
         _log_notes(dataset, notes)
         writer.add_notes(notes)
         for track in tracks:
