@@ -96,7 +96,7 @@ class RenderViews(Output):
         return make
 
 
-_FILES = (*("lpips_weights", "lpips_vgg_weights", "fid_weights", "fvd_weights", "detections", "lanes"),)
+_FILES = ("lpips_weights", "lpips_vgg_weights", "fid_weights", "fvd_weights", "detections", "lanes")
 """Settings that name files and folders to read."""
 
 
