@@ -18,7 +18,7 @@ from mudg.base.run_folder import RunDir
 from mudg.base.types import EgoPath, Ref, Source, Sweep, View
 from mudg.core.depth import ray_elevation
 from mudg.labels import annotate
-from mudg.labels.annotate import LABELLERS, nearest_sweeps
+from mudg.labels.annotate import LABELLERS, nearest_sweeps, steady_bottom
 from mudg.labels.inputs import TRAIN_ID_OF, LabelInput, Labels, Prediction, box_outline, find_sky, label_by_network
 from mudg.labels.settings import AnnotateConfig
 from mudg.networks.folders import CPU
@@ -199,7 +199,7 @@ def test_a_label_that_is_there_stays_and_depth_without_lidar_too(tmp_path: Path)
     labels = labelled(*given_at(STREET))
     arrays = annotate.label_arrays(AnnotateConfig(depth=False, dynamic=False), labels)
     assert set(arrays) == {"semantics", "semantics_confidence", "sky"}
-    assert annotate.wanted_labels(AnnotateConfig()) == {"semantics", "sky", "depth", "dynamic"}
+    assert annotate.wanted_labels(AnnotateConfig(ego=True)) == {"semantics", "sky", "depth", "dynamic", "ego"}
     given, classes = given_at(STREET, lidar=False)
     labels = labelled(given, classes)
     network = lambda _: pytest.fail("asked")
@@ -251,3 +251,14 @@ def test_what_labellers_and_depth_networks_need_is_named(tmp_path: Path) -> None
     assert set(annotate.digests(AnnotateConfig())) == {"weights"}
     with pytest.raises(ResourceError, match="weights"):
         LABELLERS["network"](str(tmp_path / "nothing"), CPU)
+
+
+def test_bonnet_is_what_stays_the_same() -> None:
+    rng = np.random.default_rng(3)
+    grey = rng.uniform(60, 200, (12, 60, 90))
+    bonnet = np.zeros((60, 90), bool)
+    bonnet[48:, 20:70] = True
+    grey[:, bonnet] = rng.uniform(60, 200, bonnet.sum()) + rng.normal(0, 1, (12, bonnet.sum()))
+    found = steady_bottom(grey)
+    assert (found & bonnet).sum() / (found | bonnet).sum() > 0.85
+    assert not steady_bottom(rng.uniform(60, 200, (12, 60, 90))).any()

@@ -10,6 +10,8 @@ from tiny_networks import saved_mdm
 
 from mudg.base import seeds, store
 from mudg.base.errors import InputError, UsageError
+from mudg.base.geometry import yaw_matrix
+from mudg.base.types import Camera, View
 from mudg.benchmarks import run as bench
 from mudg.benchmarks import shift
 from mudg.benchmarks.rows import LONGER, method_rows
@@ -51,7 +53,7 @@ def test_a_list_is_what_the_rule_gives(first, name):
     kept, half, seed = {True: [], False: []}, len(city_logs.LISTS[name]) // 2, first
     while min(map(len, kept.values())) < half:
         curved = city_logs.turn_deg(city_logs.log_config(seed)) >= city_logs.CURVED_DEG
-        if len(kept[curved]) < half and city_logs.facts(seed).moving >= city_logs.MOVING:
+        if len(kept[curved]) < half and city_logs.facts(seed)["movers"] >= city_logs.MOVING:
             kept[curved].append(seed)
         seed += 1
     assert tuple(sorted(kept[True] + kept[False])) == city_logs.LISTS[name]
@@ -128,14 +130,17 @@ def test_what_a_log_lacks_is_left_out_and_named():
 def test_flicker_is_change_relative_to_the_truth_and_leaves_movers_and_the_camera_out():
     """A wall 10 m ahead, the camera moving 0.5 m sideways (so 1 pixel) per frame: its picture moves, it does not
     change."""
-    poses = np.tile(np.eye(4), (3, 1, 1))
-    poses[:, 0, 3] = 0.5 * np.arange(3)
+    camera = Camera("front", 16, 12, 20.0, 20.0, 8.0, 6.0)
+    views = [View(camera, yaw_matrix(0.0, (0.5 * t, 0, 0)), 0.1 * t) for t in range(3)]
     row = torch.rand(1, 3, 12, 19, generator=torch.Generator().manual_seed(0))
-    rgb, lens = torch.cat([row[..., t : t + 16] for t in range(3)]), torch.tensor([20.0, 20.0, 8.0, 6.0]).double()
+    rgb = torch.cat([row[..., t : t + 16] for t in range(3)])
     depth, ids = torch.full((1, 12, 16), 10.0), torch.full((12, 16), 2)
-    frames = [metrics.TrueFrame(depth, ids, pose, lens) for pose in torch.from_numpy(poses)]
-    for made, truth in metrics.changes(rgb + torch.tensor([0.0, 0.1, 0.0]).view(3, 1, 1, 1), rgb, frames):
-        assert truth == pytest.approx(0.0, abs=1e-3) and made == pytest.approx(0.1 * 12 * 15, rel=1e-3)
+    frames, blinking = [metrics.TrueFrame(view, depth, ids) for view in views], rgb.clone()
+    blinking[1] += 0.1
+    for t in (0, 1):
+        motion = metrics.pixel_motion(frames[t], frames[t + 1])
+        assert metrics.change(rgb[t], rgb[t + 1], motion) == pytest.approx(0.0, abs=1e-3)
+        assert metrics.change(blinking[t], blinking[t + 1], motion) == pytest.approx(0.1 * 12 * 15, rel=1e-3)
     noise = torch.randn(rgb.shape, generator=torch.Generator().manual_seed(1))
     made, truth = rgb + 0.3 * noise, rgb + 0.1 * noise
     assert metrics.flicker(made, truth, frames) == pytest.approx(3.0, rel=1e-3)

@@ -7,14 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from toy_scene import ToyStreet
+from toy_scene import CAR_SIZE_M, ToyStreet
 
-from mudg.base.geometry import CAM_FROM_EGO_AXES, invert, project
+from mudg.base.geometry import CAM_FROM_EGO_AXES, box_corners, invert, project, transform_points, yaw_matrix
 from mudg.base.types import Camera, View
 from mudg.core.pictures import depth_colors
 from mudg.scene import contact_sheet as sheets
 
 VIEW = View(Camera("front", 96, 64, 70.0, 70.0, 48.0, 32.0), invert(CAM_FROM_EGO_AXES), 0.0)
+
+
+def box_of(size_m: np.ndarray, world_from_box: np.ndarray) -> np.ndarray:
+    return transform_points(world_from_box, box_corners(size_m))
 
 
 def test_points_are_drawn_where_they_project_and_near_ones_win() -> None:
@@ -27,15 +31,36 @@ def test_points_are_drawn_where_they_project_and_near_ones_win() -> None:
     assert int((pixels.sum(2) > 0).sum()) == 1
 
 
+def test_edges_of_a_box_in_front_are_its_projected_corners() -> None:
+    corners = box_of(CAR_SIZE_M, yaw_matrix(0.4, (12.0, 0.5, 0.0)))
+    uv, z = project(VIEW, corners)
+    edges = dict(sheets.visible_edges(VIEW, corners))
+    assert len(edges) == 12 and (z > 0).all()
+    for number, (a, b) in enumerate(sheets._EDGES):
+        assert np.allclose(edges[number], uv[[a, b]], atol=1e-9)
+    lengths = [np.linalg.norm(corners[a] - corners[b]) for a, b in sheets._EDGES]
+    assert np.allclose(np.sort(lengths), np.repeat(np.sort(CAR_SIZE_M), 4))
+
+
+def test_a_box_around_the_camera_is_cut_and_one_behind_is_not_drawn() -> None:
+    size = np.array([10.0, 3.0, 2.0])
+    around = sheets.visible_edges(VIEW, box_of(size, yaw_matrix(0.0)))
+    assert 0 < len(around) < 12
+    for _, uv in around:
+        assert np.isfinite(uv).all()
+    assert sheets.visible_edges(VIEW, box_of(size, yaw_matrix(0.0, (-20.0, 0, 0)))) == []
+    ends = sheets.cut_near(np.array([[0.0, 0, -1], [0, 0, 2]]))
+    assert ends is not None and np.allclose(ends, [[0, 0, sheets.NEAR_M], [0, 0, 2]])
+    assert sheets.cut_near(np.array([[0.0, 0, -1], [0, 0, -2]])) is None
+
+
 def test_a_sheet_has_a_row_per_camera_and_a_view_from_above(tmp_path: Path) -> None:
     scene = ToyStreet(car_start=(12, 0), car_velocity=(3, 0)).write(tmp_path / "scene", width=120, height=60)
     image = sheets.contact_sheet(scene)
     assert image.size == (3 * sheets.TILE_WIDTH_PX, sheets.TILE_WIDTH_PX // 2 + sheets.TOP_HEIGHT_PX)
-    tile, top = np.split(np.array(image).astype(int), [sheets.TILE_WIDTH_PX // 2])
-    assert (tile == sheets.VEHICLE_COLOR).all(2).any() and not (tile == sheets.FRONT_COLOR).all(2).any()
-    top = top[20:]
-    assert (np.abs(top - sheets.VEHICLE_COLOR).max(2) < 60).any()
-    assert (np.abs(top - sheets.PATH_COLOR).max(2) < 60).any()
+    top = np.array(image)[sheets.TILE_WIDTH_PX // 2 + 20 :]
+    assert (np.abs(top.astype(int) - sheets.VEHICLE_COLOR).max(2) < 60).any()
+    assert (np.abs(top.astype(int) - sheets.PATH_COLOR).max(2) < 60).any()
 
 
 @pytest.mark.parametrize("lacking", ["sweeps", "tracks", "one frame"])

@@ -8,7 +8,6 @@ import pytest
 import torch
 import toy_inception
 import toy_views
-import toy_vit
 from test_i3d import made_up, renamed
 from test_score_metrics import lpips_state
 
@@ -25,7 +24,6 @@ from mudg.steps.render import Score
 STATES = {
     "inception": lambda: {**toy_inception.state(), "Conv2d_1a_3x3.bn.num_batches_tracked": torch.tensor(3)},
     "i3d": lambda: {renamed(name): value for name, value in made_up().items()},
-    "clip": lambda: toy_vit.transformers_names(toy_vit.clip_state()),
     "lpips": lpips_state,
 }
 
@@ -53,8 +51,6 @@ def test_converted_weights_are_the_published_ones_under_known_names(tmp_path: Pa
     if network == "i3d":
         assert set(found) == set(i3d.tensor_shapes())
         assert torch.equal(found["logits.conv3d.bias"], made_up()["logits.conv3d.bias"])
-    if network == "clip":
-        assert all(torch.equal(found[name], value) for name, value in toy_vit.clip_state().items())
     if network == "inception":
         assert set(found) == set(inception.tensor_shapes())
 
@@ -77,25 +73,21 @@ def test_a_converted_file_keeps_its_origin(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_other_networks_are_refused_and_nothing_is_written(tmp_path: Path) -> None:
-    for network, given, said in (
-        ("inception", "i3d", "not the network it should be"),
-        ("clip", "lpips", "not the weights of a CLIP"),
-    ):
-        with pytest.raises(InputError, match=said):
-            converted.convert_weights(network, saved(tmp_path, given), tmp_path / "out")
+    with pytest.raises(InputError, match="not the network it should be"):
+        converted.convert_weights("inception", saved(tmp_path, "lpips"), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
 def test_the_verb_converts_replaces_and_refuses_foreign_settings(tmp_path: Path) -> None:
-    checkpoint = saved(tmp_path, "clip")
-    to = tmp_path / "weights" / "clip"
-    words = ["convert", str(checkpoint), "--to", str(to), "--network", "clip"]
+    checkpoint = saved(tmp_path, "lpips")
+    to = tmp_path / "weights" / "lpips"
+    words = ["convert", str(checkpoint), "--to", str(to), "--network", "lpips"]
     assert app.main(words) == 0
     assert (to / "weights.safetensors").is_file()
     assert app.main(words) != 0
     assert app.main([*words, "--overwrite"]) == 0
-    plain, half = ConvertConfig(network="clip"), ConvertConfig(network="clip", dtype="float16")
+    plain, half = ConvertConfig(network="lpips"), ConvertConfig(network="lpips", dtype="float16")
     with pytest.raises(UsageError, match="diffusion models only"):
         Convert(checkpoint=checkpoint, to=tmp_path / "other", settings=half).run()
     with pytest.raises(InputError, match="no such checkpoint"):

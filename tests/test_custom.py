@@ -15,7 +15,6 @@ import pytest
 import roundtrip
 import write_custom
 from bad_logs import refused
-from PIL import Image
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert
@@ -185,19 +184,6 @@ def test_traps_are_refused_in_words_by_doctor_and_ingest_alike(log: Path, tmp_pa
     with pytest.raises(InputError):
         ingest(log, tmp_path / "scene")
     assert not (tmp_path / "scene").exists()
-
-
-@pytest.mark.parametrize(("kind", "words"), [("another size", "camera's size"), ("missing", "file not found")])
-def test_bad_images_are_named(log: Path, tmp_path: Path, kind: str, words: str) -> None:
-    """What else may be wrong with an image: test_bad_images.py."""
-    path = log / "images" / "front" / "000002.png"
-    if kind == "another size":
-        Image.new("RGB", (48, 32)).save(path)
-    else:
-        path.unlink()
-    found = words_of(log)
-    assert words in found and "000002" in found
-    refused(words, ingest, log, tmp_path / "scene")
 
 
 def test_bad_clouds_are_named(log: Path, tmp_path: Path) -> None:

@@ -46,9 +46,8 @@ from mudg.sim.session import CameraRequest, Instant, Session
 from mudg.steps.edit import Edit
 from mudg.steps.render import RenderViews
 from mudg.steps.synthesize import Synthesize
-from mudg.viewer.live import FrameRequest, FrameSource
 from mudg.viewer.settings import ViewConfig
-from mudg.viewer.view import server_of
+from mudg.viewer.view import FrameRequest, FrameSource, server_of
 
 CAR = (0.6, 1.0, 1.0)
 

@@ -63,5 +63,5 @@ def test_lpips_without_or_with_other_weights_is_refused(tmp_path):
     with pytest.raises(UsageError, match="weight file"):
         perception_of(VirtualConfig(perception="lpips"))
     store.write_safetensors(tmp_path / "other.safetensors", {"x": torch.zeros(3).numpy()})
-    with pytest.raises(InputError, match="incomplete"):
+    with pytest.raises(InputError, match="not the network it should be"):
         perception_of(VirtualConfig(perception="lpips", lpips_weights=str(tmp_path / "other.safetensors")))

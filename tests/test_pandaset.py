@@ -183,23 +183,6 @@ def test_published_poses_of_a_sequence_give_a_vehicle_that_drives_forward(source
     assert in_ego[:3, 3] == pytest.approx([0.85, 0.0, 1.8], abs=0.1)
 
 
-def test_swapped_sizes_are_refused_and_unknown_classes_said(source: Path, tmp_path: Path, truth: Scene) -> None:
-    def write(swap: bool) -> None:
-        for index, sweep in enumerate(truth.sweeps):
-            table = cuboids(truth, sweep.time_s)
-            table["label"] = ["Hover Board", *table["label"][1:]]
-            if swap:
-                table["dimensions.x"], table["dimensions.y"] = table["dimensions.y"], table["dimensions.x"]
-            write_frame(source / "annotations" / "cuboids" / f"{index:02d}.pkl.gz", table)
-
-    write(swap=True)
-    roundtrip.assert_refused(ingest, source, tmp_path / "out", "swapped")
-    write(swap=False)
-    scene = ingest(source, tmp_path / "out")
-    assert "'Hover Board' (5 boxes)" in " | ".join(scene.source.notes)
-    assert scene.tracks[0].label == "hover_board"
-
-
 def write_classes(source: Path, names: dict[str, str]) -> list[np.ndarray]:
     """Classes for every point, in turns, as the data set stores them; returns the numbers frame by frame."""
     folder = source / "annotations" / "semseg"

@@ -122,5 +122,5 @@ def test_a_far_path_is_drawn_with_a_warning_and_nothing_is_half_written(
     (tmp_path / "bad.txt").write_text("1 2 3\n")
     refused("wrong number of values", mudg.render, scene, fit, out=tmp_path / "bad", path=tmp_path / "bad.txt")
     assert not (tmp_path / "bad").exists()
-    with pytest.raises(UsageError, match="without repairs and sweeps"):
+    with pytest.raises(UsageError, match="drawn without sweeps"):
         mudg.render(scene, fit, out=tmp_path / "x", path=tmp_path / "far.txt", lidar="scene")

@@ -163,7 +163,7 @@ def test_a_run_says_which_step_it_is_at_and_what_is_left(
     assert list(pipeline.PERCENT_OF_A_RUN) == [*steps, "viewer", "report"]
     said = list[str]()
     monkeypatch.setattr(pipeline.log, "info", said.append)
-    monkeypatch.setattr(pipeline.Meter, "stop", lambda _: pipeline.Usage(19 * 60.0, 19 * 60.0))
+    monkeypatch.setattr(pipeline.store, "json_object", lambda _: {"seconds": 19 * 60.0})  # the record of each step
     chain(tmp_path)
     assert "== fit without diffusion, step 2 of 9" in said
     assert "== synthesize, step 3 of 9, about 162 min left" in said

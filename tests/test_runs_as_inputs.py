@@ -40,7 +40,7 @@ def called(monkeypatch: pytest.MonkeyPatch) -> list[Result]:
         ("annotate RUN --out OUT", ["scene"]),
         ("fuse RUN --out OUT", ["scene"]),
         ("fit RUN --out OUT", ["scene", "fuse"]),
-        ("fit RUN RUN --start-from RUN --out OUT", ["scene", "fuse", "fit/street_gaussians"]),
+        ("fit RUN --start-from RUN --out OUT", ["scene", "fuse", "fit/street_gaussians"]),
         ("fit RUN --observations RUN --out OUT", ["scene", "fuse", "synthesize"]),
         ("synthesize RUN --out OUT", ["scene", "fuse"]),
         ("synthesize RUN --fitted RUN --out OUT", ["scene", "fuse", "fit/street_gaussians"]),

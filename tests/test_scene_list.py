@@ -141,22 +141,18 @@ def test_a_training_on_a_list_resumes_bit_equal(clips, tmp_path):
     refused("list of scenes says", both.run, raises=UsageError)
 
 
-def test_streamed_clips_give_the_same_losses(clips, address, tmp_path):
+def test_streamed_clips_give_the_same_losses(clips, address, tmp_path, capsys):
     Learn(out=tmp_path / "local", settings=tiny(clips, log_every=1, steps=2)).run()
     settings = tiny(address.text, log_every=1, steps=2, cache=str(tmp_path / "cache"), cache_gb=1e-6)
-    Learn(out=tmp_path / "streamed", settings=settings).run()
+    (tmp_path / "recipe.yaml").write_text(configuration.dump_yaml(settings))
+    words = ["learn", "--config", str(tmp_path / "recipe.yaml"), "--out", str(tmp_path / "streamed"), "--quiet"]
+    assert app.main(words) == 0
+    assert app.main([*words, "--data.textures", "s3://bucket/textures"]) == 2
+    assert "a path of this machine" in capsys.readouterr().err
     assert losses_of(tmp_path / "local") == losses_of(tmp_path / "streamed")
     assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 1  # all others had to go
     local, streamed = (store.read_json(tmp_path / name / "metrics.json") for name in ("local", "streamed"))
     assert local == streamed
-
-
-def test_the_command_takes_an_address_of_clips(address, tmp_path, capsys):
-    recipe = tmp_path / "recipe.yaml"
-    recipe.write_text(configuration.dump_yaml(tiny(address.text, steps=2)))
-    assert app.main(["learn", "--config", str(recipe), "--out", str(tmp_path / "a"), "--quiet"]) == 0
-    assert app.main(["learn", "--data.textures", "s3://bucket/textures", "--out", str(tmp_path / "c"), "--quiet"]) == 2
-    assert "a path of this machine" in capsys.readouterr().err
 
 
 def test_the_least_recently_used_clips_leave_the_cache(tmp_path):

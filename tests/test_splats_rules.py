@@ -91,10 +91,8 @@ def check_animation(document: dict[str, Any], data: bytes, animation: dict[str, 
     for channel in animation["channels"]:
         sampler, path = animation["samplers"][channel["sampler"]], channel["target"]["path"]
         times = np.array(slow.accessor(document, data, sampler["input"]))[:, 0]
-        given, values = (
-            document["accessors"][sampler["input"]],
-            np.array(slow.accessor(document, data, sampler["output"])),
-        )
+        given = document["accessors"][sampler["input"]]
+        values = np.array(slow.accessor(document, data, sampler["output"]))
         assert times[0] >= 0 and (np.diff(times) > 0).all() and len(values) == len(times)
         assert [given["min"][0], given["max"][0]] == [times[0], times[-1]]
         assert path != "rotation" or np.abs(np.linalg.norm(values, axis=1) - 1).max() < 1e-6

@@ -39,10 +39,10 @@ from mudg.gaussians.storage import save_model
 from mudg.scene.read import read_scene
 from mudg.viewer import page as viewer_page
 from mudg.viewer import view
-from mudg.viewer.live import GROUND
 from mudg.viewer.page import BLOCK, blob_of, coverage, level_of, opacity_of, pack_scene, smallest_three
 from mudg.viewer.server import token_for
 from mudg.viewer.settings import PageConfig
+from mudg.viewer.view import GROUND
 
 Toy = tuple[Path, Path, SceneModel]
 

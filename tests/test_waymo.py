@@ -74,15 +74,13 @@ def drive(pristine: made.Log) -> made.Log:
     return copy.deepcopy(pristine)
 
 
-@pytest.mark.parametrize("form, workers", [("v1", 1), ("v2", 2)])
-def test_round_trip(form: str, workers: int, city: City, drive: made.Log, tmp_path: Path) -> None:
+def test_round_trip(city: City, drive: made.Log, tmp_path: Path) -> None:
     truth, own = city
-    scene = ingest(write(drive, form, tmp_path / "log"), tmp_path / "scene", workers=workers)
+    scene = ingest(write(drive, "v1", tmp_path / "log"), tmp_path / "scene")
     roundtrip.assert_same_log(scene, truth, labels=made.LABELS, cloud_m=2e-4, dt_s=1e-6, box_pose=0.03, intensity=1e-4)
     assert scene.ego.world_from_ego[0] == pytest.approx(np.eye(4), abs=1e-12)
     assert scene.frames[0].view.camera.readout_s == pytest.approx(made.READOUT_S, abs=1e-6)
     assert scene.frames[0].view.camera.shutter == "left_to_right"
-    assert any(form in note for note in scene.source.notes)
     assert {scene.split[f"front/00000{n}"] for n in (0, 1, 2, 3)} == {"train"}
     assert scene.split["front_left/000004"] == "test"
     assert scene.frames[0].view.time_s == pytest.approx(0.05, abs=1e-6)  # the clock begins with the LiDAR's turn
@@ -111,20 +109,20 @@ def test_both_formats_and_any_number_of_workers_give_the_same_scene(drive: made.
         assert np.array_equal(a.view.world_from_cam, b.view.world_from_cam)
 
 
-@pytest.mark.parametrize("form", ["v1", "v2"])
-def test_chosen_frames_and_cameras_far_from_the_origin(form: str, city: City, tmp_path: Path) -> None:
-    far = yaw_matrix(2.0, (-25211.25, 42391.08, -160.6))
+def test_chosen_frames_and_cameras_far_from_the_origin(city: City, tmp_path: Path) -> None:
+    far, truth = yaw_matrix(2.0, (-25211.25, 42391.08, -160.6)), city[0]
     log = made.log_of(*city, beams=rig.lidar_elevations(roundtrip.SMALL), columns=COLUMNS, global_from_world=far)
-    source, truth = write(log, form, tmp_path / "log"), city[0]
-    scene = ingest(source, tmp_path / "scene", frames=(1, 4), cameras=("front_left",))
-    assert [frame.id for frame in scene.frames] == [f"front_left/{n:06d}" for n in range(3)]
-    shift = scene.frames[0].view.world_from_cam @ invert(truth.frames_of("front_left")[1].view.world_from_cam)
-    for index, sweep in enumerate(scene.sweeps):
-        original = truth.sweeps[index + 1]
-        assert np.abs(sweep.world_from_lidar - shift @ original.world_from_lidar).max() < 1e-6
-        assert len(read_points(scene, sweep).xyz) == len(read_points(truth, original).xyz)
-    assert any("origin is (-25" in note for note in scene.source.notes)
-    refused("no such camera", ingest, source, tmp_path / "c", cameras=("rear",), raises=UsageError)
+    for form in ("v1", "v2"):
+        source = write(log, form, tmp_path / form)
+        scene = ingest(source, tmp_path / f"{form} scene", frames=(1, 4), cameras=("front_left",))
+        assert [frame.id for frame in scene.frames] == [f"front_left/{n:06d}" for n in range(3)]
+        shift = scene.frames[0].view.world_from_cam @ invert(truth.frames_of("front_left")[1].view.world_from_cam)
+        for index, sweep in enumerate(scene.sweeps):
+            original = truth.sweeps[index + 1]
+            assert np.abs(sweep.world_from_lidar - shift @ original.world_from_lidar).max() < 1e-6
+            assert len(read_points(scene, sweep).xyz) == len(read_points(truth, original).xyz)
+        assert any("origin is (-25" in note for note in scene.source.notes)
+        refused("no such camera", ingest, source, tmp_path / "c", cameras=("rear",), raises=UsageError)
 
 
 def test_lenses_are_undone_and_other_lidars_read(drive: made.Log, tmp_path: Path) -> None:
@@ -492,10 +490,10 @@ def test_range_images_are_unpacked_within_bounds(monkeypatch: pytest.MonkeyPatch
     assert range_image(whole, 4, "x").shape == (2, 3, 4)
     refused("wrong shape", range_image, whole, 6, "x")
     refused("cut off", range_image, whole[:-6], 4, "x")
-    refused("cannot be unpacked", range_image, b"nonsense", 4, "x")
+    refused("is damaged", range_image, b"nonsense", 4, "x")
     monkeypatch.setattr(logs, "MAX_UNPACKED_BYTES", 1 << 20)
     bomb = zlib.compress(bytes(2 << 20), 1)
-    refused("unpacks to more", range_image, bomb, 4, "x")
+    refused("unpacks to too much", range_image, bomb, 4, "x")
     lying = made.text(1, bytes(16)) + made.text(2, b"".join(made.number(1, n) for n in (1 << 20, 1 << 20, 4)))
     refused("wrong shape", range_image, zlib.compress(lying), 4, "x")
 

@@ -1,7 +1,7 @@
 """Compare the networks and distances of the scores with the packages that published numbers are made with, on made-up
 weights.
 
-    python -m venv oracle && oracle/bin/pip install torch numpy scipy pillow tqdm transformers
+    python -m venv oracle && oracle/bin/pip install torch numpy scipy pillow tqdm
     oracle/bin/pip install --no-deps torchvision==0.28.0 pytorch-fid==0.3.0 torch-fidelity==0.4.0 lpips==0.1.4
     PYTHONPATH=src:tests oracle/bin/python tools/oracle_parity.py
 
@@ -22,7 +22,6 @@ from pathlib import Path
 import numpy as np
 import torch
 import toy_inception
-import toy_vit
 
 warnings.filterwarnings("ignore")
 LIBRARY = torch.library.Library("torchvision", "DEF")  # the CUDA build of torchvision asks for them when it is imported
@@ -103,42 +102,15 @@ def lpips() -> None:
         note(f"LPIPS, {trunk}", "lpips", abs(made / float(model(first[None] * 2 - 1, second[None] * 2 - 1)) - 1))
 
 
-@torch.no_grad()
-def transformers() -> None:
-    """CLIP's tower."""
-    from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
-
-    from mudg.networks import clip as clip_image
-
-    state = toy_vit.clip_state(side=112)
-    config = CLIPVisionConfig(
-        hidden_size=128,
-        intermediate_size=512,
-        num_hidden_layers=2,
-        num_attention_heads=2,
-        image_size=112,
-        patch_size=14,
-        projection_dim=32,
-    )
-    model = CLIPVisionModelWithProjection(config).eval()
-    named = {k: v for k, v in toy_vit.transformers_names(state).items() if k.startswith("vis")}
-    report = model.load_state_dict(named, strict=False)
-    if report.unexpected_keys or any("position_ids" not in name for name in report.missing_keys):
-        raise SystemExit(f"CLIP's names differ: {report}")
-    image = torch.randn(2, 3, 112, 112, generator=torch.Generator().manual_seed(0))
-    found = model(pixel_values=image).image_embeds
-    note("CLIP tower with projection", "transformers", apart(clip_image.ClipImageFeatures(named)(image), found))
-
-
 def main() -> int:
     """Run all comparisons that the installed packages allow."""
-    parts: dict[str, Callable[[], None]] = {"inception": inception, "lpips": lpips, "transformers": transformers}
+    parts: dict[str, Callable[[], None]] = {"inception": inception, "lpips": lpips}
     for part in parts.values():
         part()
     print("| what | oracle | relative difference | limit |\n|---|---|---|---|")
     for what, oracle, difference, limit in ROWS:
         print(f"| {what} | {oracle} | {difference:.1e} | {limit:.0e} |")
-    names = ("torch", "torchvision", "pytorch-fid", "torch-fidelity", "lpips", "transformers")
+    names = ("torch", "torchvision", "pytorch-fid", "torch-fidelity", "lpips")
     print("\n" + ", ".join(f"{name} {importlib.metadata.version(name)}" for name in names))
     return int(any(difference > limit for _, _, difference, limit in ROWS))
 

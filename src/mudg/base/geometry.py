@@ -169,7 +169,7 @@ def yaw_of(world_from_object: Matrix) -> float:
 def pinhole(intrinsics: Iterable[Any], x: Any, y: Any, z: Any) -> tuple[Any, Any]:
     """Pixels (u, v) of camera coordinates (arrays or tensors that broadcast, metres, z not 0): ``(fx x / z + cx, fy y /
     z + cy)``. intrinsics: ``Camera.intrinsics``. The one pinhole formula of the package; its twins are the native
-    library's and ``core.zbuffer``'s, which repeats that one in float32."""
+    library's and ``core.project``'s, which repeats that one in float32."""
     fx, fy, cx, cy = intrinsics
     return fx * x / z + cx, fy * y / z + cy
 

@@ -24,7 +24,7 @@ from mudg.core.raster.rasterize import rasterize
 from mudg.core.table import Table
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import NodeRows, RigidNode
-from mudg.gaussians.recipes import DrawnView, OwnRecipe
+from mudg.gaussians.recipes import DrawnView, Recipe
 from mudg.gaussians.rendering import boxes_in_view, objects_only
 from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.start import start_model
@@ -212,7 +212,7 @@ LIDAR_WEIGHT, SMOOTH_WEIGHT, OBJECTS_WEIGHT, CONSISTENCY_WEIGHT = 1.0, 0.1, 0.1,
 SSIM_SHARE: Final = 0.2
 
 
-class BezierRecipe(OwnRecipe):
+class BezierRecipe(Recipe):
     """See the module's text."""
 
     def start(

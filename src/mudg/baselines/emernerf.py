@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mudg.base import checkpoint, geometry, log, records, seeds, store
 from mudg.base.devices import memory_of
-from mudg.base.errors import InputError, NumericsError
+from mudg.base.errors import InputError
 from mudg.base.processes import one_torch_thread
 from mudg.base.records import understood
 from mudg.base.run_folder import RunDir
@@ -25,7 +25,7 @@ from mudg.base.types import Observation, Scene, View
 from mudg.baselines import emernerf_field as fields
 from mudg.core.pictures import panels_of, resize_area
 from mudg.gaussians.rendering import COVERED
-from mudg.gaussians.schedule import Progress, run_steps
+from mudg.gaussians.schedule import FiniteCheck, Progress, run_steps
 from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.storage import RADIANCE, description_of, kind_of
 from mudg.gaussians.views import StoredView, load_recorded, training_frames
@@ -357,7 +357,7 @@ def take_step(state: RadianceState, config: FitConfig, step: int) -> dict[str, T
     marched, draws, rays = _marched(field, given, budget, generator, learns)
     truth = rgb.to(device), counts.to(device), None if sky is None else sky.to(device)
     terms, error = fields.pixel_terms(field, rays, marched, draws, truth, dynamic)
-    _learn(state, terms, marched, learns, f"step {step}, pixels")
+    _learn(state, terms, marched, learns, step, "of pixels")
     state.pixels.note(cells, error)
     if state.lidar is None:
         return terms
@@ -367,7 +367,7 @@ def take_step(state: RadianceState, config: FitConfig, step: int) -> dict[str, T
     marched, draws, _ = _marched(field, given, budget, generator, learns)
     sight_m = sight_width(step, config.iterations)
     measured = fields.lidar_terms(field, marched, draws, range_m.to(device), dynamic, sight_m)
-    _learn(state, measured, marched, learns, f"step {step}, LiDAR")
+    _learn(state, measured, marched, learns, step, "of LiDAR")
     return terms | {name if name not in terms else f"{name}_lidar": value for name, value in measured.items()}
 
 
@@ -381,24 +381,18 @@ def _marched(
 
 
 def _learn(
-    state: RadianceState, terms: Mapping[str, Tensor], marched: fields.Marched, learns: bool, where: str
+    state: RadianceState, terms: Mapping[str, Tensor], marched: fields.Marched, learns: bool, step: int, view: str
 ) -> None:
     """One step of the optimisers down the sum of the terms; NumericsError before that if something is not finite."""
-    total = torch.stack(list(terms.values())).sum()
-    total = total + fields.proposal_loss(marched) if learns else total
+    check, clear = FiniteCheck(step), state.field.zero_grad
     remedy = "the parameters are those of the step before; another --seed draws other rays"
-    if not bool(torch.isfinite(total)):
-        odd = [name for name, value in terms.items() if not bool(torch.isfinite(value))]
-        raise NumericsError("a loss term is not finite", where=where, got=", ".join(odd) or "proposals", remedy=remedy)
-    for optimiser in state.optimisers:
-        optimiser.zero_grad(set_to_none=True)
-    total.backward()
-    named = [(name, value.grad) for name, value in state.field.named_parameters() if value.grad is not None]
-    sums = torch.stack([gradient.sum() for _, gradient in named])
-    if not bool(torch.isfinite(sums).all()):
-        odd = [name for name, gradient in named if not bool(torch.isfinite(gradient).all())]
-        if odd:
-            raise NumericsError("a gradient is not finite", where=where, got=", ".join(odd[:3]), remedy=remedy)
+    every = {**terms, **({"proposals": fields.proposal_loss(marched)} if learns else {})}
+    check.terms(view, every)
+    clear()
+    torch.stack(list(every.values())).sum().backward()
+    named = {name: value.grad for name, value in state.field.named_parameters() if value.grad is not None}
+    check.sums(view, named, remedy, clear)
+    check.refuse()
     for optimiser in state.optimisers[: 2 if learns else 1]:
         optimiser.step()
 

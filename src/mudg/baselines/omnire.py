@@ -23,7 +23,7 @@ from mudg.base.types import FusedCloud, Scene
 from mudg.core.table import Table
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import DeformableNode, NodeRows, RigidNode, StaticNode
-from mudg.gaussians.recipes import DrawnView, OwnRecipe
+from mudg.gaussians.recipes import DrawnView, Recipe
 from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.start import start_model
 from mudg.gaussians.views import StoredView, TrainView
@@ -183,7 +183,7 @@ LIDAR_WEIGHT: Final = 0.01
 """Of the mean absolute difference of depth, per metre."""
 
 
-class OmniRecipe(OwnRecipe):
+class OmniRecipe(Recipe):
     """See the module's text."""
 
     last_densified: ClassVar[float] = 0.5

@@ -23,7 +23,7 @@ from mudg.base.types import FusedCloud, Scene
 from mudg.core import losses
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import NodeRows, StaticNode
-from mudg.gaussians.recipes import SCENE_UNIT_M, DrawnView, OwnRecipe
+from mudg.gaussians.recipes import SCENE_UNIT_M, DrawnView, Recipe
 from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.start import painted_sky, timed_points, world_model
 from mudg.gaussians.views import StoredView, TrainView
@@ -115,7 +115,7 @@ FILLED_SPAN: Final = 1.2
 """Points without a time of their own start at times spread over this many durations of the log."""
 
 
-class VibrationRecipe(OwnRecipe):
+class VibrationRecipe(Recipe):
     """See the module's text."""
 
     last_densified: ClassVar[float] = 0.5

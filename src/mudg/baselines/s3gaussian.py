@@ -25,7 +25,7 @@ from mudg.core.grids import TIME, PlaneSizes, look_up
 from mudg.core.table import Table
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import NodeRows, StaticNode
-from mudg.gaussians.recipes import DrawnView, OwnRecipe
+from mudg.gaussians.recipes import DrawnView, Recipe
 from mudg.gaussians.schedule import FIELD_STEPS
 from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.start import timed_points, world_model
@@ -191,7 +191,7 @@ BOX_MARGIN: Final = 0.02
 """The box of the field is that of the LiDAR points, grown by this share."""
 
 
-class FieldRecipe(OwnRecipe):
+class FieldRecipe(Recipe):
     """See the module's text."""
 
     last_densified: ClassVar[float] = 0.5

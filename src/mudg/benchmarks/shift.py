@@ -76,10 +76,8 @@ class ShiftLog(Views):
             (metrics,) = self.scores(name, folders).values()
             values[name] = {f"{entry['distance_m']:g}": entry["values"] for entry in metrics["by_distance"]}
         self.film({name: folders for name, folders in views.items() if name in SHOWN})
-        facts = city_logs.facts(self.log.seed, self.log.rules)
-        path = {"log": self.log.seed, "turn_deg": round(facts.turn_deg, 2), "length_m": round(facts.length_m, 1)}
-        movers = {"movers": facts.moving, "mover_share": round(facts.moving_share, 4), "words": facts.description}
-        return {**path, **movers, "values": values, "seconds": seconds_of(self.out)}
+        facts = {"log": self.log.seed, **city_logs.facts(self.log.seed, self.log.rules)}
+        return {**facts, "values": values, "seconds": seconds_of(self.out)}
 
 
 def run(

@@ -82,19 +82,6 @@ class LogRules:
     cameras: tuple[str, ...] = ("front", "front_left", "front_right")
 
 
-@dataclass(frozen=True)
-class LogFacts:
-    """What a log holds: turn in degrees (range of headings), length in metres, moving vehicles in view of the front
-    camera, the share of the image they cover together on average, and the generator's line about the city."""
-
-    seed: int
-    turn_deg: float
-    length_m: float
-    moving: int
-    moving_share: float
-    description: str
-
-
 STANDARD: Final = LogRules()
 MOVING, SMALLEST_SHARE, FRAMES_SHARE, CURVED_DEG = 2, 1e-3, 0.25, 5.0
 """A log enters a list with so many moving vehicles in view of the front camera: they cover this share of the image, in
@@ -122,16 +109,19 @@ def moving_instances(world: CityWorld, labels: Container[str] | None = None) -> 
     return tuple(world.instance_of(track.id) for track in moving)
 
 
-def facts(seed: int, rules: LogRules = STANDARD) -> LogFacts:
-    """What the log of a seed holds, from small images of every fourth frame."""
+def facts(seed: int, rules: LogRules = STANDARD) -> dict[str, float | str]:
+    """What the log of a seed holds, from small images of every fourth frame: its turn in degrees (range of headings)
+    and length in metres, moving vehicles in view of the front camera, the share of the image that they cover together
+    on average, and the generator's line about the city."""
     world = CityWorld(log_config(seed, rules))
     views = [view.resized(96, 64) for view in world.frame_views("front")[::4]]
     seen = np.stack([world.render(view, supersample=1).instance for view in views])
     moving = moving_instances(world, VEHICLES)
     shares = np.array([[float((image == i).mean()) for image in seen] for i in moving]).reshape(-1, len(views))
     count = int(((shares >= SMALLEST_SHARE).mean(1) >= FRAMES_SHARE).sum())
-    share = float(shares.sum(0).mean())
-    return LogFacts(seed, turn_deg(world.config), world.plan.drive_length, count, share, world.describe())
+    path = {"turn_deg": round(turn_deg(world.config), 2), "length_m": round(world.plan.drive_length, 1)}
+    movers = {"movers": count, "mover_share": round(float(shares.sum(0).mean()), 4)}
+    return {**path, **movers, "words": world.describe()}
 
 
 def turn_deg(config: CityConfig) -> float:

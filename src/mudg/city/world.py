@@ -25,7 +25,7 @@ from mudg.city import layout as rec
 from mudg.city import sensors
 from mudg.city.config import CityConfig
 from mudg.city.furnish import furnish
-from mudg.city.layout import StreetPlan, plan_streets
+from mudg.city.layout import Array, StreetPlan, plan_streets
 from mudg.city.light import draw_photos, lamp_places, light_numbers, weather_numbers
 from mudg.city.traffic import PosedObject, ego_keys, key_times, plan_traffic
 
@@ -57,21 +57,14 @@ def library() -> ctypes.CDLL:
     return lib
 
 
-def _f64(array: Any) -> NDArray[np.float64]:
+def _f64(array: Any) -> Array:
     return np.ascontiguousarray(array, np.float64)
 
 
 class CityHandle:
     """Owns one native world."""
 
-    def __init__(
-        self,
-        records: NDArray[np.float64],
-        plan: StreetPlan,
-        road: NDArray[np.float64],
-        light: NDArray[np.float64],
-        seed: int,
-    ) -> None:
+    def __init__(self, records: Array, plan: StreetPlan, road: Array, light: Array, seed: int) -> None:
         self._lib = library()
         line = _f64(np.stack([plan.line.s, plan.line.x, plan.line.y, plan.line.heading], 1))
         records, marks, walks, road, light = map(_f64, (records, plan.marks, plan.crosswalks, road, light))
@@ -92,7 +85,7 @@ class CityHandle:
         if self._lib.mudg_city_set_texture(self._handle, slot, pixels, pixels.shape[1], pixels.shape[0], metres):
             raise ResourceError("not enough memory for a texture of the city")
 
-    def set_weather(self, numbers: NDArray[np.float64], lamps: NDArray[np.float64]) -> None:
+    def set_weather(self, numbers: Array, lamps: Array) -> None:
         """Wet ground, snow and lamps f64[N, 3]; before anything is rendered. Numbers as in native/city_weather.cpp."""
         values, places = _f64(numbers), _f64(lamps).reshape(-1, 3)
         if self._lib.mudg_city_set_weather(self._handle, values, places, len(places)):
@@ -105,12 +98,12 @@ class CityHandle:
 
     def render(
         self,
-        poses: NDArray[np.float64],
-        phases: NDArray[np.float64],
+        poses: Array,
+        phases: Array,
         intrinsics: tuple[float, float, float, float],
         width: int,
         height: int,
-        world_from_cam: NDArray[np.float64],
+        world_from_cam: Array,
         supersample: int,
         noise_key: int,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]:
@@ -126,12 +119,12 @@ class CityHandle:
 
     def sweep(
         self,
-        poses: NDArray[np.float64],
-        phases: NDArray[np.float64],
-        elevations: NDArray[np.float64],
-        azimuths: NDArray[np.float64],
-        world_from_lidar: NDArray[np.float64],
-        fractions: NDArray[np.float64],
+        poses: Array,
+        phases: Array,
+        elevations: Array,
+        azimuths: Array,
+        world_from_lidar: Array,
+        fractions: Array,
         settings: tuple[float, float, float, float],
         key: int,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]:
@@ -148,7 +141,7 @@ class CityHandle:
             raise ResourceError("not enough memory to scan the city")
         return points
 
-    def street(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    def street(self, xy: Array) -> Array:
         """Per world point [N, 2]: street coordinates s, u and signed distance to the kerb (negative on the road)."""
         xy = _f64(xy).reshape(-1, 2)
         out = np.empty((len(xy), 3), np.float64)
@@ -193,7 +186,7 @@ class CitySweep:
     ``semantics`` u8[N] and ``instance`` i32[N] belong to the points."""
 
     time_s: float
-    world_from_lidar: NDArray[np.float64]
+    world_from_lidar: Array
     points: SweepPoints
     semantics: NDArray[np.uint8]
     instance: NDArray[np.int32]
@@ -212,7 +205,7 @@ class CityWorld:
         self.key_times_s = key_times(config)
         """Times f64[K] of the keys of all objects."""
         self._furniture = furnish(config, self.plan)
-        self.lamps: NDArray[np.float64] = lamp_places(self._furniture + [m.row for m in self.objects])
+        self.lamps: Array = lamp_places(self._furniture + [m.row for m in self.objects])
         no_keys = np.zeros((len(self.key_times_s), 0, 4))
         self._keys = np.stack([m.keys for m in self.objects], 1) if self.objects else no_keys
         self._gaits = np.array([m.gait_rad_per_s for m in self.objects], np.float64)
@@ -257,7 +250,7 @@ class CityWorld:
             what, remedy = error.what, "generate it again"
             raise InputError(what, where=error.where, expected=error.expected, got=error.got, remedy=remedy) from error
 
-    def rearranged(self, keys: Mapping[str, NDArray[np.float64] | None]) -> CityWorld:
+    def rearranged(self, keys: Mapping[str, Array | None]) -> CityWorld:
         """The same world, light and shadows included, with some vehicles or people elsewhere or gone. ``keys``: track
         id -> x, y, z of the point on the ground below the box's centre, yaw f64[K, 4] at ``key_times_s``; None: not
         there."""
@@ -351,7 +344,7 @@ class CityWorld:
             views.append(View(self._cameras[camera], self.frame_pose(time_s) @ self._mounts[camera], time_s))
         return tuple(views)
 
-    def frame_pose(self, time_s: float) -> NDArray[np.float64]:
+    def frame_pose(self, time_s: float) -> Array:
         """world_from_ego f64[4, 4] of the recording vehicle; UsageError outside the log."""
         pose = self._ego_path.pose_at(time_s)
         if pose is None:
@@ -359,7 +352,7 @@ class CityWorld:
             raise UsageError(what, expected=f"{self._ego_times[0]:.3f}..{self._ego_times[-1]:.3f} s", got=f"{time_s} s")
         return pose
 
-    def _object_keys_at(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _object_keys_at(self, times_s: Array) -> Array:
         """x, y, z, yaw f64[T, objects, 4] between the keys, as Track.pose_at interpolates."""
         times, keys = self.key_times_s, self._keys
         first, last = self.span_s
@@ -373,7 +366,7 @@ class CityWorld:
         u = (at - before)[:, None, None]
         return keys[before] + u * (keys[before + 1] - keys[before])
 
-    def _phases(self, time_s: float) -> NDArray[np.float64]:
+    def _phases(self, time_s: float) -> Array:
         return self._gait_starts + self._gaits * time_s
 
     def markings(self, view: View, truth: CityTruth) -> NDArray[np.bool_]:
@@ -386,11 +379,11 @@ class CityWorld:
             mask[rows, columns] = rec.painted(self.plan, self._handle.street(xyz[:, :2]), xyz[:, :2])
         return mask
 
-    def beyond_kerb_m(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    def beyond_kerb_m(self, xy: Array) -> Array:
         """Distance f64[N] of places f64[N, 2] from the kerb, metres; negative on the road."""
         return self._handle.street(xy)[:, 2]
 
-    def lane_lines(self) -> list[NDArray[np.float64]]:
+    def lane_lines(self) -> list[Array]:
         """Road lines, road edges and crosswalks as a map has them: lines f64[N, 3] in the world, metres."""
         return rec.lane_lines(self.plan)
 
@@ -441,9 +434,7 @@ class CityWorld:
         rgb, depth, semantics, instance = zip(*parts, strict=True)
         return CityTruth(*(np.concatenate(column) for column in (rgb, depth, semantics, instance)))
 
-    def ranges(
-        self, places: NDArray[np.float64], directions: NDArray[np.float64], times_s: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def ranges(self, places: Array, directions: Array, times_s: Array) -> tuple[Array, Array]:
         """Exact range f64[N] in metres and intensity f64[N] of single beams without noise; NaN: nothing returns (glass
         and weak surfaces lose beams as in a sweep). ``places``, ``directions``: f64[N, 3] in the world, of length 1.
         ``times_s``: f64[N]; limbs of people keep their pose of the middle."""
@@ -506,9 +497,7 @@ class CityWorld:
         return CitySweep(time_s, world_from_lidar, points, semantics[hit], instance[hit])
 
 
-def _interpolated_poses(
-    times: NDArray[np.float64], poses: NDArray[np.float64], at: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _interpolated_poses(times: Array, poses: Array, at: Array) -> Array:
     """``geometry.pose_at`` for many times f64[N, 4, 4]: slerp and straight line between neighbouring keys."""
     before = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
     out = np.empty((len(at), 4, 4))
@@ -539,7 +528,7 @@ def _seed31(config: CityConfig, purpose: str) -> int:
     return seeds.key(config.seed, 0, purpose) & 0x7FFFFFFF
 
 
-def _road_numbers(config: CityConfig, plan: StreetPlan) -> NDArray[np.float64]:
+def _road_numbers(config: CityConfig, plan: StreetPlan) -> Array:
     """Numbers of the road in the order of ``RoadNumber`` in native/city.cpp."""
     rng = seeds.numpy_rng(config.seed, 0, "city ground")
     cross = [0.0] * 10

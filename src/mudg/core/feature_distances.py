@@ -1,15 +1,6 @@
-"""Distances between two sets of feature vectors: how far the distribution of generated images is from that of real
-ones.
-
-All take two arrays ``generated`` ``[n, d]`` and ``real`` ``[m, d]`` (rows are images, any real dtype), compute in
-float64 on the CPU and return a plain number. Smaller is better everywhere. InputError: sets of other widths, too few
-rows, or values that are not finite. What the features are decides the name of the number: with those of
-``networks/inception.py`` ``frechet_distance`` is FID and ``kernel_distance`` is KID.
-
-All of them depend on the number of rows. The Frechet distance of two small samples of the *same* law is far from 0:
-with FID's features and 96 rows about nine tenths of the total variance. Compare only numbers of equal n, and show what
-two samples of the truth give beside them. ``kernel_distance`` alone is unbiased.
-"""
+"""Distances between two sets of feature vectors ``generated`` [n, d] and ``real`` [m, d], in float64 on the CPU;
+smaller is better. All depend on the number of rows, the unbiased ``kernel_distance`` alone excepted: compare only equal
+n. InputError: sets of other widths, too few rows, or values that are not finite."""
 
 from __future__ import annotations
 
@@ -107,7 +98,7 @@ def _unbiased(own_a: Features, own_b: Features, across: Features, a: Features, b
 
 
 def _pair(generated: ArrayLike, real: ArrayLike, fewest: int) -> tuple[Features, Features]:
-    a, b = (_checked(features, name, fewest) for features, name in ((generated, "generated"), (real, "real")))
+    a, b = _checked(generated, "generated", fewest), _checked(real, "real", fewest)
     if a.shape[1] != b.shape[1]:
         what = "two sets of features differ in width"
         raise InputError(what, expected=f"{b.shape[1]} values a row, as the real set", got=str(a.shape[1]))

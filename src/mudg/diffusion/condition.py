@@ -3,7 +3,7 @@
 `build_conditions` makes the model's input for a path of views from a fused cloud and recorded images:
 
 1. the cloud is projected into every view (z-buffer);
-2. far points that shine through gaps between near ones are removed (`core.visible`, rule `condition`);
+2. far points that shine through gaps between near ones are removed (`core.project`, rule `condition`);
 3. pixels without a measured depth get the nearest measured one; the mask of what was measured is kept;
 4. every pixel is carried by its depth into recorded images taken at about the same time, and takes their colour if it
    falls inside and is not hidden there (`warp`); elsewhere it keeps the colour of its point, or of the nearest point;

@@ -522,20 +522,11 @@ class MDM(nn.Module):
         device, shared = encoded.planes.device, self.config.shared_noise
         draw = lambda: noise.video_noise((*lead, sum(sizes), *cell), generator, shared).to(device)
         known = None if request.known is None else torch.cat([request.known[m] for m in MODALITIES], 1)[None].to(device)
-        begun = None
-        if request.start is not None:  # the latents that the sample begins from, and the freedom of their cells
-            begin = request.start
-            rgb, depth, ids = (x[None].to(device) for x in (begin.rgb, begin.depth, begin.semantics))
-            shares = self.codec.shares_to_latent(cell_shares(ids))
-            start = torch.cat([self.codec.encode_rgb(rgb), self.codec.encode_depth(depth), shares], 2)
-            begun = start, functional.max_pool2d(begin.freedom.to(device), self.codec.factor)[None]
 
         def denoise(x: Tensor, t: int) -> Tensor:
             at = torch.full((lead[0],), t, device=device)
             stated, _ = self.predict(dict(zip(MODALITIES, x.split(sizes, 2))), encoded, at)
             out = torch.cat([stated[m].float() for m in MODALITIES], 2)
-            if begun is not None:  # a pixel moves once the noise has come down to its share
-                out = torch.where(begun[1] * len(self.schedule) >= t + 1, out, begun[0])
             return out if known is None else torch.cat([known, out[:, known.shape[1] :]], 1)
 
         # around all steps: the weights are converted once

@@ -477,14 +477,6 @@ class PublishedMDM(nn.Module):
 
     # sampling -------------------------------------------------------------------------------------
 
-    @staticmethod
-    def check_request(request: SampleRequest) -> None:
-        """UsageError for a setting that does not apply to this kind of model."""
-        if request.start is not None:
-            raise UsageError(
-                "only small models can begin from a given clip", where="start", remedy="choose another model"
-            )
-
     def image_size(self, width: int, height: int, width_px: int = 0) -> tuple[int, int]:
         """Width and height the model works at: its own whatever the camera's are, or about `width_px` wide in the same
         aspect."""
@@ -503,7 +495,6 @@ class PublishedMDM(nn.Module):
         the sparse colour: the published way to continue a video. Depth and semantics are not continued. Without
         `align`, depth is what the model says.
         """
-        self.check_request(request)
         self.check_frames(len(condition.views))
         frames_at_once = self.split.frames_at_once
         half = request.bf16 and self.dtype == torch.float32

@@ -1,8 +1,8 @@
 """The interface that the two diffusion models share: requests, generated clips, and their confidence.
 
-`MDM` (`diffusion/model.py`) and `PublishedMDM` (`diffusion/published.py`) have the same methods: `check_request`,
-`check_clip`, `image_size`, and `sample`, which makes a `GeneratedClip` from a condition and a `SampleRequest`, both on
-the model's device.
+`MDM` (`diffusion/model.py`) and `PublishedMDM` (`diffusion/published.py`) have the same methods: `check_clip`,
+`image_size`, and `sample`, which makes a `GeneratedClip` from a condition and a `SampleRequest`, both on the model's
+device.
 
 Conditions are made on the CPU, and clips are used there: `generated` is the border to the model's device. It takes a
 clip's condition over once and brings back the finished clip; in between only noise, drawn on the CPU so that it is the
@@ -29,18 +29,6 @@ from mudg.networks.codec import Modality
 
 
 @dataclass(frozen=True, eq=False)
-class StartClip:
-    """What a clip is to stay like: rgb f32[T,3,H,W] in [0,1], depth f32[T,1,H,W] metres, semantics u8[T,1,H,W] (255 =
-    unknown), and freedom f32[T,1,H,W]: the share of the noise schedule, from 0 (stays) to 1 (made from noise), that
-    each pixel goes through."""
-
-    rgb: Tensor
-    depth: Tensor
-    semantics: Tensor
-    freedom: Tensor
-
-
-@dataclass(frozen=True, eq=False)
 class SampleRequest:
     """How one clip is to be generated.
 
@@ -53,8 +41,6 @@ class SampleRequest:
         guidance_rescale: published kind: share of the guided prediction whose spread is pulled back (None = the model's
             own).
         known: modality -> latents [k,C,h,w] of the clip's first k frames, from the previous window.
-        start: a clip at the size of the condition that the sample begins from, each pixel as far as its freedom says;
-            small kind.
         align: bring each frame's depth to the measured scale (`core.align`).
         bf16: run the networks in bfloat16.
     """
@@ -66,7 +52,6 @@ class SampleRequest:
     guidance: float | None = None
     guidance_rescale: float | None = None
     known: Mapping[Modality, Tensor] | None = field(default=None, repr=False)
-    start: StartClip | None = field(default=None, repr=False)
     align: bool = True
     bf16: bool = False
 

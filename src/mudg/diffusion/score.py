@@ -99,7 +99,7 @@ def score_clip(clip: Clip, sample: GeneratedClip) -> tuple[dict[str, float], Ten
     depth = torch.where(clip.depth_weight == 1, clip.depth, clips.FAR_M)
     seen = given.valid if given.warped is None else given.valid | given.warped
     backdrop = given.color if given.backdrop is None else given.backdrop
-    frames = [TrueFrame.of(*one) for one in zip(given.views, depth, ids, strict=True)]
+    frames = [TrueFrame(*one) for one in zip(given.views, depth, ids, strict=True)]
     solid = (depth < 90.0) & (ids.unsqueeze(1) != SKY)
     flat = lambda x: x.transpose(0, 1).flatten(1, 2)
     error = metrics.depth_errors(flat(sample.depth), flat(depth), flat(solid))

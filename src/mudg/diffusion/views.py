@@ -5,7 +5,7 @@ Whoever generates along a path (``synthesize``, repairs of edited views) asks a 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +26,7 @@ from mudg.diffusion.inputs import ConditionParts, ConditionSources, conditions_o
 from mudg.diffusion.memory_plan import half_format
 from mudg.diffusion.model import MDM
 from mudg.diffusion.published import PublishedMDM, WorkSplit, is_published
-from mudg.diffusion.requests import GeneratedClip, SampleRequest, StartClip, generated
+from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.networks.codec import Modality
 from mudg.scene.labels import read_label, read_trusted_classes
@@ -63,7 +63,8 @@ def check_config(config: SynthesizeConfig, fitted: bool, *, weather: bool = Fals
     config = replace(config, device=str(device))
     half_of(config)
     full_size = is_published(config.model)
-    (PublishedMDM if full_size else MDM).check_request(request_of(config))
+    if not full_size:
+        MDM.check_request(request_of(config))
     if full_size and fitted and not weather:
         raise UsageError(
             "a published-type model uses a fitted scene for weather and light of --edits only",
@@ -231,15 +232,10 @@ def recorded_pixels(scene: Scene, frame: Frame) -> NDArray[np.bool_] | None:
     return ~read_label(scene, frame, "rendered") if "rendered" in frame.labels else None
 
 
-StartAt = Callable[[Sequence[View]], StartClip]
-"""What a clip of some views, of the size that the model works at, is to stay like."""
-
-
 class ViewMaker:
     """Conditions, samples and observations of one scene at one size.
 
     Args:
-        start_at: what clips begin from, and how far they may leave it (``StartClip``).
         images: recorded images that were prepared before, for views of this size; None: none.
     """
 
@@ -248,7 +244,6 @@ class ViewMaker:
         model: DiffusionModel,
         sources: ConditionSources,
         config: SynthesizeConfig,
-        start_at: StartAt | None = None,
         images: PreparedImages | None = None,
     ) -> None:
         if not sources.recorded:
@@ -257,7 +252,6 @@ class ViewMaker:
         self._parts: ConditionParts = config.condition
         self._images = PreparedImages() if images is None else images
         self._request = request_of(config, half_of(config) == torch.bfloat16)
-        self._start_at = start_at
 
     def sized(self, view: View) -> View:
         """The view at the size that is written."""
@@ -274,24 +268,22 @@ class ViewMaker:
         spans: Sequence[range],
         first: int = 0,
         tail: Mapping[Modality, Tensor] | None = None,
-        wanted: Callable[[range], bool] = bool,
-    ) -> Iterator[tuple[int, range, tuple[GeneratedClip, Condition, list[Observation]] | None]]:
-        """The windows of a path one after another; those that are `wanted` continue the one before.
+    ) -> Iterator[tuple[int, range, tuple[GeneratedClip, Condition, list[Observation]]]]:
+        """The windows of a path one after another; each continues the one before.
 
         Args:
             first, tail: number of the window to begin with, and the latents of the one before, of an interrupted run.
 
-        Returns, of each: its number, its frames that are in none before, and what `make` gives, or None.
+        Returns, of each: its number, its frames that are in none before, and what `make` gives.
         """
         done = spans[first - 1].stop if first else 0
         for number in range(first, len(spans)):
-            span, made = spans[number], None
-            if wanted(span):
-                shared = done - span.start
-                known = {m: z[-shared:] for m, z in tail.items()} if shared and tail else None
-                made = self.make([views[i] for i in span], number, known)
+            span = spans[number]
+            shared = done - span.start
+            known = {m: z[-shared:] for m, z in tail.items()} if shared and tail else None
+            made = self.make([views[i] for i in span], number, known)
             yield number, range(done, span.stop), made
-            done, tail = span.stop, made[0].latents if made else None
+            done, tail = span.stop, made[0].latents
             del made  # before the next window is made
 
     def make(
@@ -300,8 +292,7 @@ class ViewMaker:
         """Sample window `number` at `views`; `known` latents [k,C,h,w] fix its first k frames."""
         condition, fine = conditions_of(self._given, self._parts, views, self._images)
         release_memory()  # of renders for the condition: the model needs more than they do
-        start = None if self._start_at is None else self._start_at(condition.views)
-        request = replace(self._request, index=number, known=known, start=start)
+        request = replace(self._request, index=number, known=known)
         sample, made, made_views = self._generated(condition, fine, views, request)
         usable = torch.ones_like(made.confidence, dtype=torch.bool)
         if self._model.points_alone and not recorded_at_pose(views[0], self._given.recorded):

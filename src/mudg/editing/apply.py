@@ -303,7 +303,7 @@ FACT = "edits"
 @dataclass(frozen=True, slots=True, eq=False)
 class EditedDrive:
     """What a script made of a drive. ``plan``: what was done. ``scene``, ``cloud``: edited; None where they were not
-    given. ``notes``: what the reader should know (``plan.check``)."""
+    given. ``notes``: what the reader should know, each with ``kind``, ids, numbers and a sentence ``text``."""
 
     script: EditScript
     plan: EditPlan
@@ -330,9 +330,9 @@ def carry_out(
     its objects are those that a script can name where there is no scene; its ground where there is no cloud. None: only
     scene and cloud are wanted. InputError: something in the script that cannot be done here."""
     if model is not None and conditions_of(script.canonical()) is not None and not model.classes:
-        what = "weather, light and season need the classes of surfaces, and this scene was fitted without"
+        what = "weather and light need the classes of surfaces, and this scene was fitted without"
         remedy = "fit a scene with labels (`mudg annotate` makes them), or take them out of the script"
-        raise InputError(what, where="weather, light, season", remedy=remedy)
+        raise InputError(what, where="weather, light", remedy=remedy)
     ground = ground_of(cloud, model)
     world = EditWorld.of_model(model, ground) if scene is None else EditWorld.of_scene(scene, ground)
     closes = scene is not None and scene.source.recipe is None  # a city has exact pictures of what an object hid
@@ -348,8 +348,8 @@ def carry_out(
         plan.notes.append({"kind": "street not closed", "ids": names, "text": text})
     made = None if scene is None else edited_scene(scene, plan)
     views = tuple([frame.view for frame in s.frames] if s else [] for s in (scene, made))
-    plan.sides = plans.shown_anew(plan, *views)
-    notes = plans.check(plan, *views)
+    seldom, plan.sides = plans.shown_sides(plan, *views)
+    notes = [*plan.notes, *plans.collisions(plan), *seldom]
     for note in notes:
         log.warn(f"edit: {note['text']}")
     return EditedDrive(script, plan, made, None if cloud is None else edited_cloud(cloud, plan), notes)

@@ -87,10 +87,6 @@ class ScoreConfig:
     fvd_resize: Literal["videogpt", "google", "stylegan-v"] = "videogpt"
     """How FVD's network gets its 224 x 224 pixels: shorter side and crop (videogpt), or squashed (google,
     stylegan-v)."""
-    clip_weights: str = ""
-    """File with the image tower of CLIP ViT-L/14 at 336 pixels (`model.safetensors` of
-    openai/clip-vit-large-patch14-336, or OpenAI's names). CLIP-F and CLIP-V are then computed (empty = not
-    computed)."""
     detections: str = ""
     """File with boxes that a detector found in the views, as COCO results. NTA-IoU is then computed (empty = not
     computed)."""
@@ -100,5 +96,5 @@ class ScoreConfig:
     error_pictures: bool = True
     """Write an image of the colour error at the middle view of every trajectory."""
     device: DeviceName = "auto"
-    """Device of the networks behind perceptual distance, LPIPS, FID, FVD and CLIP: auto (CUDA if there is one),
+    """Device of the networks behind perceptual distance, LPIPS, FID and FVD: auto (CUDA if there is one),
     cpu, cuda, cuda:N. All other metrics run on the CPU."""

@@ -35,7 +35,6 @@ from mudg.editing.model import Asset, classes_of_rows, lowest_points
 from mudg.editing.runs import RunParts, find_run
 from mudg.editing.script import EditScript
 from mudg.exporting.settings import ExportConfig, ImportConfig
-from mudg.formats import ncore as ncore_package
 from mudg.formats.exporters import messages, ncore
 from mudg.formats.exporters.cameras import colmap_files, nerfstudio_files, picture_names, pictures
 from mudg.formats.splats.binary import MAX_BYTES
@@ -192,7 +191,7 @@ CAMERAS: Final[Mapping[str, Callable[[Scene, PointCloud | None], dict[str, bytes
 """Formats of cameras: files beside the pictures."""
 SUFFIXES: Final = {"mcap": ".mcap", "ros2": "", "ncore": ""}
 """Formats of a log over time, and the suffix of their file; none: a folder."""
-_PACKAGES: Final = {"ncore": ncore_package.package, "mcap": messages.mcap_writer, "ros2": messages.mcap_writer}
+_PACKAGES: Final = {"ncore": ncore.package, "mcap": messages.mcap_writer, "ros2": messages.mcap_writer}
 """Formats that need a package -> what loads it."""
 MOST_POINTS: Final = 500_000
 _CAMERA_FILES: Final = ("transforms.json", "points.ply", *below("sparse/0", ("*.bin",)), "images/")
@@ -375,7 +374,7 @@ def _write_messages(name: str, records: messages.LogRecords, out: Path) -> dict[
         what, count = "messages", sum(number for _, number in topics.values())
     else:
         cameras = records.scene.cameras.items()
-        if rolling := ", ".join(name for name, camera in cameras if ncore_package.unknown_shutter(camera)):
+        if rolling := ", ".join(name for name, camera in cameras if ncore.unknown_shutter(camera)):
             log.warn(f"export: the scene does not say which way the shutters of {rolling} roll; ncore says downwards")
         largest, what, count = ncore.write_ncore(out, records)[0], "boxes", len(records.scene.tracks)
     log.info(f"export: {_counts(records)}, {count} {what}, {largest.stat().st_size / 1e6:.2f} MB in {out}")

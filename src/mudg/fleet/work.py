@@ -24,7 +24,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 
 import yaml
 
@@ -142,27 +142,16 @@ def _turn(alone: bool, stop: Stop) -> Iterator[None]:
     for name in ("door", "room"):
         store.create_once(folder / name, b"")
     with store.open_file(folder / "door") as door, store.open_file(folder / "room") as room:
-        lock(door, alone, stop)
-        lock(room, alone, stop)
+        for file in (door, room):
+            while not stop.asked:
+                try:
+                    fcntl.flock(file, (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError:
+                    time.sleep(0.1)
         if not alone:
             fcntl.flock(door, fcntl.LOCK_UN)
         yield
-
-
-def lock(file: BinaryIO, alone: bool, stop: Stop | None) -> bool:
-    """Lock an open file until it is closed, alone or together with others. False where that could not be: work is to
-    stop meanwhile, or stop is None and it is locked already."""
-    pause_s = 0.02
-    while fcntl is not None:
-        try:
-            fcntl.flock(file, (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
-            return True
-        except BlockingIOError:
-            if stop is None or stop.asked:
-                return False
-            time.sleep(pause_s)
-            pause_s = min(1.0, 2 * pause_s)
-    return True
 
 
 def last_words(text: str, code: int) -> str:

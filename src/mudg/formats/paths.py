@@ -1,14 +1,6 @@
-"""Camera paths from files: TUM and KITTI poses, and nerfstudio's ``transforms.json``.
-
-====================== ===========================================================================================
-file                   rows
-====================== ===========================================================================================
-``.txt``, 8 numbers    TUM: time, position x y z, quaternion x y z w; camera axes x right, y down, z forward
-``.txt``, 12 numbers   KITTI: the rows of world-from-camera 3x4, same axes; no times
-``.json``              nerfstudio: ``frames`` with ``transform_matrix`` (camera axes x right, y up, z back), ``time``
-====================== ===========================================================================================
-
-Places are metres in the scene's world. Where no time is given, the views are spread evenly over the log.
+"""Camera paths from files, metres in the scene's world. ``.txt`` with 8 numbers a row (TUM): time, position, quaternion
+x y z w; with 12 (KITTI): world-from-camera 3x4; camera axes x right, y down, z forward. ``.json``: nerfstudio's
+``transforms.json``, axes x right, y up, z back. Where no time is given, views are spread evenly over the log.
 """
 
 from __future__ import annotations
@@ -22,7 +14,7 @@ from numpy.typing import NDArray
 from mudg.base import geometry, log, store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Scene, Trajectory, View
-from mudg.formats.importers.kitti_files import line_numbers
+from mudg.formats.importers.kitti import line_numbers
 
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 FAR_M = 5.0

@@ -130,6 +130,9 @@ class Appearance:
         return cls({group: tuple(map(str, members)) for group, members in values.items()}, tables)
 
 
+UNCORRECTED: Final = Appearance({})
+
+
 def owner(name: str) -> str:
     """Camera of a recorded view: what stands before the last slash of its name."""
     return name.rpartition("/")[0]
@@ -197,7 +200,7 @@ class PoseEvidence:
 
 @torch.no_grad()
 def refine_poses(
-    model: SceneModel, views: Sequence[StoredView], raster: RasterConfig, appearance: Appearance | None = None
+    model: SceneModel, views: Sequence[StoredView], raster: RasterConfig, appearance: Appearance = UNCORRECTED
 ) -> float:
     """One round for every node that learns its pose, in place. Returns root mean square of the moves, metres."""
     rigid = {index: node for index, node in enumerate(model.nodes) if isinstance(node, RigidNode)}
@@ -234,7 +237,7 @@ def _add_evidence(
     outlines: dict[int, Tensor],
     evidence: dict[int, PoseEvidence],
     raster: RasterConfig,
-    appearance: Appearance | None,
+    appearance: Appearance,
 ) -> None:
     """Add what one recorded view tells about the objects in it."""
     time_s = stored.view.time_s
@@ -255,14 +258,13 @@ def _add_evidence(
 
 
 def _picture(
-    model: SceneModel, gaussians: Gaussians, stored: StoredView, raster: RasterConfig, appearance: Appearance | None
+    model: SceneModel, gaussians: Gaussians, stored: StoredView, raster: RasterConfig, appearance: Appearance
 ) -> Tensor:
     """Blurred colour ``[3, H, W]``."""
-    pose = None if appearance is None else appearance.world_from_cam(stored.view, stored.name)
+    pose = appearance.world_from_cam(stored.view, stored.name)
     drawn = rasterize(gaussians, stored.view, raster, world_from_cam=pose)
     rgb = composite_sky(model, stored.view, drawn.rgb, drawn.alpha)
-    rgb = rgb if appearance is None else appearance.colored(rgb, stored.name, "recorded")
-    return _blurred(rgb)
+    return _blurred(appearance.colored(rgb, stored.name, "recorded"))
 
 
 def _blurred(rgb: Tensor) -> Tensor:

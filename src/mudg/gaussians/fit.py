@@ -82,26 +82,24 @@ def check(config: FitConfig, *, fused: bool, virtual: bool, continued: bool) -> 
         raise UsageError(f"{config.method} needs virtual observations", remedy=remedy)
 
 
-@dataclass(frozen=True)
-class FitInputs:
-    """What a fit reads: scene and fused cloud (folders), sets of virtual views by name, and the finished fit that it
-    goes on with."""
-
-    scene: Path
-    fused: Path
-    virtual: Mapping[str, ObservationSet] = field(default_factory=dict)
-    start: storage.StartFit | None = None
-
-
-def write_fit(config: FitConfig, inputs: FitInputs, work: RunDir) -> dict[str, Any]:
-    """Fit a scene and write the model to the work folder; returns a summary. An interrupted fit goes on from its newest
-    checkpoint. NumericsError: a loss or gradient is not finite. InputError: damaged inputs."""
+def write_fit(
+    config: FitConfig,
+    scene: Path,
+    fused: Path,
+    work: RunDir,
+    virtual: Mapping[str, ObservationSet] | None = None,
+    start: storage.StartFit | None = None,
+) -> dict[str, Any]:
+    """Fit a scene, from its folder and that of its fused cloud, and write the model to the work folder; returns a
+    summary. An interrupted fit goes on from its newest checkpoint. ``virtual``: sets of virtual views by name.
+    ``start``: the finished fit that it goes on with. NumericsError: a loss or gradient is not finite. InputError:
+    damaged inputs."""
     device = drawing_device(config.device, "fit", config.raster)
     config = recipe_of(config.method).used(config)
-    if inputs.start is not None:
+    if start is not None:
         config = storage.whole_run(config)
     with one_torch_thread(), memory_of(device, "fit"):
-        state = _prepare(config, inputs, work.path).to(device)
+        state = _prepare(config, scene, fused, virtual or {}, start, work.path).to(device)
         optimise(state, config, work)
         add_certainty(state, config)
     storage.save_model(state.model, work.path)
@@ -138,16 +136,23 @@ class FitState(Progress):
         return {**counts, "seconds": round(self.seconds, 2), **(self.last or {})}
 
 
-def _prepare(config: FitConfig, inputs: FitInputs, out: Path) -> FitState:
+def _prepare(
+    config: FitConfig,
+    folder: Path,
+    clouds: Path,
+    virtual: Mapping[str, ObservationSet],
+    start: storage.StartFit | None,
+    out: Path,
+) -> FitState:
     """Read views, then continue from the newest checkpoint or build the starting model."""
-    scene, fused, start = read_scene(inputs.scene), read_fused(inputs.fused), inputs.start
+    scene, fused = read_scene(folder), read_fused(clouds)
     if not METHODS[config.method].boxes:
-        scene, fused = replace(scene, tracks=()), fused_without_boxes(scene, inputs.fused)
-    shown, classes = recorded_views(config, scene, inputs.virtual, start, out)
-    if inputs.virtual:
+        scene, fused = replace(scene, tracks=()), fused_without_boxes(scene, clouds)
+    shown, classes = recorded_views(config, scene, virtual, start, out)
+    if virtual:
         measured = views.fused_lidar(fused, scene.tracks) if config.virtual.lidar_weight else None
-        loaded = views.load_virtual(inputs.virtual, classes, measured)
-        shown = replace(shown, virtual=views.keep(loaded, sum(map(len, inputs.virtual.values())), out))
+        loaded = views.load_virtual(virtual, classes, measured)
+        shown = replace(shown, virtual=views.keep(loaded, sum(map(len, virtual.values())), out))
     found = checkpoint.latest(out / "steps")
     if found is None and start is None:
         return start_state(config, scene, fused, shown, classes)
@@ -236,7 +241,7 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
         chosen = state.views.choose(config.seed, step, probability, config.virtual.beside)
         # The one way to the device; results come back in gaussians/rendering.py.
         seen = [sizes.sized(view, step).as_tensors(state.device) for view in chosen]
-        check = FiniteCheck(step, at_once=state.device.type == "cpu")
+        check = FiniteCheck(step)
         learn = partial(_learn_from, state, config=config, raster=raster, perception=perception, check=check)
         learnt = [learn(view, step=step, first=view is seen[0]) for view in seen]
         check.refuse()

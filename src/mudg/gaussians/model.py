@@ -38,8 +38,8 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import CLASSES, ID
 from mudg.base.types import Gaussians, View
 from mudg.core import native_ops
-from mudg.core.shutter import Readout, as_read, moved_by
 from mudg.core.table import Table
+from mudg.core.trajectory import Readout, as_read, moved_by
 from mudg.gaussians.nodes import NodeRows, RigidNode, SkyNode, StaticNode
 
 NODES: Final[Mapping[str, str]] = {
@@ -237,7 +237,7 @@ def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussia
 
 def compose_as_read(model: SceneModel, view: View, readout: Readout | None, semantics: bool = True) -> Gaussians:
     """``compose`` at a view's time. With a read-out, every Gaussian is where the view's camera, standing still, sees it
-    as its rolling shutter did (``core/shutter.py``); how an object deforms meanwhile is left out."""
+    as its rolling shutter did (``core/trajectory.py``); how an object deforms meanwhile is left out."""
     gaussians = compose(model, view.time_s, semantics)
     if readout is None:
         return gaussians

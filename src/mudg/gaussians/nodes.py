@@ -488,42 +488,20 @@ class SkyNode:
     def coarse_picture(self, view: View) -> Tensor:
         """Sky colour ``[3, h, w]`` on a coarse grid of a view's pixels, to be interpolated between them (the panorama
         is far coarser than an image); differentiable in the panorama."""
-        camera = view.camera
         texel_rad = np.pi / self.rows
-        stride = int(np.clip(0.7 * texel_rad * min(camera.fx, camera.fy), 1, 8))
-        height, width = -(-camera.height // stride), -(-camera.width // stride)
-        here = self.table.device.type == "cpu"
-        grid = torch.from_numpy(self._grid(view, height, width)) if here else self._grid_there(view, height, width)
-        grid = grid.to(self.table["panorama"].dtype)
-        padded = F.pad(self.table["panorama"], (1, 1, 0, 0), mode="circular")
-        return F.grid_sample(padded, grid[None], mode="bilinear", padding_mode="border", align_corners=False)[0]
-
-    def _grid(self, view: View, height: int, width: int) -> NDArray[np.float32]:
-        """Sampling positions in the padded panorama, ``f32[height, width, 2]`` in [-1, 1]."""
-        x, y = geometry.pixel_rays(view.camera.resized(width, height))
-        # Written out: a matrix product of this shape wakes the threads of BLAS at every step of a fit.
-        right, down, ahead = view.world_from_cam[:3, 0], view.world_from_cam[:3, 1], view.world_from_cam[:3, 2]
-        rays = x[None, :, None] * right + (y[:, None, None] * down + ahead)
-        return self.panorama_grid(rays, padding=1)
-
-    def _grid_there(self, view: View, height: int, width: int) -> Tensor:
-        """As ``_grid``, computed where the panorama is, from plain numbers: nothing is copied there."""
-        camera, device = view.camera.resized(width, height), self.table.device
-        columns, rows = (torch.arange(n, dtype=torch.float64, device=device) + 0.5 for n in (width, height))
+        stride = int(np.clip(0.7 * texel_rad * min(view.camera.fx, view.camera.fy), 1, 8))
+        height, width = -(-view.camera.height // stride), -(-view.camera.width // stride)
+        camera, panorama = view.camera.resized(width, height), self.table["panorama"]
+        # computed where the panorama is, from plain numbers: nothing is copied there
+        columns, rows = (torch.arange(n, dtype=torch.float64, device=panorama.device) + 0.5 for n in (width, height))
         across, down = geometry.pinhole_ray(camera.intrinsics, columns, rows)
         pose = view.world_from_cam[:3, :3].tolist()
         x, y, z = (across * right + (down[:, None] * below + ahead) for right, below, ahead in pose)
-        span = 2 * self.rows / (2 * self.rows + 2)
         longitude, elevation = torch.atan2(y, x), torch.atan2(z, torch.hypot(x, y))
-        return torch.stack([(longitude / np.pi) * span, -2 * elevation / np.pi], -1)
-
-    def panorama_grid(self, directions_world: NDArray[np.float64], padding: int = 0) -> NDArray[np.float32]:
-        """Directions ``[..., 3]`` to panorama positions ``[..., 2]`` in [-1, 1] (x: longitude, y: from up to down)."""
-        longitude = np.arctan2(directions_world[..., 1], directions_world[..., 0])
-        elevation = np.arctan2(directions_world[..., 2], np.hypot(directions_world[..., 0], directions_world[..., 1]))
-        columns = 2 * self.rows
-        x = (longitude / np.pi) * columns / (columns + 2 * padding)
-        return np.stack([x, -2 * elevation / np.pi], -1).astype(np.float32)
+        padded, texels = F.pad(panorama, (1, 1, 0, 0), mode="circular"), 2 * self.rows
+        grid = torch.stack([(longitude / np.pi) * texels / (texels + 2), -2 * elevation / np.pi], -1)
+        grid = grid.float().to(panorama.dtype)[None]
+        return F.grid_sample(padded, grid, mode="bilinear", padding_mode="border", align_corners=False)[0]
 
     def fill(self, measured: Iterable[tuple[NDArray[np.float64], NDArray[np.float32]]]) -> None:
         """Start from measured sky colours: mean per texel; texels nobody saw take the nearest seen one's colour.
@@ -532,7 +510,9 @@ class SkyNode:
         rows, columns = self.rows, 2 * self.rows
         total, count = np.zeros((3, rows * columns)), np.zeros(rows * columns)
         for directions_world, rgb in measured:
-            grid = self.panorama_grid(directions_world)
+            longitude = np.arctan2(directions_world[:, 1], directions_world[:, 0])
+            elevation = np.arctan2(directions_world[:, 2], np.hypot(directions_world[:, 0], directions_world[:, 1]))
+            grid = np.stack([longitude / np.pi, -2 * elevation / np.pi], -1).astype(np.float32)
             column = np.clip(((grid[:, 0] + 1) / 2 * columns).astype(np.int64), 0, columns - 1)
             row = np.clip(((grid[:, 1] + 1) / 2 * rows).astype(np.int64), 0, rows - 1)
             texel = row * columns + column

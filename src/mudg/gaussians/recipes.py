@@ -1,7 +1,7 @@
 """What a published method does beyond the common loop of ``gaussians/fit.py``: its start, its own losses, what each
 step renders.
 
-A recipe is a class with the methods of ``Recipe``, which itself adds nothing, and one row in ``recipes.RECIPES``.
+A recipe is a class with the methods of ``Recipe``, which itself adds nothing, and one row in ``RECIPES``.
 """
 
 from __future__ import annotations
@@ -46,11 +46,6 @@ class DrawnView:
     raster: RasterConfig
 
     @property
-    def published_step(self) -> float:
-        """The step of the published length that this one stands for."""
-        return self.step * PUBLISHED_STEPS / self.config.iterations
-
-    @property
     def lidar(self) -> LidarPixels | None:
         """LiDAR depths of the view, if there are any."""
         return self.view.lidar if self.view.lidar is not None and len(self.view.lidar.pixel) else None
@@ -65,7 +60,8 @@ class DrawnView:
         if self.lidar is None:
             return {}
         error = losses.sparse_inverse_depth(self.inverse_depth, self.lidar.pixel, self.lidar.depth_m / SCENE_UNIT_M)
-        return {"lidar": weight * math.exp(-self.published_step / LIDAR_DECAY_STEPS) * error}
+        published_step = self.step * PUBLISHED_STEPS / self.config.iterations
+        return {"lidar": weight * math.exp(-published_step / LIDAR_DECAY_STEPS) * error}
 
 
 class Recipe:
@@ -76,6 +72,15 @@ class Recipe:
 
     def check(self, config: FitConfig, continues: bool) -> None:
         """Refuse settings that the method cannot follow. UsageError: naming the setting."""
+        unfit, weights, usual = UNFIT.get(config.method, ()), WEIGHTS.get(config.method, ()), FitConfig()
+        if continues and config.method in RECIPES:
+            raise UsageError(f"{config.method} cannot go on with a finished fit", remedy="leave out --start-from")
+        for name in (*unfit, *weights):
+            expected, got = (str(attrgetter(name)(one)) for one in (usual, config))
+            if got != expected:
+                reason = "knows nothing of it" if name in unfit else "has published weights of its own"
+                remedy = "leave the setting out, or choose --method street_gaussians"
+                raise UsageError(f"{config.method} {reason}", where=name, expected=expected, got=got, remedy=remedy)
 
     def used(self, config: FitConfig) -> FitConfig:
         """The settings with those put in that the method fixes."""
@@ -99,22 +104,6 @@ class Recipe:
     def terms(self, drawn: DrawnView) -> dict[str, Tensor]:
         """Weighted loss terms of the method, beside the common ones."""
         return {}
-
-
-class OwnRecipe(Recipe):
-    """A recipe with rules about settings: common to all that are not the common loop."""
-
-    def check(self, config: FitConfig, continues: bool) -> None:
-        """See ``Recipe``."""
-        unfit, weights, usual = UNFIT.get(config.method, ()), WEIGHTS.get(config.method, ()), FitConfig()
-        if continues:
-            raise UsageError(f"{config.method} cannot go on with a finished fit", remedy="leave out --start-from")
-        for name in (*unfit, *weights):
-            expected, got = (str(attrgetter(name)(one)) for one in (usual, config))
-            if got != expected:
-                reason = "knows nothing of it" if name in unfit else "has published weights of its own"
-                remedy = "leave the setting out, or choose --method street_gaussians"
-                raise UsageError(f"{config.method} {reason}", where=name, expected=expected, got=got, remedy=remedy)
 
 
 REPAIRED: Final = {
@@ -143,7 +132,7 @@ class RepairRecipe(Recipe):
 
 
 RECIPES: Final[Mapping[str, str]] = {
-    "gs3d": "mudg.gaussians.recipes:OwnRecipe",
+    "gs3d": "mudg.gaussians.recipes:Recipe",
     "bezier": "mudg.baselines.bezier:BezierRecipe",
     "omnire": "mudg.baselines.omnire:OmniRecipe",
     "pvg": "mudg.baselines.pvg:VibrationRecipe",

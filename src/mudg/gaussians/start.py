@@ -62,38 +62,6 @@ def neighbour_scale(xyz: NDArray[np.float32], smallest_m: float = 0.005, largest
     return np.sqrt((distance[:, 1:] ** 2).mean(1)).clip(smallest_m, largest_m).astype(np.float32)
 
 
-def columns_from_points(
-    xyz: NDArray[np.float32],
-    rgb: NDArray[np.uint8],
-    semantics: NDArray[np.uint8] | None,
-    classes: Sequence[int],
-    sh_degree: int,
-    scale_m: NDArray[np.float32] | None = None,
-) -> dict[str, Tensor]:
-    """Starting columns for ``N`` coloured points: round, colour of the point, class of the point where known. ``xyz``:
-    f32[N, 3] metres in the node's frame. ``rgb``: u8[N, 3]. ``semantics``: u8[N] train ids (255 = unknown) or None.
-    ``scale_m``: f32[N]; default from the three nearest neighbours."""
-    count = len(xyz)
-    scale = neighbour_scale(xyz) if scale_m is None else scale_m
-    logits = np.zeros((count, len(classes)), np.float32)
-    if semantics is not None:
-        for channel, train_id in enumerate(classes):
-            logits[semantics == train_id, channel] = 3.0
-    quats = np.zeros((count, 4), np.float32)
-    quats[:, 0] = 1.0
-    columns = {
-        "means": torch.from_numpy(np.array(xyz, np.float32)),
-        "quats": torch.from_numpy(quats),
-        "log_scales": torch.from_numpy(np.log(scale))[:, None].repeat(1, 3),
-        "logits": torch.full((count,), float(np.log(START_OPACITY / (1 - START_OPACITY)))),
-        "sh_dc": torch.from_numpy((rgb.astype(np.float32) / 255 - 0.5) / SH_C0)[:, None],
-        "semantics": torch.from_numpy(logits),
-    }
-    if sh_degree > 0:
-        columns["sh_rest"] = torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3)
-    return columns
-
-
 def box_grid(size_m: Sequence[float], rgb: Sequence[float]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Points on the surface of a box, for an object that the LiDAR hardly saw: xyz f32[M, 3] in the box frame, one
     colour."""
@@ -140,9 +108,22 @@ class StartPoints:
         rows = np.arange(len(self))[rows] if isinstance(rows, slice) else rows
         return StartPoints(self.xyz[rows], self.rgb[rows], self.semantics[rows], self.scale_m[rows])
 
-    def columns(self, classes: tuple[int, ...], sh_degree: int) -> dict[str, torch.Tensor]:
-        """Rows of the table of Gaussians."""
-        return columns_from_points(self.xyz, self.rgb, self.semantics, classes, sh_degree, scale_m=self.scale_m)
+    def columns(self, classes: Sequence[int], sh_degree: int) -> dict[str, Tensor]:
+        """Rows of the table of Gaussians: round, with colour and class of their point."""
+        count = len(self)
+        quats = torch.zeros(count, 4)
+        quats[:, 0] = 1.0
+        columns = {
+            "means": torch.from_numpy(np.array(self.xyz, np.float32)),
+            "quats": quats,
+            "log_scales": torch.from_numpy(np.log(self.scale_m))[:, None].repeat(1, 3),
+            "logits": torch.full((count,), float(np.log(START_OPACITY / (1 - START_OPACITY)))),
+            "sh_dc": torch.from_numpy((self.rgb.astype(np.float32) / 255 - 0.5) / SH_C0)[:, None],
+            "semantics": 3.0 * torch.from_numpy(self.semantics[:, None] == np.array(classes, np.uint8)).float(),
+        }
+        if sh_degree > 0:
+            columns["sh_rest"] = torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3)
+        return columns
 
 
 def start_model(
@@ -208,7 +189,7 @@ def mirrored_points(
 
 def _object_columns(
     node: RigidNode, cloud: PointCloud, classes: tuple[int, ...], config: FitConfig, most: int
-) -> Mapping[str, torch.Tensor]:
+) -> Mapping[str, Tensor]:
     rows = voxel_filter(cloud.xyz, 0.06)
     rows = rows[np.sort(seeds.numpy_rng(config.seed, 0, f"object {node.name}").permutation(len(rows))[:most])]
     xyz, rgb, semantics = cloud.xyz[rows], cloud.rgb[rows], _labels(cloud)[rows]

@@ -15,7 +15,7 @@ from torch import Tensor
 from mudg.base import geometry, log, seeds
 from mudg.base.types import Render, View
 from mudg.core.raster.rasterize import RasterConfig, rasterize
-from mudg.gaussians.corrections import Appearance
+from mudg.gaussians.corrections import UNCORRECTED, Appearance
 from mudg.gaussians.model import SceneModel, compose, compose_as_read, composite_sky
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.start import StartPoints, voxel_filter
@@ -58,7 +58,7 @@ def certainty_of(
     model: SceneModel,
     views: Sequence[StoredView],
     raster: RasterConfig,
-    appearance: Appearance | None = None,
+    appearance: Appearance = UNCORRECTED,
     most: int = 0,
 ) -> Tensor:
     """Certainty of every Gaussian of a model, f16[N], from recorded views, evenly chosen if there are more than
@@ -74,13 +74,13 @@ def certainty_of(
 
 
 def weight_sums(
-    model: SceneModel, view: TrainView, raster: RasterConfig, appearance: Appearance | None = None
+    model: SceneModel, view: TrainView, raster: RasterConfig, appearance: Appearance = UNCORRECTED
 ) -> Tensor:
     """``[4, N]``: over the pixels of one view, the blending weights of every Gaussian times each of
     ``difference_images``."""
     with torch.no_grad():
         gaussians = compose_as_read(model, view.view, view.readout, semantics=False)
-        pose = None if appearance is None else appearance.world_from_cam(view.view, view.name)
+        pose = appearance.world_from_cam(view.view, view.name)
     features = torch.zeros(len(gaussians), 4, device=model.device, requires_grad=True)
     render = rasterize(replace(gaussians, extra=features), view.view, raster, world_from_cam=pose)
     if render.extra is None:
@@ -91,11 +91,10 @@ def weight_sums(
 
 
 @torch.no_grad()
-def difference_images(model: SceneModel, render: Render, view: TrainView, appearance: Appearance | None) -> Tensor:
+def difference_images(model: SceneModel, render: Render, view: TrainView, appearance: Appearance) -> Tensor:
     """``[4, H, W]``: 1 where the photograph counts, and its difference from the render; 1 where LiDAR measured, and the
     relative difference (at most 1)."""
-    rgb = composite_sky(model, view.view, render.rgb, render.alpha)
-    rgb = rgb if appearance is None else appearance.colored(rgb, view.name, view.kind)
+    rgb = appearance.colored(composite_sky(model, view.view, render.rgb, render.alpha), view.name, view.kind)
     used = view.mask[0].float()
     color = (rgb - view.rgb).abs().mean(0) * used
     lidar, depth = torch.zeros_like(used), torch.zeros_like(used)

@@ -28,7 +28,7 @@ from mudg.core.fusion import largest_beam_gap
 from mudg.core.pictures import resize_area, resize_nearest
 from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import ProjectConfig, project_sparse, visible_depth
-from mudg.core.shutter import Readout, points_as_read, readout_of
+from mudg.core.trajectory import Readout, points_as_read, readout_of
 from mudg.networks.featnets import WHOLE_PIXELS
 from mudg.scene.labels import read_label
 from mudg.scene.observations import ObservationSet, list_observation_sets, read_observations
@@ -364,7 +364,7 @@ def _within(xyz: NDArray[np.float32], center: NDArray[np.float32], reach_m: floa
 
 
 def lidar_pixels(view: View, xyz_world: NDArray[np.float32], gap_deg: float) -> LidarPixels:
-    """Depth of the points that the camera sees (``core.visible``); ``gap_deg``: largest angle between neighbouring
+    """Depth of the points that the camera sees (``core.project``); ``gap_deg``: largest angle between neighbouring
     beams."""
     depth = visible_depth(view, xyz_world, HIDING_RULES["sweep"], gap_deg=gap_deg, far_m=MAX_LIDAR_M).reshape(-1)
     pixel = np.flatnonzero(np.isfinite(depth))

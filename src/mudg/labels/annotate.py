@@ -139,6 +139,49 @@ def _mark(staging: Path, frame_id: str) -> Path:
     return staging / f"{frame_id}.filled.json"
 
 
+# the own vehicle in an image: what stays the same at the bottom of the image while everything else goes by ------------
+
+FRAMES: Final = 16
+MIN_TRAVEL_M: Final = 10.0
+MIN_SHARE: Final = 0.002
+"""A piece smaller than this share of the image is no bonnet."""
+
+
+def find_ego(scene: Scene, camera: str) -> NDArray[np.bool_]:
+    """Own vehicle in the images of a camera, bool[H, W]; empty (and said so) on a drive too short to tell."""
+    frames = scene.frames_of(camera)
+    size = (scene.cameras[camera].height, scene.cameras[camera].width)
+    steps = np.diff(scene.ego.world_from_ego[:, :3, 3], axis=0)
+    travel_m = float(np.linalg.norm(steps, axis=1).sum())
+    if len(frames) < 4 or travel_m < MIN_TRAVEL_M:
+        length = f"{len(frames)} images, {travel_m:.0f} m"
+        log.warn(f"camera {camera}: the log is too short to find the own vehicle ({length})")
+        return np.zeros(size, bool)
+    at = np.unique(np.linspace(0, len(frames) - 1, FRAMES).astype(int))
+    return steady_bottom(np.stack([read_image(scene, frames[index]).mean(2) for index in at]))
+
+
+def steady_bottom(grey: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Pixels joined to the lower edge that vary much less over time than the rest of the lower half.
+
+    Args:
+        grey: [N, H, W] images over a drive, 0..255.
+
+    Returns:
+        bool[H, W].
+    """
+    middle = np.median(grey, axis=0)
+    spread = ndimage.uniform_filter(np.median(np.abs(grey - middle), axis=0), 3)
+    height, width = spread.shape
+    limit = 0.35 * float(np.median(spread[height // 2 :]))
+    steady = ndimage.binary_opening(np.pad(spread < limit, 2, mode="edge"), np.ones((5, 5), bool))[2:-2, 2:-2]
+    steady[: height // 2] = False
+    pieces, count = ndimage.label(steady)
+    sizes = np.bincount(pieces.ravel(), minlength=count + 1)
+    joined = [piece for piece in np.unique(pieces[-1]) if piece and sizes[piece] > MIN_SHARE * height * width]
+    return ndimage.binary_fill_holes(np.isin(pieces, joined)) if joined else np.zeros((height, width), bool)
+
+
 # points -------------------------------------------------------------------------------------------
 
 MAX_GAP_S = 2.0
@@ -278,7 +321,7 @@ def write_labelled(config: AnnotateConfig, scene: Path, work: RunDir) -> dict[st
 
 def wanted_labels(config: AnnotateConfig) -> set[str]:
     """Names of the labels that every frame shall have; a confidence comes only with a label that was made."""
-    optional = {"depth": config.depth, "dynamic": config.dynamic}
+    optional = {"depth": config.depth, "dynamic": config.dynamic, "ego": config.ego}
     return {"semantics", "sky", *(name for name, wanted in optional.items() if wanted)}
 
 
@@ -293,6 +336,7 @@ def _notes(config: AnnotateConfig, missing: Sequence[Frame], inputs: Mapping[str
         "sky": made_by,
         "depth": depth,
         "dynamic": "tracked boxes that move and dense depth",
+        "ego": "pixels that stay the same while the vehicle moves",
     }
     for name, origin in origins.items():
         count = sum(name in wanted_labels(config) and name not in frame.labels for frame in missing)
@@ -365,6 +409,7 @@ def label_arrays(config: AnnotateConfig, labels: Labels) -> dict[str, NDArray[An
 def _add_frames(
     config: AnnotateConfig, scene: Scene, missing: Sequence[Frame], staging: Path, writer: SceneWriter
 ) -> None:
+    ego = {name: find_ego(scene, name) for name in scene.cameras} if config.ego else {}
     lacking = {frame.id for frame in missing}
     for frame in scene.frames:
         if frame.id not in lacking:
@@ -374,4 +419,6 @@ def _add_frames(
         for name in ("semantics", "depth"):  # a confidence tells that a label was made: none beside one that was given
             if name in frame.labels:
                 arrays.pop(f"{name}_confidence", None)
+        if config.ego:
+            arrays["ego"] = ego[frame.view.camera.name]
         writer.copy_frame(scene, frame, arrays)

@@ -32,6 +32,9 @@ class AnnotateConfig:
     """Number of sweeps per LiDAR, nearest in time, whose points are merged for dense depth."""
     dynamic: bool = True
     """Write masks of dynamic objects, from the tracked boxes."""
+    ego: bool = False
+    """Write masks of the own vehicle: pixels at the bottom of the image that stay the same while it drives. Use it if
+    the bonnet is visible."""
     processes: int = setting(default=0, ge=0)
     """Number of frames labelled at the same time (0 = one per core; one if a pretrained network computes on another
     device)."""

@@ -1,9 +1,14 @@
 """A picture of a whole scene for a first look: some frames of each camera with LiDAR and boxes drawn in, and a view
-from above. Points lie on the surfaces they belong to (near ones warm, far ones cold), outlines of boxes sit on their
-objects, and standing things stay single lines from above."""
+from above.
+
+What to look for: points lie on the surfaces they belong to (edges of posts and cars), boxes sit on their objects, and
+standing things stay single lines from above. Near points are warm, far ones cold; boxes of vehicles are green, of
+people violet, of all else light blue, and the edges of their fronts red.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
@@ -11,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from mudg.base import geometry
-from mudg.base.types import Frame, Scene, View
+from mudg.base.types import Frame, Scene, Track, View
 from mudg.core.pictures import depth_colors, resize_area
 from mudg.scene.motion import VEHICLES
 from mudg.scene.read import read_image, read_points, spread, sweeps_beside
@@ -30,31 +35,36 @@ FRONT_COLOR: Final = (255, 80, 80)
 PATH_COLOR: Final = (60, 200, 255)
 _COURSE_COLOR: Final = (150, 110, 60)
 _MARGIN_M: Final = 8.0
-_TOP_SWEEPS, _TOP_POINTS = 24, 20_000
-_OUTER_PERCENT: Final = 4.0
-"""Of the points on each side that need not fit into the picture."""
 
 PEOPLE: Final = frozenset(
     "pedestrian person person_sitting cyclist rider motorcyclist bicyclist stroller wheelchair".split()
 ) | {"person (sitting)"}
 
 
-def top_view(scene: Scene, width: int, height: int) -> Image.Image:
-    """A scene from above, x to the right, y up: points of up to 24 sweeps by height above the vehicle's path (higher
-    ones over lower ones), the path, boxes at the middle of the log and their courses."""
-    parts = [np.zeros((0, 3))]
-    for sweep in spread(scene.sweeps, _TOP_SWEEPS):
-        points = read_points(scene, sweep).xyz
-        points = points[:: max(1, len(points) // _TOP_POINTS)].astype(np.float64)
-        parts.append(geometry.transform_points(sweep.world_from_lidar, points))
-    xyz = np.concatenate(parts)
-    height_m = (xyz[:, 2] - np.median(scene.ego.world_from_ego[:, 2, 3])).clip(-2.5, 4.0)
-    grey = (60 + 170 * (height_m + 2.5) / 6.5).astype(np.uint8)
-    middle_s = float(np.median(scene.ego.times_s))
-    path = scene.ego.world_from_ego[:, :3, 3]
-    places = [xyz] if len(xyz) else [track.world_from_object[:, :3, 3] for track in scene.tracks]
+def draw_top_view(
+    scene: Scene,
+    size: tuple[int, int],
+    xyz: Floats,
+    rgb: NDArray[np.uint8],
+    boxes: Mapping[str, Floats | None],
+    caption: str,
+    *,
+    dot_px: int = 1,
+    outer_percent: float = 4.0,
+) -> Image.Image:
+    """Draw a scene from above, x to the right, y up.
+
+    Args:
+        size: width and height of the picture. xyz: points f64[N, 3] in the world. rgb: their colours u8[N, 3]; higher
+            points lie over lower ones.
+        boxes: id of a track -> ``world_from_object`` of its box, or None for its course alone. caption: upper left.
+        dot_px: side of a point, pixels. outer_percent: of the points on each side that need not fit into the picture.
+    """
+    path, (width, height) = scene.ego.world_from_ego[:, :3, 3], size
+    tracks = [track for track in scene.tracks if track.id in boxes]
+    places = [xyz] if len(xyz) else [track.world_from_object[:, :3, 3] for track in tracks]
     around = np.concatenate([path[:, :2], *(one[:, :2] for one in places)])
-    low, high = np.percentile(around, [_OUTER_PERCENT, 100 - _OUTER_PERCENT], axis=0)
+    low, high = np.percentile(around, [outer_percent, 100 - outer_percent], axis=0)
     low, high = np.minimum(low, path[:, :2].min(0)) - _MARGIN_M, np.maximum(high, path[:, :2].max(0)) + _MARGIN_M
     scale = float(min(width / (high[0] - low[0]), height / (high[1] - low[1])))
     middle = (low + high) / 2
@@ -62,12 +72,14 @@ def top_view(scene: Scene, width: int, height: int) -> Image.Image:
     canvas, uv = np.full((height, width, 3), GROUND_COLOR, np.uint8), pixels(xyz)
     order = np.argsort(xyz[:, 2], kind="stable")
     order = order[((uv[order] >= 0) & (uv[order] < [width, height])).all(1)]
-    canvas[uv[order, 1].astype(int), uv[order, 0].astype(int)] = grey[order, None]
+    for down, right in np.ndindex(dot_px, dot_px):
+        rows, columns = uv[order, 1].astype(int) + down, uv[order, 0].astype(int) + right
+        canvas[rows.clip(0, height - 1), columns.clip(0, width - 1)] = rgb[order]
     image = Image.fromarray(canvas)
     draw = ImageDraw.Draw(image)
-    for track in scene.tracks:
+    for track in tracks:
         draw.line(pairs(pixels(track.world_from_object[:, :3, 3])), fill=_COURSE_COLOR)
-        pose = track.pose_at(middle_s)
+        pose = boxes[track.id]
         if pose is not None:
             corners = pixels(geometry.transform_points(pose, geometry.box_corners(track.size_m)[[0, 2, 6, 4]]))
             draw.polygon(pairs(corners), outline=box_color(track.label))
@@ -79,9 +91,7 @@ def top_view(scene: Scene, width: int, height: int) -> Image.Image:
     draw.line((10, height - 12, 10 + 10 * scale, height - 12), fill=TEXT_COLOR, width=2)
     draw.text((10, height - 28), "10 m", fill=TEXT_COLOR)
     _legend(draw, width, height)
-    draw_caption(
-        draw, f"{scene.id}: {len(scene.sweeps)} sweeps, {len(scene.tracks)} tracked boxes (at {middle_s:.1f} s)"
-    )
+    draw_caption(draw, caption)
     return image
 
 
@@ -125,8 +135,15 @@ MAX_GAP_S: Final = 0.15
 NEAR_M: Final = 0.3
 _NEAREST_M, _FARTHEST_M = 3.0, 80.0
 """Depths at the ends of the colour map."""
+_TOP_SWEEPS: Final = 24
+_TOP_POINTS: Final = 20_000
 _SPARSE: Final = 0.08
 """Points on a smaller share of a tile's pixels are drawn as dots of 2x2."""
+_SHADE: Final = (10, 10, 10)
+_SHADED_FROM_PX: Final = 24.0
+_THICKER_FROM_PX: Final = 700
+_EDGES: Final = ((0, 1), (1, 3), (3, 2), (2, 0), (4, 5), (5, 7), (7, 6), (6, 4), (0, 4), (1, 5), (2, 6), (3, 7))
+"""Pairs of corners (``geometry.box_corners``)."""
 
 
 def contact_sheet(scene: Scene) -> Image.Image:
@@ -160,10 +177,8 @@ def frame_tile(scene: Scene, frame: Frame) -> Image.Image:
     draw = ImageDraw.Draw(tile)
     for track in scene.tracks:
         pose = track.pose_at(frame.view.time_s)
-        hull = None if pose is None else geometry.box_hull(view, pose, track.size_m)
-        if hull is not None:
-            outline = pairs(hull.points[[*hull.vertices, hull.vertices[0]]])
-            draw.line(outline, fill=box_color(track.label), width=2)
+        if pose is not None:
+            draw_box(draw, view, pose, track)
     gap = f", LiDAR {1e3 * (sweeps[0].time_s - frame.view.time_s):+.0f} ms" if sweeps else ", no sweep at this time"
     split = " held out" if scene.split.get(frame.id) == "test" else ""
     draw_caption(draw, f"{frame.id}  {frame.view.time_s:.2f} s{gap}{split}")
@@ -184,3 +199,68 @@ def draw_points(pixels: NDArray[np.uint8], view: View, xyz_world: Floats) -> Non
     rows = np.minimum(uv[order, 1, None] + down, height - 1)
     columns = np.minimum(uv[order, 0, None] + right, width - 1)
     pixels[rows, columns] = depth_colors(z[order], _NEAREST_M, _FARTHEST_M)[:, None]
+
+
+def visible_edges(view: View, corners_world: Floats) -> list[tuple[int, Floats]]:
+    """Edges of a box as the camera sees them: number of the edge and its ends f64[2, 2] in pixels.
+
+    What lies nearer than ``NEAR_M``, or behind the camera, is cut off before projection. Edges that lie far outside the
+    image are left out.
+    """
+    camera = view.camera
+    xyz = geometry.transform_points(view.cam_from_world, corners_world)
+    found = []
+    for number, (a, b) in enumerate(_EDGES):
+        ends = cut_near(xyz[[a, b]])
+        if ends is None:
+            continue
+        uv = ends[:, :2] / ends[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        low, high = uv.min(0), uv.max(0)
+        if (high >= 0).all() and low[0] <= camera.width and low[1] <= camera.height and np.abs(uv).max() < 30_000:
+            found.append((number, uv))
+    return found
+
+
+def cut_near(ends: Floats) -> Floats | None:
+    """The part f64[2, 3] of a segment in camera coordinates that is farther than ``NEAR_M``; None if nothing is."""
+    z = ends[:, 2]
+    if (z < NEAR_M).all():
+        return None
+    if (z < NEAR_M).any():
+        share = (NEAR_M - z[0]) / (z[1] - z[0])
+        cut = ends[0] + share * (ends[1] - ends[0])
+        ends = np.stack([cut, ends[1]]) if z[0] < NEAR_M else np.stack([ends[0], cut])
+    return ends
+
+
+def draw_box(draw: ImageDraw.ImageDraw, view: View, world_from_object: Floats, track: Track) -> None:
+    """A box as lines in its class' colour, those of its front red; on a dark edge where it is large enough, so that
+    points do not hide it."""
+    edges = visible_edges(view, geometry.transform_points(world_from_object, geometry.box_corners(track.size_m)))
+    if not edges:
+        return
+    line = 1 + view.camera.width // _THICKER_FROM_PX
+    ends = np.concatenate([uv for _, uv in edges])
+    if np.ptp(ends, axis=0).max() > _SHADED_FROM_PX:
+        for _, uv in edges:
+            draw.line(pairs(uv), fill=_SHADE, width=line + 2)
+    for number, uv in edges:
+        front = all(corner & 4 for corner in _EDGES[number])
+        draw.line(pairs(uv), fill=FRONT_COLOR if front else box_color(track.label), width=line)
+
+
+def top_view(scene: Scene, width: int, height: int) -> Image.Image:
+    """Points of up to 24 sweeps by height above the vehicle's path, the path, boxes at the middle of the log and their
+    courses."""
+    parts = [np.zeros((0, 3))]
+    for sweep in spread(scene.sweeps, _TOP_SWEEPS):
+        points = read_points(scene, sweep).xyz
+        points = points[:: max(1, len(points) // _TOP_POINTS)].astype(np.float64)
+        parts.append(geometry.transform_points(sweep.world_from_lidar, points))
+    xyz = np.concatenate(parts)
+    height_m = (xyz[:, 2] - np.median(scene.ego.world_from_ego[:, 2, 3])).clip(-2.5, 4.0)
+    grey = np.repeat((60 + 170 * (height_m + 2.5) / 6.5).astype(np.uint8)[:, None], 3, 1)
+    middle_s = float(np.median(scene.ego.times_s))
+    caption = f"{scene.id}: {len(scene.sweeps)} sweeps, {len(scene.tracks)} tracked boxes (at {middle_s:.1f} s)"
+    boxes = {track.id: track.pose_at(middle_s) for track in scene.tracks}
+    return draw_top_view(scene, (width, height), xyz, grey, boxes, caption)

@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from mudg.base import config as configuration
-from mudg.base import log
+from mudg.base import log, store
 from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import InputError
+from mudg.base.geometry import transform_points
 from mudg.base.run_folder import RunDir
 from mudg.base.types import FusedCloud, Photo, Scene
 from mudg.core.calibration import match_cameras
@@ -30,10 +32,12 @@ from mudg.core.fusion import (
 )
 from mudg.scene.check import check_distance
 from mudg.scene.clouds import write_fused
+from mudg.scene.contact_sheet import draw_top_view
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points
 from mudg.scene.settings import FuseConfig
 
+_TOP_VIEW_PX = (1400, 1000)
 MOST_NAMED = 3
 """Objects that are left out are named up to here, then counted."""
 MOST_IMAGE_GAP_S = 0.06
@@ -43,7 +47,8 @@ MATCHED_SWEEPS, MATCHED_IMAGES, MATCHED_WITHIN_S = 8, 5, 1.0
 
 
 def write_fusion(config: FuseConfig, scene: Scene, work: RunDir) -> dict[str, Any]:
-    """Fuse a scene; writes ``static.safetensors``, ``objects/*.safetensors`` and ``fuse.json``. Returns counts."""
+    """Fuse a scene; writes ``static.safetensors``, ``objects/*.safetensors``, ``fuse.json`` and ``top.png``. Returns
+    counts."""
     for finding in check_distance(scene):
         log.warn(f"fuse: {finding.message}")
     cloud, report = fuse_scene(scene, config)
@@ -52,6 +57,7 @@ def write_fusion(config: FuseConfig, scene: Scene, work: RunDir) -> dict[str, An
     for words in describe(report, cloud.colors):
         log.info(f"fuse: {words}")
     write_fused(work.path, cloud, report_record(report, rules_of(config)))
+    store.write_image(work.path / "top.png", top_view(scene, cloud, report))
     return {"points_static": report.points_static, "objects": len(cloud.objects), "points_in": report.points_in}
 
 
@@ -167,3 +173,17 @@ def describe(report: FusionReport, cameras: CameraColors) -> list[str]:
     gains = {name: " ".join(f"{gain:.2f}" for gain in found.gain) for name, found in cameras.to_common.items()}
     to = f"brought to those of {cameras.reference}"
     return lines + [f"colours of {name} {to}: gain {gain}" for name, gain in gains.items()]
+
+
+def top_view(scene: Scene, cloud: FusedCloud, report: FusionReport) -> Image.Image:
+    """The clouds from above, dynamic objects at the middle of their tracks."""
+    middles = {track.id: track.world_from_object[len(track.times_s) // 2] for track in scene.tracks}
+    boxes = {track_id: pose for track_id, pose in middles.items() if report.verdicts[track_id].moving}
+    placed = [
+        transform_points(middles[track_id], one.xyz.astype(np.float64)) for track_id, one in cloud.objects.items()
+    ]
+    xyz = np.concatenate([cloud.static.xyz.astype(np.float64), *placed])
+    rgb = np.concatenate([cloud.static.rgb, *(one.rgb for one in cloud.objects.values())])
+    caption = f"{scene.id}: {len(xyz)} points, {len(boxes)} dynamic objects"
+    dot_px = 2 if len(xyz) < 400_000 else 1
+    return draw_top_view(scene, _TOP_VIEW_PX, xyz, rgb, boxes, caption, dot_px=dot_px, outer_percent=1.0)

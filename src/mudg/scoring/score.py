@@ -28,7 +28,7 @@ from mudg.base.records import understood
 from mudg.base.run_folder import RunDir
 from mudg.base.types import FusedCloud, Observation, Scene, View
 from mudg.base.weights import read_checkpoint
-from mudg.core import metrics, project, view_metrics
+from mudg.core import metrics, project
 from mudg.core.losses import LPIPS_EPSILON
 from mudg.core.metrics import ViewFacts
 from mudg.core.pictures import error_image, resize_nearest, resize_rgb, to_bytes
@@ -175,8 +175,8 @@ def _score(
     """Score all methods on one trajectory; writes its truth, its baseline and its error picture."""
     names = [*([BASELINE] if reference.baseline is not None else []), *trajectory.sets]
     motion, exact_motion = metrics.ExactMotion(), metrics.ExactMotion(reference.vehicles)
-    build = lambda: metrics.build_all(reference.distances, motion, view_metrics.build_facts(exact_motion))
-    sums = {name: build() for name in names} | {TRUTH: view_metrics.build_facts(exact_motion)}
+    build = lambda: metrics.build_all(reference.distances, motion, metrics.build_facts(exact_motion))
+    sums = {name: build() for name in names} | {TRUTH: metrics.build_facts(exact_motion)}
     counted = trajectory.counted(reference.held_out)
     wanted = _wanted(trajectory, reference, counted)
     truth_has: set[str] = set()
@@ -227,7 +227,7 @@ def _score(
         classes = of["miou"]
         counted = isinstance(classes, metrics.Segmentation) and int(classes.counts.sum())
         iou = {n: round(value, 4) for n, value in metrics.iou_of(classes.counts).items()} if counted else {}
-        numbers = {"values": _values(of, truth_has), "iou": iou, "details": view_metrics.details(of)}
+        numbers = {"values": _values(of, truth_has), "iou": iou}
         where = {"method": name, "trajectory": trajectory.name, "views": scored}
         results.append({**where, **numbers, "truth": dict(anchors)})
     return results
@@ -243,8 +243,7 @@ def _wanted(trajectory: ScoredTrajectory, reference: Reference, counted: Sequenc
     every_frame = {"temporal_flickering"} | ({"flicker", "warp_error"} if reference.truth.exact else set())
     needs_weights = reference.distances.keys()  # "flicker" and "temporal_flickering" want all views, in order
     usual = {name for name, row in metrics.METRICS.items() if row.build is not None}
-    usual |= {*view_metrics.FACTS, *view_metrics.PARTS}
-    usual -= {*needs_weights, "flicker", "temporal_flickering"}
+    usual = (usual | {*metrics.FACTS}) - {*needs_weights, *metrics.EVERY_VIEW}
     return [
         every_frame | (usual if n in counted else set()) | (needs_weights if n in sampled else set())
         for n in range(len(trajectory.views))
@@ -261,7 +260,7 @@ def _measured(
     if reference.baseline is not None:
         seen = {BASELINE: reference.baseline(view), **seen}
     asked = {name for of in wanted.values() for name in of}
-    if asked <= {"flicker", *view_metrics.EVERY_VIEW}:  # a view that does not count: only its neighbours need it
+    if asked <= {*metrics.EVERY_VIEW}:  # a view that does not count: only its neighbours need it
         facts = ViewFacts(instance=None if truth is None else truth.instance)
     else:
         facts = reference.facts.of(view, truth)
@@ -307,7 +306,7 @@ def pair_of(
 ) -> metrics.Pair:
     """Bring a method's view to the truth's size; where it gives no depth, it counts as the depth limit (80 m).
     ``view``: of both; without it, the truth's. ``facts``: what is known of the view beside the truth."""
-    true = None if truth is None else truth.seen
+    true, facts = None if truth is None else truth.seen, facts or ViewFacts()
     view = view or (seen.view if true is None else true.view)
     height, width = view.camera.height, view.camera.width
     depth: Tensor | None = None

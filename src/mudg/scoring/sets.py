@@ -1,6 +1,6 @@
-"""Distances of whole sets of views from the recorded video of the same camera (FID, KID, FVD), CLIP scores of videos;
-and the detectors and anchors that stand beside them. Sets are small, and FID of small sets is mostly bias: every
-trajectory also gets a floor, what the truth itself would score."""
+"""Distances of whole sets of views from the recorded video of the same camera (FID, KID, FVD); and the detectors and
+anchors that stand beside them. Sets are small, and FID of small sets is mostly bias: every trajectory also gets a
+floor, what the truth itself would score."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from torch import Tensor
 from mudg.base import log, seeds, store
 from mudg.base.devices import choose_device
 from mudg.base.errors import InputError
-from mudg.base.types import Scene, View
+from mudg.base.types import Scene
 from mudg.base.weights import read_checkpoint
 from mudg.core import feature_distances
 from mudg.core.feature_distances import frechet_distance
 from mudg.core.pictures import resize_rgb, to_bytes
 from mudg.editing.settings import ScoreConfig
-from mudg.networks import clip, i3d, inception
+from mudg.networks import i3d, inception
 from mudg.networks.featnets import LpipsFeatures, LpipsTrunk, lpips_shapes
 from mudg.scene.observations import ObservationSet, read_observations
 from mudg.scene.read import read_image
@@ -33,7 +33,7 @@ from mudg.scoring import detections
 from mudg.scoring import tables as score_tables
 from mudg.scoring.detections import BoxDetections, LaneDetections, ViewImages
 from mudg.scoring.tables import SET_SIZES
-from mudg.scoring.truth import SAME_TIME_S, Reference, ScoredTrajectory
+from mudg.scoring.truth import Reference, ScoredTrajectory
 
 # -- weights ---------------------------------------------------------------------------------------
 #
@@ -57,7 +57,6 @@ _without_counts = lambda state: {name: own for name, own in state.items() if not
 NETWORKS: Final[Mapping[str, Network]] = {
     "inception": ("--fid-weights", inception.InceptionFeatures, _without_counts),
     "i3d": ("--fvd-weights", i3d.I3DFeatures, i3d.with_known_names),
-    "clip": ("--clip-weights", clip.ClipImageFeatures, clip.with_openai_names),
     "lpips": _lpips("alex", "--lpips-weights"),
     "lpips-vgg": _lpips("vgg", "--lpips-vgg-weights"),
 }
@@ -249,7 +248,9 @@ class SetComparison:
             what, expected = "FID of sets of different size cannot be compared", "the same views for all methods"
             got = ", ".join(f"{method}: {count}" for method, count in counts.items())
             raise InputError(what, where=sets.name, expected=expected, got=got)
-        recorded = recorded_images(self._scene, sets)
+        frames = self._scene.frames_of(sets.camera) if sets.camera in self._scene.cameras else ()
+        recorded = ImageSet(len(frames), lambda number: read_image(self._scene, frames[number]))
+        recorded = recorded.resized(sets.width, sets.height)
         if not recorded.count:
             return dict.fromkeys(counts, score_tables.NO_TRUTH)
         if min(self._files.rows(count) for count in (*counts.values(), recorded.count)) < FEWEST:
@@ -276,12 +277,6 @@ class SetComparison:
     def record(self) -> dict[str, Any]:
         """How the numbers were made, and the floors, for metrics.json."""
         return {**self._facts, "floors": self._floors, "sets": self._sets}
-
-
-def recorded_images(scene: Scene, sets: TrajectorySets) -> ImageSet:
-    """All recorded images of a trajectory's camera, at the common size."""
-    frames = scene.frames_of(sets.camera) if sets.camera in scene.cameras else ()
-    return ImageSet(len(frames), lambda number: read_image(scene, frames[number])).resized(sets.width, sets.height)
 
 
 def distributions(scene: Scene, files: FeatureFiles) -> SetComparison:
@@ -380,60 +375,10 @@ def videos(scene: Scene, files: ClipFiles) -> SetComparison:
     return SetComparison(scene, files, video_entry, made, (halves, how))
 
 
-# -- embeddings ------------------------------------------------------------------------------------
-
-
-class ClipScores:
-    """CLIP-F of videos, so that all views count, and CLIP-V of their counted views. ``weights``: of CLIP's image tower.
-    ``folder``: where features are kept."""
-
-    def __init__(self, scene: Scene, weights: Path, folder: Path, device: torch.device) -> None:
-        network = clip.ClipImageFeatures(read_checkpoint(weights), str(weights)).to(device)
-        sha256 = store.sha256_file(weights)
-        prepare = functools.partial(clip.prepared, side=network.side)
-        self._scene = scene
-        self._files = EmbeddingFiles(network, prepare, network.out, f"CLIP {sha256}", folder, device)
-        self._facts = {
-            "network": f"CLIP {network.name}, projected, {network.out} values",
-            "weights_sha256": sha256,
-            "resize": "bicubic without antialiasing, squashed",
-            "reference": "recorded frames of the same camera",
-        }
-
-    def _units(self, images: ImageSet) -> NDArray[np.float64]:
-        values = self._files.of(images).astype(np.float64)
-        return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12)
-
-    def of(self, sets: TrajectorySets, counted: Sequence[int], views: Sequence[View]) -> dict[str, Entry | str]:
-        """Numbers by method, or why there are none. ``counted``: of the images, of all ``views``."""
-        sources = self._units(recorded_images(self._scene, sets))
-        frames = self._scene.frames_of(sets.camera) if len(sources) else ()
-        times, pairs = np.array([frame.view.time_s for frame in frames]), list[tuple[int, int]]()
-        for place in counted if len(times) else ():
-            nearest = int(np.argmin(np.abs(times - views[place].time_s)))
-            if abs(times[nearest] - views[place].time_s) <= SAME_TIME_S:
-                pairs.append((place, nearest))
-        found: dict[str, Entry | str] = {}
-        for method, images in sets.methods.items():
-            units = self._units(images.resized(sets.width, sets.height))
-            steps, same = (units[1:] * units[:-1]).sum(1), [float(units[a] @ sources[b]) for a, b in pairs]
-            values: dict[str, float | str] = {"clip_f": score_tables.TOO_FEW, "clip_v": score_tables.NO_TRUTH}
-            values |= {"clip_f": round(float(steps.mean()), 6)} if len(steps) else {}
-            values |= {"clip_v": round(sum(same) / len(same), 6)} if same else {}
-            found[method] = {"values": values}
-        return found
-
-    def record(self) -> dict[str, Any]:
-        """How the numbers were made, for metrics.json."""
-        return dict(self._facts)
-
-
 # -- all that is computed of whole sets ------------------------------------------------------------
 
 BASELINE: Final = "nearest_fill"
 Scored = Sequence[dict[str, Any]]
-ENTRIES: Final = {"distributions": "distribution", "videos": "video"}
-"""Entry of metrics.json that says how numbers were made -> that of a result with their sizes, where it differs."""
 
 
 @dataclass(frozen=True)
@@ -442,7 +387,7 @@ class SetScores:
     -> what compares images or clips. ``detected``: metric -> entry of a result, and what holds detections against the
     truth."""
 
-    comparisons: Mapping[str, SetComparison | ClipScores]
+    comparisons: Mapping[str, SetComparison]
     detected: Mapping[str, tuple[str, BoxDetections | LaneDetections]]
 
     def add_to(
@@ -462,15 +407,11 @@ class SetScores:
         counted, every = trajectory.counted(reference.held_out), range(len(trajectory.views))
         for name, comparison in self.comparisons.items():
             images = _sets_of(trajectory, reference, out, counted if name == "distributions" else every)
-            if isinstance(comparison, ClipScores):
-                found = comparison.of(images, counted, trajectory.views)
-            else:
-                found = comparison.of(images)
-            entry = ENTRIES.get(name, name)
+            entry, found = name.removesuffix("s"), comparison.of(images)
             for row in rows:
                 of = found[row["method"]]
                 row["values"] |= dict.fromkeys(SET_SIZES[entry], of) if isinstance(of, str) else dict(of["values"])
-                if not isinstance(of, str) and "n" in of:
+                if not isinstance(of, str):
                     row[entry] = {name: value for name, value in of.items() if name != "values"}
         for metric, (entry, source) in self.detected.items():
             _add_detected(rows, metric, entry, source, trajectory, counted, reference)
@@ -486,16 +427,14 @@ class SetScores:
 def set_scores_of(config: ScoreConfig, scene: Scene, out: Path) -> SetScores:
     """What the given weights and files allow to compute. InputError: a file is missing, damaged, or holds another
     network, or the log has no lane lines."""
-    comparisons: dict[str, SetComparison | ClipScores] = {}
-    folder, fid, fvd, clip = out / FEATURES_FOLDER, config.fid_weights, config.fvd_weights, config.clip_weights
-    device = choose_device(config.device, "networks of the scores") if fid or fvd or clip else torch.device("cpu")
+    comparisons: dict[str, SetComparison] = {}
+    folder, fid, fvd = out / FEATURES_FOLDER, config.fid_weights, config.fvd_weights
+    device = choose_device(config.device, "networks of the scores") if fid or fvd else torch.device("cpu")
     if fid:
         files = FeatureFiles(Path(fid), config.fid_resize, folder, device)
         comparisons["distributions"] = distributions(scene, files)
     if fvd:
         comparisons["videos"] = videos(scene, ClipFiles(Path(fvd), config.fvd_resize, folder, device))
-    if clip:
-        comparisons["clip"] = ClipScores(scene, Path(clip), folder, device)
     detected: dict[str, tuple[str, BoxDetections | LaneDetections]] = {}
     if config.detections:
         detected["nta_iou"] = ("nta", BoxDetections(scene, Path(config.detections)))

@@ -23,7 +23,6 @@ WEIGHT_FLAGS: Final = {
         ("--lpips-vgg-weights", "lpips_vgg"),
         ("--fid-weights", "fid kid"),
         ("--fvd-weights", "fvd"),
-        ("--clip-weights", "clip_f clip_v"),
         ("--detections", "nta_iou"),
         ("--lanes", "ntl_iou"),
     )
@@ -62,7 +61,7 @@ _DIGITS: Final = {
     **dict.fromkeys(("fid", "fvd"), 1),
     **dict.fromkeys(("psnr", "psnr_movers", "flicker", "rmse_m"), 2),
     **dict.fromkeys(("lidar_rmse_m", "lidar_psnr", "lane_psnr", "ntl_iou"), 2),
-    **dict.fromkeys(("kid", "warp_error", "temporal_flickering", "clip_f", "clip_v"), 4),
+    **dict.fromkeys(("kid", "warp_error", "temporal_flickering"), 4),
 }
 """Digits of metrics that do not have 3."""
 
@@ -149,9 +148,6 @@ def _further_rules(facts: Mapping[str, Any]) -> list[str]:
     if facts.get("lpips"):
         how = "in -1..1" if facts["lpips"]["input"] == "correct" else "unscaled, in 0..1"
         rules.append(f"LPIPS gets its colours {how}.")
-    if facts.get("clip"):
-        pairs = "CLIP-F (neighbouring views) and CLIP-V (recorded frame of the same time)"
-        rules.append(f"{pairs} are made with {facts['clip']['network']}.")
     detections = facts.get("detections", {})
     if of := detections.get("nta_iou"):
         of = f"true boxes {of['boxes']}; classes: {of['classes']}; points: {of['points']}"

@@ -32,8 +32,8 @@ from mudg.core.metrics import LaneFacts, ViewFacts
 from mudg.core.pictures import resize_nearest, resize_rgb
 from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import visible_depth
-from mudg.core.shutter import points_as_read
 from mudg.core.street_scores import VEHICLE_LABELS, visible_agents
+from mudg.core.trajectory import points_as_read
 from mudg.editing.settings import ScoreConfig
 from mudg.labels.annotate import nearest_sweeps
 from mudg.labels.evidence import driven_path, ground_near

@@ -1,8 +1,6 @@
-"""A vehicle that drives in a scene: how it moves, where the road is, who else is on it, and what it runs into and sees.
-
-The world is that of the log (metres, z up); the vehicle's frame is the log's: x forward,
-y left, z up, its origin taken for the middle of the rear axle.
-"""
+"""A vehicle that drives in a scene: how it moves, where the road is, who else is on it, what it runs into and sees. The
+world is that of the log (metres, z up); the vehicle's frame is the log's: x forward, y left, z up, its origin taken for
+the middle of the rear axle."""
 
 from __future__ import annotations
 

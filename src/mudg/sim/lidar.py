@@ -1,12 +1,6 @@
-"""A simulated LiDAR: beams into a fitted scene and into what the log's own sweeps measured.
-
-A sweep is cut into slices of its firing order. Each slice is drawn at the pose and time of its middle, so that a
-turning sensor on a moving vehicle measures what it would have measured; its beams are then placed by their own poses.
-
-With a log, a beam meets the surface that the log's sweeps measured (``sim/returns.py``), with the intensity measured
-there, or is lost as beams were lost there. Where they measured nothing, and without a log, beams meet the Gaussians,
-sampled from pinhole views.
-"""
+"""A simulated LiDAR. Each slice of a sweep is drawn at the pose and time of its middle, then its beams are placed by
+their own poses. With a log, a beam meets the surface that the log's sweeps measured, with its intensity, or is lost as
+beams were lost there (``sim/returns.py``); where they measured nothing, and without a log, it meets the Gaussians."""
 
 from __future__ import annotations
 

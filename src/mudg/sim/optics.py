@@ -1,8 +1,6 @@
-"""Lenses of simulated cameras: the ray of every pixel, and pinhole faces from which any of them is resampled.
-
-Axes are those of a camera: x right, y down, z forward; the centre of the top-left pixel is (0.5, 0.5). Rays have length
-1; NaN where the lens sees nothing.
-"""
+"""Lenses of simulated cameras: the ray of every pixel, and pinhole faces from which any of them is resampled. Axes are
+those of a camera (x right, y down, z forward); the centre of the top-left pixel is (0.5, 0.5). Rays have length 1; NaN
+where the lens sees nothing."""
 
 from __future__ import annotations
 

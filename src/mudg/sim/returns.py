@@ -1,12 +1,6 @@
 """What a log's own sweeps tell a simulated LiDAR: where surfaces are, how bright they return, and which beams are lost.
-
-Beams meet the sweeps that were taken nearest to them in place and time, those of held-out frames left out: poses drift,
-and edges seen from elsewhere lie elsewhere. Every rigid part of the world has its own nearest sweeps
-(``scene/beams.py``). What these did not measure others answer, and where none did, the Gaussians (``sim/lidar.py``).
-Beams that were lost are part of the cloud (``core/returns.py``). Whether a beam returns is a logistic regression of the
-loss around it, of that in this direction of the sensor, of range, incidence, and how well the returns around cover it,
-learnt from sweeps that are met without themselves.
-"""
+Every rigid part of the world is met in the sweeps that were taken nearest to it in place and time (``scene/beams.py``),
+then in others; held-out frames are left out. Lost beams are part of the cloud (``core/returns.py``)."""
 
 from __future__ import annotations
 
@@ -20,8 +14,7 @@ from scipy.spatial import KDTree
 from mudg.base import geometry, log
 from mudg.base.errors import UsageError
 from mudg.base.types import Scene, Sweep
-from mudg.core.returns import Met, Returns, first_surface
-from mudg.core.rows import Rows
+from mudg.core.returns import Met, Returns, Rows, first_surface
 from mudg.editing.apply import spread
 from mudg.scene.beams import WORLD, Beams, beams_of, moving_tracks, placed, returns_of, training_sweeps, with_silent
 
@@ -201,7 +194,7 @@ class LogReturns:
         return np.nan_to_num(np.stack(columns, 1))
 
     def returns(self, beams: Floats, met: Met) -> NDArray[np.bool_]:
-        """Which beams return."""
+        """Which beams return: by a logistic regression of `features`, learnt from sweeps met without themselves."""
         seen = np.isfinite(met.range_m)
         return seen if self.weights is None else seen & (self.features(beams, met) @ self.weights > 0)
 

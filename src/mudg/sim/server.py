@@ -1,9 +1,6 @@
-"""``mudg serve``: a session behind gRPC, as AlpaSim and NuRec call a renderer.
-
-The world is AlpaSim's local frame, the vehicle's rig the log's vehicle frame; microseconds are those of the scene's
-clock. Objects that a request does not list are absent, as these simulators expect. Names that the reconstruction has no
-Gaussians of (parked vehicles) are passed over: they are part of the background.
-"""
+"""``mudg serve``: a session behind gRPC, as AlpaSim and NuRec call a renderer. The world is AlpaSim's local frame, the
+vehicle's rig the log's vehicle frame; microseconds are those of the scene's clock. Objects that a request does not list
+are absent; names without Gaussians of their own (parked vehicles) are passed over: they are background."""
 
 from __future__ import annotations
 

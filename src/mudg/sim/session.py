@@ -1,9 +1,6 @@
-"""One reconstruction that answers sensor requests. No files are written, no clock runs: a reply depends on its request
-alone, so a simulator may step, rewind and ask for anything in any order; equal requests get equal bytes.
-
-The world is that of the log: metres, z up. Objects are those that the fit has Gaussians of; parked vehicles belong to
-the background unless an edit script takes them out.
-"""
+"""One reconstruction that answers sensor requests. A reply depends on its request alone (no clock, no files): equal
+requests get equal bytes, in any order. The world is that of the log: metres, z up. Objects are those that the fit has
+Gaussians of; parked vehicles belong to the background unless an edit script takes them out."""
 
 from __future__ import annotations
 

@@ -18,6 +18,7 @@ def annotate(
     device: str = 'auto',
     sweeps: int = 6,
     dynamic: bool = True,
+    ego: bool = False,
     processes: int = 0,
 ) -> Any:
     """Add missing labels to a scene: semantics, sky and depth, with confidences.
@@ -35,6 +36,7 @@ def annotate(
         device: Device of the networks of labeller and `depth_network`: auto (CUDA if there is one), cpu, cuda, cuda:N, mps.
         sweeps: Number of sweeps per LiDAR, nearest in time, whose points are merged for dense depth.
         dynamic: Write masks of dynamic objects, from the tracked boxes.
+        ego: Write masks of the own vehicle: pixels at the bottom of the image that stay the same while it drives. Use it if the bonnet is visible.
         processes: Number of frames labelled at the same time (0 = one per core; one if a pretrained network computes on another device).
     """
     ...
@@ -106,7 +108,7 @@ def convert(
     to: str | Path,
     overwrite: bool = False,
     config: str | Path | None = None,
-    network: Literal['diffusion', 'inception', 'i3d', 'clip', 'lpips', 'lpips-vgg'] = 'diffusion',
+    network: Literal['diffusion', 'inception', 'i3d', 'lpips', 'lpips-vgg'] = 'diffusion',
     resolution: Literal['auto', '320x512', '576x1024'] = 'auto',
     dtype: Literal['keep', 'float32', 'float16', 'bfloat16'] = 'keep',
     towers: str = '',
@@ -197,8 +199,8 @@ def demo(
         out: Folder to write. Repeat the same command to resume an interrupted demo.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         preset: Settings to start from. fast: smaller images, fewer frames and iterations. default: minutes on two cores. quality: 30,000 iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type model (docs/presets.md).
-        fast: The same as --preset fast, 3 m to each side: one to two minutes on 2 cores.
-        seed: Seed of the city and of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config).
+        fast: The same as --preset fast: images of a log 480 pixels wide, 3 m to each side. One to two minutes on 2 cores for the city, or 16 frames of one camera.
+        seed: Seed of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config).
         shifts_m: Lateral shifts in metres, positive to the left (not given: 2, 3 and 4 m to both sides; --fast: 3 m). They apply to synthesize, render and score.
         config: YAML file of settings, read before those given here.
         device: Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N. A step whose own device is set, as by --fit.device, keeps that one.
@@ -335,7 +337,7 @@ def fit(
 
     Args:
         scene: Scene directory written by ingest or annotate, or folder of mudg run.
-        fused: Point clouds written by fuse; required by every method but emernerf. The folder may also stand after SCENE without the flag.
+        fused: Point clouds written by fuse; required by every method but emernerf.
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         tensorboard: Also write the numbers of log.jsonl to OUT/tensorboard, for TensorBoard (needs `pip install 'mudg[track]'`).
@@ -420,7 +422,7 @@ def import_asset(
         label: Class of the object, e.g. car or pedestrian.
         length_m: Scale the object so that its box has this length (not given: the file is in metres).
         yaw_deg: Turn what the file holds by this angle about the vertical, counter-clockwise from above, so that an object looks, or a street leads, along x.
-        origin_m: With --kind scene: the place in the file that becomes the origin, after --axes and before --yaw-deg (not given: the file's own origin, or the middle of Gaussians that lie more than 16 km away). As a background of an edit script, a street begins there.
+        origin_m: With --kind scene: the place in the file that becomes the origin, after --axes and before --yaw-deg (not given: the file's own origin, or the middle of Gaussians that lie more than 16 km away).
         axes: Where x, y and z of the file point. file: as the file says, else as viewer. viewer: as programs expect of its format. world: x forward, y left, z up, as of export --axes world. Or three letters of L, R, U, D, F, B: RDF is x right, y down, z forward.
     """
     ...
@@ -565,7 +567,7 @@ def render(
 
     Args:
         scene: Scene directory that the Gaussian scene was fitted to, or folder of mudg run.
-        model: Gaussian scene written by fit, or edit. It may also follow SCENE without the flag (not given: that of the run at SCENE).
+        model: Gaussian scene written by fit, or edit (not given: that of the run at SCENE).
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         edits: Edit script (docs/edit.md) to carry out before rendering.
@@ -630,7 +632,7 @@ def run(
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         preset: Settings to start from. fast: smaller images, fewer frames and iterations. default: minutes on two cores. quality: 30,000 iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type model (docs/presets.md).
-        fast: The same as --preset fast: images of a log 480 pixels wide, 3 m to each side. One to two minutes on 2 cores for 16 frames of one camera.
+        fast: The same as --preset fast: images of a log 480 pixels wide, 3 m to each side. One to two minutes on 2 cores for the city, or 16 frames of one camera.
         seed: Seed of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config).
         cameras: Cameras for which shifted trajectories are made (not given: the first camera).
         shifts_m: Lateral shifts in metres, positive to the left (not given: 2, 3 and 4 m to both sides; --fast: 3 m). They apply to synthesize, render and score.
@@ -665,7 +667,6 @@ def score(
     fid_resize: Literal['pytorch-fid', 'tf1', 'clean', 'tm', 'neurad'] = 'pytorch-fid',
     fvd_weights: str = '',
     fvd_resize: Literal['videogpt', 'google', 'stylegan-v'] = 'videogpt',
-    clip_weights: str = '',
     detections: str = '',
     lanes: str = '',
     error_pictures: bool = True,
@@ -675,7 +676,7 @@ def score(
 
     Args:
         scene: Scene directory that the views belong to, or folder of mudg run.
-        views: Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render. They may also stand after SCENE without the flag.
+        views: Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render.
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         fused: Point clouds written by fuse. They are needed for the baseline without learning (not given: no baseline).
@@ -690,11 +691,10 @@ def score(
         fid_resize: How FID's network gets its 299 x 299 pixels: as pytorch-fid, torch-fidelity (tf1), clean-fid (clean), torchmetrics (tm) or neurad-studio (neurad) do it. Numbers of different rules cannot be compared.
         fvd_weights: File with the weights of FVD's I3D network (Kinetics-400), as safetensors, a state dict or the TorchScript archive. FVD then compares clips of 16 views with those of the recorded video of the same camera (empty = not computed).
         fvd_resize: How FVD's network gets its 224 x 224 pixels: shorter side and crop (videogpt), or squashed (google, stylegan-v).
-        clip_weights: File with the image tower of CLIP ViT-L/14 at 336 pixels (`model.safetensors` of openai/clip-vit-large-patch14-336, or OpenAI's names). CLIP-F and CLIP-V are then computed (empty = not computed).
         detections: File with boxes that a detector found in the views, as COCO results. NTA-IoU is then computed (empty = not computed).
         lanes: Folder with lane masks that a detector made of the views, METHOD/TRAJECTORY/000000.png. NTL-IoU is then computed (empty = not computed). Generated cities only: prepared logs have no lane lines.
         error_pictures: Write an image of the colour error at the middle view of every trajectory.
-        device: Device of the networks behind perceptual distance, LPIPS, FID, FVD and CLIP: auto (CUDA if there is one), cpu, cuda, cuda:N. All other metrics run on the CPU.
+        device: Device of the networks behind perceptual distance, LPIPS, FID and FVD: auto (CUDA if there is one), cpu, cuda, cuda:N. All other metrics run on the CPU.
     """
     ...
 
@@ -731,7 +731,7 @@ def synthesize(
 
     Args:
         scene: Scene directory written by ingest or annotate, or folder of mudg run.
-        fused: Point clouds written by fuse. The folder may also follow SCENE without the flag (not given: those of the run at SCENE).
+        fused: Point clouds written by fuse (not given: those of the run at SCENE).
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         fitted: Gaussian scene written by fit, without virtual views. Its renders become part of the diffusion model's input. For models that were trained with renders.

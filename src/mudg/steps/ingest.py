@@ -120,7 +120,7 @@ class Annotate(Output):
     result = "scene"
     version, files = 4, (*SCENE_FILES, "labels.html", "pictures/*.jpg", "labelled/")
     idle = ("processes",)
-    short = ("labeller", "weights", "depth_network", "device", "sweeps", "processes")
+    short = ("labeller", "weights", "depth_network", "device", "sweeps", "ego", "processes")
     scene: Annotated[Path, SCENE]
     """Scene directory written by ingest, or folder of mudg run."""
     settings: AnnotateConfig
@@ -152,7 +152,7 @@ class Fuse(Output):
     examples = ("mudg fuse scenes/city --out runs/fused",)
     smaller = "larger voxels (--voxel-m), or a shorter log (mudg ingest --frames)"
     result = "fused"
-    version, files = 3, ("static.safetensors", "objects/*.safetensors", "fuse.json")
+    version, files = 2, ("static.safetensors", "objects/*.safetensors", "fuse.json", "top.png")
     scene: Annotated[Path, SCENE]
     """Scene directory written by ingest or annotate, or folder of mudg run."""
     settings: FuseConfig

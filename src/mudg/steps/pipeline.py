@@ -7,6 +7,7 @@ OUT/report.html  OUT/viewer.html  OUT/run.yaml (settings)  OUT/run.json (state, 
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any
 from mudg.base import config as configuration
 from mudg.base import log, store
 from mudg.base.errors import InputError, IntegrityError, MudgError, UsageError, similar_path
-from mudg.base.memory import Meter, Usage, folder_bytes, in_words
+from mudg.base.memory import Usage, folder_bytes, in_words
 from mudg.base.records import ForeignRecord, Number, parse_record
 from mudg.base.run_folder import is_temporary, locked, refuse_overlap
 from mudg.base.versions import environment
@@ -110,7 +111,7 @@ def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: boo
         run_report.write_page(out, reels)
         ledger.steps["report"]["written_bytes"] = folder_bytes(page)
         ledger.save("complete")
-    text = _closing_text(out, str(source), page, ledger)
+    text = _closing_text(out, page, ledger)
     return {"report": page, "metrics": out / "score" / "metrics.json", "seconds": ledger.seconds(), "text": text}
 
 
@@ -220,7 +221,7 @@ def steps_of(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> dict
     return {name: replace(step, overwrite=overwrite) for name, step in steps.items()}
 
 
-def _closing_text(out: Path, source: str, report: Path, ledger: _Ledger) -> str:
+def _closing_text(out: Path, report: Path, ledger: _Ledger) -> str:
     """Scores, what the steps took, where the pages lie, and what to do next."""
     from mudg.scoring import score
     from mudg.viewer.report import next_commands
@@ -237,7 +238,7 @@ def _closing_text(out: Path, source: str, report: Path, ledger: _Ledger) -> str:
     viewer = out / "viewer.html"
     pages = [f"report: {report.resolve()}", *([f"viewer: {viewer.resolve()}"] if viewer.is_file() else [])]
     wanted = {"view": "fly through it", "export": "take it elsewhere", "dataset": "train on it", "run": "your own log"}
-    lines = [line for _, block in next_commands(out, source) for line in block]
+    lines = [line for _, block in next_commands(out) for line in block]
     first = {verb: next(line for line in lines if line.startswith(f"mudg {verb} ")) for verb in wanted}
     after = ["next:", *(f"  {first[verb]:<58}  {what}" for verb, what in wanted.items())]
     return "\n".join([score.summary_table(out / "score"), "", head, *rows, total, "", *pages, "", *after])
@@ -330,25 +331,23 @@ class _Ledger:
         return f"{standing}, about {left_min:.0f} min left" if share >= FORECAST_FROM and left_min >= 1 else standing
 
     def timed(self, name: str, result: Path, run: Callable[[], Any]) -> Any:
-        """Do one step, which makes a folder or file, and add its seconds, also when it is interrupted; a reused result
-        adds none. The next step begins with the memory that this one took given back."""
+        """Do one step, which makes a folder or file, and note what it took: of a folder, what its own record says. The
+        next step begins with the memory that this one took given back."""
         from mudg.core.raster.cpu import release_memory
 
-        known = self.steps.get(name, {})
-        finished = known.get("state") == "complete" and result.exists()
-        meter, state = Meter(), "interrupted"
         log.info(f"== {self._standing(name)}")
+        began_s, self.steps[name] = time.monotonic(), {"state": "interrupted"}
         try:
             made = run()
             release_memory()
-            state = "complete"
+            self.steps[name] = {"state": "complete"}
+            return made
         finally:
-            spent, earlier = meter.stop(), Usage.of_record(known)
-            if not (finished and state == "complete" and spent.seconds < earlier.seconds):
-                spent = spent if finished else earlier.then(spent)
-                self.steps[name] = {"state": state, **spent.record(), "written_bytes": folder_bytes(result)}
+            done = self.steps[name]["state"] == "complete"
+            taken = store.json_object(result / store.RUN_STATE) if done else {}
+            spent = Usage.of_record({"seconds": time.monotonic() - began_s, **taken})
+            self.steps[name] |= {**spent.record(), "written_bytes": folder_bytes(result)}
             self.save("running")
-        return made
 
     def seconds(self) -> dict[str, float]:
         """Seconds per step, in order."""

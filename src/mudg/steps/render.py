@@ -38,8 +38,7 @@ class RenderViews(Output):
     scene: Annotated[Path, Flag("SCENE", "first", "scene")]
     """Scene directory that the Gaussian scene was fitted to, or folder of mudg run."""
     model: Annotated[Path | None, Flag("FOLDER", "second", "model")] = None
-    """Gaussian scene written by fit, or edit. It may also follow SCENE without the flag (not given: that of the run at
-    SCENE)."""
+    """Gaussian scene written by fit, or edit (not given: that of the run at SCENE)."""
     edits: Annotated[Path | None, FILE_YAML] = None
     """Edit script (docs/edit.md) to carry out before rendering."""
     fused: Annotated[Path | None, Flag("FOLDER", "", "fused")] = None
@@ -97,10 +96,7 @@ class RenderViews(Output):
         return make
 
 
-_FILES = (
-    *("lpips_weights", "lpips_vgg_weights", "fid_weights", "fvd_weights", "clip_weights"),
-    *("detections", "lanes"),
-)
+_FILES = ("lpips_weights", "lpips_vgg_weights", "fid_weights", "fvd_weights", "detections", "lanes")
 """Settings that name files and folders to read."""
 
 
@@ -121,8 +117,7 @@ class Score(Output):
     fused: Annotated[Path | None, Flag("FOLDER", "", "fused")] = None
     """Point clouds written by fuse. They are needed for the baseline without learning (not given: no baseline)."""
     views: Annotated[Mapping[str, Path], Flag("NAME=FOLDER ...", "second", "views")]
-    """Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render. They may also
-    stand after SCENE without the flag."""
+    """Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render."""
     settings: ScoreConfig
     truth: Annotated[Path | None, Flag(hidden=True)] = None
     """Folder of `DrawTruth` for the scene, read instead of drawing the truth again."""

@@ -34,7 +34,7 @@ class Run(Output):
     model (docs/presets.md)."""
     fast: bool = False
     """The same as --preset fast: images of a log 480 pixels wide, 3 m to each side. One to two minutes on 2 cores for
-    16 frames of one camera."""
+    the city, or 16 frames of one camera."""
     seed: Annotated[int | None, Flag("INT")] = None
     """Seed of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config)."""
     cameras: tuple[str, ...] = ()
@@ -69,15 +69,6 @@ class Demo(Run):
     cameras: Annotated[tuple[str, ...], Flag(hidden=True)] = ()
     out: Annotated[Path, Flag()] = Path("mudg_demo")
     """Folder to write. Repeat the same command to resume an interrupted demo."""
-    preset: PresetName | None = None
-    """Settings to start from. fast: smaller images, fewer frames and iterations. default: minutes on two cores.
-    quality: 30,000 iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type
-    model (docs/presets.md)."""
-    fast: bool = False
-    """The same as --preset fast, 3 m to each side: one to two minutes on 2 cores."""
-    seed: Annotated[int | None, Flag("INT")] = None
-    """Seed of the city and of all random numbers in all steps (not given: city 3 and seed 0, or the values in
-    --config)."""
 
 
 OUT = Flag("OUT", "first")

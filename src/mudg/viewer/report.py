@@ -1,8 +1,6 @@
-"""The report: one self-contained page of a finished run. Needs no network and works by double click.
-
-Each trajectory becomes one H.264 video that holds all panels (columns: truth and methods; rows: colour, depth, classes,
-colour error), so that the panels can never run apart; the page cuts them out of it.
-"""
+"""The report: one self-contained page of a finished run, without a network, by double click. Each trajectory becomes
+one H.264 video that holds all panels (columns: truth and methods; rows: colour, depth, classes, colour error), so that
+they never run apart; the page cuts them out of it."""
 
 from __future__ import annotations
 
@@ -46,11 +44,10 @@ from mudg.scoring.tables import (
 GUIDED: Final = "fit/mudg_s"
 
 
-def next_commands(out: Path, source: str) -> list[tuple[str, tuple[str, ...]]]:
+def next_commands(out: Path) -> list[tuple[str, tuple[str, ...]]]:
     """What a run can be used for, as (title, lines). Each block works by itself, in the folder from which the run was
     started."""
     run = str(out)
-    scene = next((f"{out}/{name}" for name in ("annotate", "scene") if (out / name / "scene.json").is_file()), source)
     try:  # an object that an edit script can name
         nodes = store.read_json(out / GUIDED / "model.json")["nodes"]
         movable = next((str(node["name"]) for node in nodes if "label" in node), "")
@@ -65,7 +62,7 @@ def next_commands(out: Path, source: str) -> list[tuple[str, tuple[str, ...]]]:
     files = [["export", kind, run, "--out", f"{run}.{kind}"] for kind in ("ply", "usdz")]
     if movable:
         files.append(["asset", "export", run, movable, "--out", f"{run}_object.safetensors"])
-    views = ["render", scene, "--model", f"{run}/{GUIDED}", "--shifts-m", "1.5", "--out", f"{run}_views"]
+    views = ["render", run, "--shifts-m", "1.5", "--out", f"{run}_views"]
     blocks = [
         ("Fly through the scene in a browser; the second line compares both fits", [["view", run], ["view", run, run]]),
         ("One page to send to others", [["page", run, "--out", f"{run}.html"]]),
@@ -93,7 +90,7 @@ GROUPS: Final = (
     ("Classes", ("miou", "accuracy")),
     ("At LiDAR points", ("lidar_abs_rel", "lidar_rmse_m", "lidar_delta1", "lidar_psnr", "agreement")),
     ("Vehicles and lanes", ("agent_iou", "lane_iou", "lane_correlation", "lane_psnr", "nta_iou", "ntl_iou")),
-    ("Steadiness", ("warp_error", "temporal_flickering", "clip_f")),
+    ("Steadiness", ("warp_error", "temporal_flickering")),
 )
 OPTIONAL: Final = frozenset({"At LiDAR points", "Vehicles and lanes", "Steadiness"})
 """Groups that are left out, and distances of them, where no method has a number."""
@@ -163,7 +160,7 @@ def page(
         settings=settings,
         provenance=_provenance(scores, ledger),
         curves=curves,
-        next_commands=next_commands(out, str(ledger.get("asked", {}).get("source", "LOG"))),
+        next_commands=next_commands(out),
         **_player_values(scores, videos, columns),
         **_score_values(scores),
         **_time_values(ledger),

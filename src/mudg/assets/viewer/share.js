@@ -17,7 +17,7 @@ export function save(blob, name) {
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
 }
 
-export const nameOf = (app, end) => `${app.facts.title.replace(/[^\w.-]+/g, "_")}_${app.state.layer}_${app.state.t.toFixed(2)}s.${end}`;
+const nameOf = (app, end) => `${app.facts.title.replace(/[^\w.-]+/g, "_")}_${app.state.layer}_${app.state.t.toFixed(2)}s.${end}`;
 
 /** What is shown, `times` as large, on a canvas of its own; boxes and points are drawn on it as on the page. */
 function sheetOf(app, times) {
@@ -45,7 +45,7 @@ export async function savePicture(app, times) {
 }
 
 /** How many pictures a drive has. */
-export const framesOf = (app) => Math.floor(app.facts.end_s * FRAMES_PER_S + 1e-6) + 1;
+const framesOf = (app) => Math.floor(app.facts.end_s * FRAMES_PER_S + 1e-6) + 1;
 
 /** Saves the whole drive as pictures in an archive: each is drawn in full, however long that takes. Asked for once more, it ends early. */
 export async function saveFrames(app, say) {

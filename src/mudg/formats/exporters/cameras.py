@@ -1,8 +1,6 @@
-"""Cameras and images of a log as a binary COLMAP model, with one rig of all cameras.
-
-Poses are camera from world, axes x right, y down, z forward, pixel centres at 0.5: those of this program. Images that
-the rig took at one time and whose poses agree with it are one frame; any other image is a frame by itself, so that
-every image has exactly its own pose.
+"""Cameras and images of a log for programs that train on them: nerfstudio's ``transforms.json``, and a binary COLMAP
+model with one rig. Images that the rig took at one time and whose poses agree with it are one frame; any other image is
+a frame by itself, so that every image has exactly its own pose.
 """
 
 from __future__ import annotations
@@ -36,10 +34,6 @@ def pictures(scene: Scene) -> Iterator[tuple[str, bytes]]:
 
 
 # nerfstudio ---------------------------------------------------------------------------------------
-#
-# Cameras and images of a log as a nerfstudio data set: ``transforms.json``, pictures, starting points.
-#
-# Poses are camera-to-world with x right, y up, z back; the world is that of this program, z up.
 
 
 FLIP: Final = np.diag([1.0, -1.0, -1.0, 1.0])

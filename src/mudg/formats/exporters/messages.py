@@ -1,7 +1,4 @@
-"""A driving log as records over time, and as messages of ROS 2 in an MCAP file or a bag.
-
-Times count from the first record. Pictures and sweeps are read when they are written, one at a time.
-"""
+"""A driving log as records over time, and as messages of ROS 2 in an MCAP file or a bag (docs/reference/export.md)."""
 
 from __future__ import annotations
 
@@ -174,17 +171,9 @@ def write_mcap(path: Path, messages: Ros2Messages) -> tuple[dict[str, tuple[str,
 
 # ros2 ----------------------------------------------------------------------------------------------
 #
-# Written without ROS: the package rosbags gives types and bytes of messages. Its own writer begins with bags of version
-# 8, which Humble does not read.
-#
-#     /tf  /tf_static  /ego/path (once)  /ego/pose  /camera/NAME/image/compressed  /camera/NAME/camera_info
-#     /lidar/NAME/points
-#     /objects/markers  /objects/detections  /points (fused, once)
-#
 # Frames (REP 103, REP 105): ``map``, ``base_link`` (the vehicle), ``camera_NAME_optical`` (x right, y down, z forward),
-# ``lidar_NAME``. A sensor whose place on the vehicle is fixed hangs on ``base_link`` by /tf_static, any other on
-# ``map`` by /tf. Principal points count from the centre of the first pixel, as OpenCV's do: half a pixel less than in
-# this program.
+# ``lidar_NAME``. Principal points count from the centre of the first pixel: half a pixel less than in this program.
+# rosbags' own writer begins with bags of version 8, which Humble does not read.
 
 
 START_S: Final = 1

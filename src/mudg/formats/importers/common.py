@@ -3,7 +3,9 @@ finding the files of a log. The scene is the same for any number of workers."""
 
 from __future__ import annotations
 
+import lzma
 import re
+import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -113,6 +115,22 @@ def arrow_files(path: Path) -> Iterator[None]:
         raise InputError(what, where=str(path), remedy=remedy, got=str(error)[:200] or "it ends early") from error
 
 
+def unpacked(unpacker: Any, packed: bytes | memoryview, most: int, what: str, where: str) -> bytes:
+    """What a decompressor of ``zlib`` or ``lzma`` makes of all bytes, ``most`` at most; ``what`` they are, for
+    messages. Raises InputError: damaged, cut off, or more than that."""
+    try:
+        content = unpacker.decompress(packed, most + 1)
+    except (zlib.error, lzma.LZMAError, EOFError) as error:
+        raise InputError(f"{what} is damaged", where=where, got=str(error), remedy="copy the file again") from error
+    if len(content) > most:
+        got = f"{len(packed)} bytes"
+        raise InputError(f"{what} unpacks to too much", where=where, got=got, expected=f"at most {most} bytes")
+    if not unpacker.eof:
+        got = f"{len(packed)} bytes, no end"
+        raise InputError(f"{what} is cut off", where=where, got=got, remedy="copy the file again")
+    return content
+
+
 # --- options --------------------------------------------------------------------------------------
 Resolution = int | tuple[int, int]
 """Longest side in pixels, or width and height."""
@@ -125,8 +143,7 @@ class ImportOptions:
     Args:
         frames: source frame numbers ``(first, end)``, end not included; None takes all.
         cameras: the dataset's camera names; empty takes the importer's default.
-        sequence: which sequence or frame of a folder that holds many.
-        poses, boxes: files to use instead of those found by looking.
+        sequence: which sequence of a folder that holds many. poses, boxes: files to use instead of those found.
         skip_missing: leave out frames of which an image, scan or vehicle pose is missing, instead of refusing.
         untwist: undo the distortion of scans by the vehicle's motion; auto decides by what the dataset documents.
         test_every: hold out every n-th frame of all cameras (n, 2n, ...); 0 holds out none.

@@ -31,11 +31,7 @@ from mudg.base import log, memory, store
 from mudg.base.errors import InputError, MudgError
 from mudg.base.geometry import all_rigid, from_rotation_translation
 from mudg.base.types import Camera, EgoPath, Scene, Shutter, Source, SweepPoints, Track
-from mudg.formats.importers import common
-from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
-from mudg.formats.importers.drive_log import BoxTracks, CameraOptics, DriveLog, ImageRecord, SweepRecord, write_log
-from mudg.formats.importers.images import Lens
-from mudg.formats.ncore import (
+from mudg.formats.exporters.ncore import (
     ABOUT,
     EGO_MASK,
     EULER,
@@ -50,6 +46,10 @@ from mudg.formats.ncore import (
     close,
     package,
 )
+from mudg.formats.importers import common
+from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
+from mudg.formats.importers.drive_log import BoxTracks, CameraOptics, DriveLog, ImageRecord, SweepRecord, write_log
+from mudg.formats.importers.images import Lens
 from mudg.formats.unknown_fields import known, note_unknown, note_unknown_within
 
 # container ----------------------------------------------------------------------------------------
@@ -198,18 +198,7 @@ def _unpacked(packed: bytes, where: str) -> bytes:
     """An xz file that is not larger than such metadata can be."""
     most = max(_LEAST_UNPACKED, _MOST_GROWTH * len(packed))
     unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_XZ_MEMORY)
-    try:
-        content = unpacker.decompress(packed, most + 1)
-    except (lzma.LZMAError, EOFError) as error:
-        what = "compressed metadata are damaged"
-        raise InputError(what, where=where, got=str(error), remedy="copy the file again") from error
-    if len(content) > most:
-        what = "compressed metadata unpack to more than metadata can be"
-        raise InputError(what, where=where, got=f"{len(packed)} bytes", expected=f"at most {most} bytes when unpacked")
-    if not unpacker.eof:
-        what = "compressed metadata are cut off"
-        raise InputError(what, where=where, got=f"{len(packed)} bytes", remedy="copy the file again")
-    return content
+    return common.unpacked(unpacker, packed, most, "compressed metadata", where)
 
 
 def _cbor(content: bytes, where: str) -> Any:

@@ -94,17 +94,7 @@ def read_frame(path: Path) -> dict[str, NDArray[Any]]:
 
 def gunzip(content: bytes, where: str) -> bytes:
     """Unpack gzip, not beyond ``MAX_BYTES``. Raises InputError: cut off, damaged, or larger than that."""
-    unpacker = zlib.decompressobj(wbits=31)
-    try:
-        unpacked = unpacker.decompress(content, MAX_BYTES + 1)
-    except zlib.error as error:
-        raise InputError("gzip file is damaged", where=where, got=str(error), remedy="copy the file again") from error
-    if len(unpacked) > MAX_BYTES:
-        raise InputError("gzip file unpacks to too much", where=where, expected=f"<= {MAX_BYTES} bytes")
-    if not unpacker.eof:
-        what = "gzip file is cut off"
-        raise InputError(what, where=where, got=f"{len(content)} bytes, no end", remedy="copy the file again")
-    return unpacked
+    return common.unpacked(zlib.decompressobj(wbits=31), content, MAX_BYTES, "gzip file", where)
 
 
 def parse_frame(content: bytes, where: str) -> dict[str, NDArray[Any]]:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mudg.base import log, store
 from mudg.base.errors import InputError
 from mudg.base.geometry import yaw_matrix
-from mudg.formats.importers.common import arrow_files, require_columns, rigid_pose
+from mudg.formats.importers.common import arrow_files, require_columns, rigid_pose, unpacked
 from mudg.formats.unknown_fields import note_unknown
 
 Matrix = NDArray[np.float64]
@@ -186,14 +186,7 @@ def _frame(
 def range_image(packed: bytes | memoryview, channels: int, where: str) -> NDArray[np.float32]:
     """A zlib-packed matrix of floats as f32[H, W, channels]. Raises InputError: damaged, too large, or of another
     shape."""
-    unpacker = zlib.decompressobj()
-    try:
-        content = unpacker.decompress(packed, MAX_UNPACKED_BYTES)
-    except zlib.error as error:
-        raise InputError("range image cannot be unpacked", where=where, got=str(error)) from error
-    if not unpacker.eof:
-        what = "range image unpacks to more than any has" if unpacker.unconsumed_tail else "range image is cut off"
-        raise InputError(what, where=where, expected=f"at most {MAX_UNPACKED_BYTES} bytes", got=f"{len(content)} bytes")
+    content = unpacked(zlib.decompressobj(), packed, MAX_UNPACKED_BYTES, "range image", where)
     values = parse_message(content, MATRIX_FLOAT, where)
     return _shaped(values["data"], values.get("shape", {}).get("dims", ()), channels, where)
 

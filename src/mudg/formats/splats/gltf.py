@@ -1,7 +1,5 @@
-"""glTF 2.0 with KHR_gaussian_splatting, as one GLB file; objects are nodes of their own, which an animation moves.
-
-Axes: y up; (x, y, z) of this program is (x, z, -y). Quaternions x, y, z, w; scales in metres; opacities 0 to 1; one
-accessor per harmonic. An animation's times begin at 0. Where an object does not exist, its node has the scale `HIDDEN`.
+"""glTF 2.0 with KHR_gaussian_splatting, as one GLB file, y up: (x, y, z) of this program is (x, z, -y). Objects are
+nodes of their own, which an animation from 0 s on moves; where one does not exist, its node has the scale ``HIDDEN``.
 """
 
 from __future__ import annotations
