@@ -20,7 +20,6 @@ from mudg.base.palette import ID
 from mudg.base.types import Camera, FusedCloud, PointCloud, Track, View
 from mudg.baselines.bezier import BezierNode
 from mudg.baselines.omnire import DeformedNode
-from mudg.city import layout as rec
 from mudg.city.config import CityConfig
 from mudg.city.world import CityWorld
 from mudg.core import edit
@@ -523,9 +522,9 @@ def test_the_ready_scripts_fit_the_demo(repository: Path) -> None:
         assert not [found for found in collisions(plan) if "ego" in found["ids"]]
 
 
-def test_the_city_is_drawn_again_with_an_object_elsewhere_or_with_another_look() -> None:
+def test_the_city_is_drawn_again_with_an_object_elsewhere() -> None:
     size = {"n_frames": 4, "width": 64, "height": 40}
-    city, other = (CityWorld(CityConfig(seed=DEMO_CITY + more, **size)) for more in (0, 1))
+    city = CityWorld(CityConfig(seed=DEMO_CITY, **size))
     frame = city.frame_views("front")[1]
     truth = city.render(frame)
     number = int(np.bincount(truth.instance.ravel())[1:].argmax()) + 1
@@ -535,23 +534,12 @@ def test_the_city_is_drawn_again_with_an_object_elsewhere_or_with_another_look()
     poses = Motion.recorded(track.times_s, track.world_from_object).poses
     yaws = np.unwrap([geometry.yaw_of(pose) for pose in poses])
     keys = np.column_stack([poses[:, :2, 3], poses[:, 2, 3] - track.size_m[2] / 2, yaws])
-    for same in (city.rearranged({track.id: keys}), city.recast(track.id, city.objects[number - 1])):
-        assert np.array_equal(same.render(frame).rgb, truth.rgb)
+    assert np.array_equal(city.rearranged({track.id: keys}).render(frame).rgb, truth.rgb)
     away = city.rearranged({track.id: keys + np.array([0, 0.5, 0, 0])}).render(frame)
     assert 0 < ((away.instance == number) ^ (truth.instance == number)).sum()
-    look = next(posed for posed in other.objects if posed.row[0] == rec.VAN)
-    recast = city.recast(track.id, look)
-    mine = recast.tracks()[number - 1]
-    assert np.allclose(mine.size_m, look.size)
-    assert np.allclose(mine.world_from_object[:, :2, 3], track.world_from_object[:, :2, 3])
-    seen = recast.render(frame)
-    assert (seen.instance == number).any() and (seen.rgb != truth.rgb).any()
-    gone = (recast.rearranged({mine.id: None}), city.rearranged({track.id: None}))
-    assert np.array_equal(*(world.render(frame).rgb for world in gone))
     assert np.array_equal(city.render(frame).rgb, truth.rgb)  # the city itself stays
-    for change in (lambda: city.rearranged({"car-999": None}), lambda: city.recast("car-999", look)):
-        with pytest.raises(UsageError, match="no such object"):
-            change()
+    with pytest.raises(UsageError, match="no such object"):
+        city.rearranged({"car-999": None})
 
 
 def test_scripts_run_on_a_fitted_scene_alone(tmp_path: Path) -> None:

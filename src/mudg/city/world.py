@@ -254,34 +254,17 @@ class CityWorld:
         """The same world, light and shadows included, with some vehicles or people elsewhere or gone. ``keys``: track
         id -> x, y, z of the point on the ground below the box's centre, yaw f64[K, 4] at ``key_times_s``; None: not
         there."""
-        moved = self._keys.copy()
+        moved, known = self._keys.copy(), [track.id for track in self.tracks()]
         for track_id, values in keys.items():
-            index = self._index_of(track_id)
+            if track_id not in known:
+                raise UsageError("the city has no such object", expected=", ".join(known), got=track_id)
+            index = known.index(track_id)
             if values is None:
                 moved[:, index, 2] = -FAR_BELOW_M
             else:
                 moved[:, index] = values
         other = copy.copy(self)
         other._keys = moved
-        return other
-
-    def _index_of(self, track_id: str) -> int:
-        known = [track.id for track in self.tracks()]
-        if track_id not in known:
-            raise UsageError("the city has no such object", expected=", ".join(known), got=track_id)
-        return known.index(track_id)
-
-    def recast(self, track_id: str, look: PosedObject) -> CityWorld:
-        """The same world, light and shadows included, with another object on the path of a vehicle or person; ``look``:
-        whose shape, size and paint it gets. UsageError: the city has no such object."""
-        index = self._index_of(track_id)
-        mine = self.objects[index]
-        objects = list(self.objects)
-        objects[index] = PosedObject([*look.row[:-1], mine.row[-1]], mine.keys, look.gait_rad_per_s, mine.moving)
-        other = copy.copy(self)
-        other.objects = tuple(objects)
-        other._gaits = np.array([m.gait_rad_per_s for m in objects], np.float64)
-        other._handle = other._native_world()
         return other
 
     def source(self) -> Source:

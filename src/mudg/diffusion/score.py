@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -52,14 +52,12 @@ def score(
     folder: Path | clips.ShardSource,
     request: SampleRequest,
     *,
-    prepare: Callable[[Clip], Clip] | None = None,
     picture: Path | None = None,
 ) -> dict[str, Any]:
     """Generate all clips of some cities and compare with the truth.
 
     Args:
         request: how clips are sampled; the index is put in for each.
-        prepare: changes each clip before it is used, for example `without_classes`.
 
     Returns {"average": scores over the shifted clips, "by_shift": {shift: scores}, "clips": n, "steps": request.steps}.
     Keys as in `SCORES`; classes are pooled over all clips before the IoU. Draws a grid of up to 6 clips into `picture`.
@@ -71,7 +69,6 @@ def score(
         for number in range(clips.clips_in(folder, city)):
             frames = range(min(model.config.window, clips.frames_in(folder, city)))
             clip = clips.read_clip(folder, city, number, frames)
-            clip = clip if prepare is None else prepare(clip)
             sample = generated(model, clip.condition, replace(request, index=city * 16 + number))
             name = "recorded" if clip.shift_m == 0 else f"{abs(clip.shift_m):.0f} m"
             row, matrix = score_clip(clip, sample)
@@ -85,11 +82,6 @@ def score(
     shifted = [n for n in rows if n != "recorded"] or list(rows)
     pooled = _average([r for n in shifted for r in rows[n]], sum(counts[n] for n in shifted))
     return {"average": pooled, "by_shift": by_shift, "clips": sum(map(len, rows.values())), "steps": request.steps}
-
-
-def without_classes(clip: Clip) -> Clip:
-    """The clip as of a log without labels: no class comes with the condition."""
-    return replace(clip, condition=replace(clip.condition, semantics=None, backdrop_semantics=None))
 
 
 def score_clip(clip: Clip, sample: GeneratedClip) -> tuple[dict[str, float], Tensor]:
