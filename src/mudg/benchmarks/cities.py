@@ -38,11 +38,11 @@ from mudg.core.losses import lpips_distance, unit_features
 from mudg.core.raster.rasterize import drawing_device, rasterize
 from mudg.diffusion import city_clips as from_city
 from mudg.diffusion import model_files as mdm_files
-from mudg.diffusion import score as learn_score
-from mudg.diffusion.city_clips import CityClipRules, fit_city
-from mudg.diffusion.memory_plan import choose_bf16
+from mudg.diffusion import models as learn_score
+from mudg.diffusion.city_clips import CityClipRules
+from mudg.diffusion.clips import ShardFolder
 from mudg.diffusion.model import MDM
-from mudg.diffusion.requests import SampleRequest
+from mudg.diffusion.requests import SampleRequest, half_format
 from mudg.editing.apply import carry_out, complete_asset, drawer, write_asset
 from mudg.editing.model import linear_of
 from mudg.editing.script import parse_edits
@@ -59,13 +59,13 @@ from mudg.scene.settings import FuseConfig
 def measure_mdm(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
     """Scores of the model at every number of steps, with and without classes; numbers and tables."""
     device = choose_device(config.device, "diffusion model", NETWORK_KINDS)
-    bf16 = choose_bf16(config.precision, device)
+    bf16 = half_format(config.precision, device) is not None
     request = SampleRequest(1, config.seed, eta=config.eta, bf16=bf16)
     MDM.check_request(request)
     model = mdm_files.load(config.model).to(device)
     cities = from_city.LISTS[config.cities][: config.count]
     rules = CityClipRules(window=model.config.window, fitted=model.config.renders)
-    from_city.write_missing(rules, cities, out / "clips", fit_city if rules.fitted else None)
+    from_city.write_missing(rules, cities, out / "clips")
     result: dict[str, Any] = {"cities": list(cities), "model": mdm_files.digest(config.model), "bf16": bf16, "rows": []}
     lines = [f"# Diffusion model on {len(cities)} held-out cities ({config.cities} list), exact truth", ""]
     with log.task("scoring", 2 * len(config.steps)) as bar:
@@ -73,7 +73,9 @@ def measure_mdm(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
             picture = out / f"steps_{steps}_{'classes' if given else 'plain'}.png"
             prepare, started = None if given else learn_score.without_classes, time.perf_counter()
             sampled = replace(request, steps=steps)
-            scores = learn_score.score(model, cities, out / "clips", sampled, prepare=prepare, picture=picture)
+            scores = learn_score.score(
+                model, cities, ShardFolder(out / "clips"), sampled, prepare=prepare, picture=picture
+            )
             seconds = (time.perf_counter() - started) / scores["clips"]
             row = {"steps": steps, "given_classes": given, "seconds_per_clip": round(seconds, 2), "scores": scores}
             result["rows"].append(row)

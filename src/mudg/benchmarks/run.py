@@ -21,7 +21,7 @@ from mudg.benchmarks import cities, loop, paper, real, shift
 from mudg.benchmarks.rows import changed_settings, generator_of
 from mudg.benchmarks.settings import BenchConfig, bench_preset
 from mudg.diffusion import model_files
-from mudg.diffusion.published import is_published
+from mudg.diffusion.model_files import is_published
 from mudg.gaussians.settings import FitConfig
 from mudg.steps.pipeline import refuse_missing
 from mudg.steps.settings import PresetName

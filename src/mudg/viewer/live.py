@@ -22,7 +22,7 @@ from mudg.base.records import Number, StrictRecord, parse_record
 from mudg.base.types import Camera, FusedCloud, Scene, View
 from mudg.core.pictures import class_colors, depth_colors, to_bytes
 from mudg.core.table import Table
-from mudg.diffusion.inputs import InWeather
+from mudg.diffusion.condition import InWeather
 from mudg.editing.apply import (
     FACT,
     Drawer,

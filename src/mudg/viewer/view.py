@@ -20,7 +20,7 @@ from mudg.base.run_folder import ResultFile, refuse_overlap
 from mudg.base.types import FusedCloud, Scene
 from mudg.core.edit import HeightMap
 from mudg.core.raster.rasterize import drawing_device
-from mudg.diffusion.synthesize import JobInputs
+from mudg.diffusion.views import JobInputs
 from mudg.editing.apply import SEED, ground_of
 from mudg.editing.render import RenderMixer, check_as_recorded
 from mudg.editing.runs import RunParts, find_run
