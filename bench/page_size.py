@@ -208,13 +208,8 @@ def main() -> None:
         say(f"made                in {time.monotonic() - began:.1f} s ({laid_out:.1f} s of it choosing and ordering)")
         say(f"memory              {memory_mb('VmHWM') - before:.0f} MB at most beside the scene's {before:.0f} MB")
         each = made["bytes"] / page.scenes[0][1].kept
-        say(
-            f"size                {made['bytes'] / 1e6:.1f} MB in {page.chunks()} chunks, {each:.1f} bytes per Gaussian"
-        )
-        say(
-            f"needs               {page.graphics_bytes() / 1e6:.0f} MB of graphics memory,"
-            f" {page.heap_bytes() / 1e6:.0f} MB for sorting"
-        )
+        chunks = len(page.scenes[0][1].layout)
+        say(f"size                {made['bytes'] / 1e6:.1f} MB in {chunks} chunks, {each:.1f} bytes per Gaussian")
         if given.browser:
             with served(work) as address:
                 browse(f"{address}/{Path(made['page']).relative_to(work)}", tuple(given.size), given.picture)

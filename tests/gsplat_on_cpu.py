@@ -1,16 +1,15 @@
 """gsplat without CUDA: the real package with stand-ins for its compiled kernels.
 
-Everything that gsplat does in Python runs as it is: argument checks, autograd functions, tiles, what it returns. Only
-the compiled functions are replaced, by gsplat's own references in torch (`gsplat.cuda._torch_impl`) and, where those
-need further packages, by the formulas of the kernels' source (alpha cut 1/255, cap 0.999, stop at a transmittance of
-1e-4, radii that know the opacity). Backward kernels are autograd of the forward ones. As on a GPU, what a kernel does
-not write is whatever was in memory: here NaN.
+Everything that gsplat does in Python runs as it is: argument checks, autograd functions, what it returns. Only the
+compiled functions are replaced, by gsplat's own references in torch (`gsplat.cuda._torch_impl`) and, where those need
+further packages, by the formulas of the kernels' source (alpha cut 1/255, cap 0.999, stop at a transmittance of 1e-4,
+radii that know the opacity), for one view and without tiles. Backward kernels are autograd of the forward ones. As on a
+GPU, what a kernel does not write is whatever was in memory: here NaN.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -53,17 +52,6 @@ def _leaves(*tensors: Tensor) -> list[Tensor]:
     return [tensor.detach().clone().requires_grad_() for tensor in tensors]
 
 
-def _tiles(width: int, height: int, tile: int, offsets: Tensor, ids: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
-    """For every tile of every image: image, flat pixel indices, entries front to back."""
-    down, across = offsets.shape[-2:]
-    ends = [*offsets.flatten().tolist(), len(ids)]
-    for index in range(len(ends) - 1):
-        image, place = divmod(index, down * across)
-        ys = torch.arange(place // across * tile, min((place // across + 1) * tile, height))
-        xs = torch.arange(place % across * tile, min((place % across + 1) * tile, width))
-        yield image, (ys[:, None] * width + xs).flatten(), ids[ends[index] : ends[index + 1]].long()
-
-
 def _blend(alpha: Tensor, sigma: Tensor, channels: Tensor) -> tuple[Tensor, Tensor]:
     """alpha, sigma [P, M] and channels [M, C] to [P, C] and accumulated alpha [P, 1], as the kernels do it."""
     alpha = alpha.clamp_max(ALPHA_MAX)
@@ -71,10 +59,6 @@ def _blend(alpha: Tensor, sigma: Tensor, channels: Tensor) -> tuple[Tensor, Tens
     alpha = torch.where(torch.cumprod(1 - alpha.detach(), 1) > STOP, alpha, 0)
     left = torch.cumprod(torch.cat([alpha.new_ones(len(alpha), 1), 1 - alpha], 1), 1)
     return (alpha * left[:, :-1]) @ channels, 1 - left[:, -1:]
-
-
-def _centers(pixels: Tensor, width: int) -> tuple[Tensor, Tensor]:
-    return pixels % width + 0.5, pixels // width + 0.5
 
 
 class Kernels:
@@ -160,79 +144,49 @@ class Kernels:
         return v[0], None, v[1], v[2], v[3]
 
     def intersect_tile(self, means2d: Tensor, radii: Tensor, depths: Tensor, *rest: Any) -> Any:
-        from gsplat.cuda._torch_impl import _isect_tiles
-
-        images, _, _, tile, across, down, sort, _ = rest
-        assert images is None  # nothing is packed
-        return _isect_tiles(means2d.nan_to_num(), radii, depths.nan_to_num(), tile, across, down, sort)
+        assert rest[0] is None  # nothing is packed
+        drawn = torch.nonzero((radii[0] > 0).all(-1))[:, 0]
+        order = drawn[torch.argsort(depths[0, drawn], stable=True)]  # instead of tiles: all of them, front to back
+        return torch.zeros_like(radii[..., 0]), order.long(), order.int()
 
     def intersect_offset(self, codes: Tensor, count: int, across: int, down: int) -> Tensor:
-        from gsplat.cuda._torch_impl import _isect_offset_encode
+        return torch.zeros(1, down, across, dtype=torch.int32)
 
-        return _isect_offset_encode(codes, count, across, down)
-
-    # ---- pixels: linear projection ----
+    # ---- pixels ----
 
     def _pixels(
-        self, colors: Tensor, size: tuple[int, int, int], offsets: Tensor, ids: Tensor, response: Any, *masked: Any
+        self, means: Tensor, conics: Tensor, colors: Tensor, opacity: Tensor, width: int, height: int
     ) -> tuple[Tensor, Tensor]:
-        assert masked == (None, None)  # backgrounds and masks
-        width, height, tile = size
-        images = offsets.numel() // offsets.shape[-1] // offsets.shape[-2]
-        blended, image_of, pixels_of = [], [], []
-        for image, pixels, entries in _tiles(width, height, tile, offsets, ids):
-            alpha, sigma = response(image, pixels, entries)
-            blended.append(_blend(alpha, sigma, colors[entries]))
-            image_of.append(torch.full_like(pixels, image))
-            pixels_of.append(pixels)
-        place = (torch.cat(image_of), torch.cat(pixels_of))
-        made = []
-        for part in range(2):
-            values = torch.cat([one[part] for one in blended])
-            canvas = values.new_zeros(images, width * height, values.shape[1]).index_put(place, values)
-            made.append(canvas.view(*offsets.shape[:-2], height, width, -1))
-        return made[0], made[1]
-
-    def _flat_response(self, means: Tensor, conics: Tensor, opacity: Tensor, width: int, spread: list[Any]) -> Any:
-        def response(image: int, pixels: Tensor, entries: Tensor) -> tuple[Tensor, Tensor]:
-            x, y = _centers(pixels, width)
-            here = means[entries][None]
-            if spread:  # a copy of the means per pixel, so that absolute gradients can be summed over pixels
-                here = means[entries].detach().expand(len(pixels), -1, -1).clone().requires_grad_()
-                spread.append((here, entries))
-            dx, dy = here[..., 0] - x[:, None], here[..., 1] - y[:, None]
-            c = conics[entries]
-            sigma = 0.5 * (c[:, 0] * dx * dx + c[:, 2] * dy * dy) + c[:, 1] * dx * dy
-            return opacity[entries] * torch.exp(-sigma), sigma
-
-        return response
+        """Of splats front to back, means [1 or P, M, 2]: image [1, H, W, C] and alpha [1, H, W, 1]."""
+        y, x = (
+            side.reshape(-1, 1) + 0.5
+            for side in torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+        )
+        dx, dy = means[..., 0] - x, means[..., 1] - y
+        sigma = 0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) + conics[:, 1] * dx * dy
+        image, alpha = _blend(opacity * torch.exp(-sigma), sigma, colors)
+        return image.view(1, height, width, -1), alpha.view(1, height, width, 1)
 
     def rasterize_to_pixels_3dgs_fwd(
         self, means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, *rest: Any
     ) -> Any:
-        background, mask, width, height, tile, offsets, ids = rest
-        means, conics, colors = (tensor.reshape(-1, tensor.shape[-1]) for tensor in (means2d, conics, colors))
-        opacity = opacities.reshape(-1)
-        response = self._flat_response(means, conics, opacity, width, [])
-        image, alpha = self._pixels(colors, (width, height, tile), offsets, ids, response, background, mask)
-        return image, alpha, torch.zeros(0)
+        background, mask, width, height, _, _, ids = rest
+        assert background is None and mask is None
+        means, conics, colors, opacity = (tensor[0][ids.long()] for tensor in (means2d, conics, colors, opacities))
+        return *self._pixels(means[None], conics, colors, opacity, width, height), torch.zeros(0)
 
     def rasterize_to_pixels_3dgs_bwd(
         self, means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, *rest: Any
     ) -> Any:
-        background, mask, width, height, tile, offsets, ids, _, _, v_image, v_alpha, absolute = rest
+        _, _, width, height, _, _, ids, _, _, v_image, v_alpha, absolute = rest
+        order = ids.long()
         with torch.enable_grad():
-            flat = [tensor.reshape(-1, tensor.shape[-1]) for tensor in (conics, colors)]
-            leaves = _leaves(*flat, opacities.reshape(-1))
-            spread: list[Any] = [None]
-            response = self._flat_response(means2d.reshape(-1, 2), leaves[0], leaves[2], width, spread)
-            image, alpha = self._pixels(leaves[1], (width, height, tile), offsets, ids, response, background, mask)
-            copies = spread[1:]
-            v = _gradients([image, alpha], [v_image, v_alpha], [*leaves, *(here for here, _ in copies)])
-        v_means = torch.zeros(means2d.reshape(-1, 2).shape)
-        v_abs = torch.zeros_like(v_means)
-        for gradient, (_, entries) in zip(v[3:], copies, strict=True):
-            v_means.index_add_(0, entries, gradient.sum(0))
-            v_abs.index_add_(0, entries, gradient.abs().sum(0))
-        v_flat = [one.view_as(like) for one, like in zip(v[:3], (conics, colors, opacities), strict=True)]
-        return v_abs.view_as(means2d) if absolute else None, v_means.view_as(means2d), *v_flat
+            given = [tensor[0][order] for tensor in (conics, colors, opacities)]
+            # a copy of the means per pixel, so that absolute gradients can be summed over pixels
+            leaves = _leaves(*given, means2d[0][order].expand(width * height, -1, -1))
+            outputs = list(self._pixels(leaves[3], *leaves[:3], width, height))
+            v = _gradients(outputs, [v_image, v_alpha], leaves)
+        spread = lambda like, values: torch.zeros_like(like).index_put((torch.tensor(0), order), values)
+        v_means, v_abs = spread(means2d.nan_to_num(), v[3].sum(0)), spread(means2d.nan_to_num(), v[3].abs().sum(0))
+        flat = [spread(like.nan_to_num(), one) for like, one in zip((conics, colors, opacities), v[:3], strict=True)]
+        return v_abs if absolute else None, v_means, *flat

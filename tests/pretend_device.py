@@ -232,23 +232,3 @@ def pretend_device():
     finally:
         torch._C._set_only_lift_cpu_tensors(before)
         del devices.PROBLEMS[NAME], devices.SAME_CODE[NAME]
-
-
-@dataclass
-class Copies:
-    """Sizes, in elements, of the tensors that went from one device to the other, in order; single numbers are left
-    out."""
-
-    to_device: list[int]
-    to_host: list[int]
-
-
-@contextmanager
-def copies():
-    """Within: every copy of a tensor between the devices is noted; the lists are filled at the end."""
-    found = Copies([], [])
-    with transfers() as taken:
-        yield found
-    for copy in taken:
-        if copy.values > 1:
-            (found.to_device if copy.way == "there" else found.to_host).append(copy.values)

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,7 @@ from scipy.spatial import KDTree
 from mudg import native
 from mudg.base.errors import InputError
 from mudg.base.geometry import invert, transform_points, yaw_matrix, yaw_of
-from mudg.base.types import Frame, Scene, Sweep, Track
+from mudg.base.types import Scene, Track
 from mudg.city.config import CityConfig
 from mudg.city.logs import write_city
 from mudg.scene.read import read_image, read_points
@@ -90,37 +90,75 @@ def assert_same_log(
         box_size_m: length, width, height.
         cloud_m: each point must have a partner this near, both ways, in the world.
         cloud_share: share of points that must have one; 1 also asks for equal counts.
-        intensity: largest difference to the partner; None = not compared.
-        dt_s: the same for point times relative to the first image's time; None = not compared.
+        intensity, dt_s: largest difference to the partner (times relative to the first image's); None = not compared.
         color_levels: mean absolute difference of images, 0..255; 0 = equal.
         missing_tracks: so many boxes may be left out by the format (say why at the call).
         sweeps: whether the format has LiDAR.
     """
     names = dict(cameras) if cameras is not None else {name: name for name in truth.cameras}
-    if set(names.values()) != set(scene.cameras):
-        raise AssertionError(f"cameras are {sorted(scene.cameras)}, expected {sorted(names.values())}")
-    first = truth.frames_of(next(iter(names)))[0]
-    first_here = scene.frames_of(next(iter(names.values())))[0]
-    compared = _Comparison(
-        truth,
-        scene,
-        first_here.view.world_from_cam @ invert(first.view.world_from_cam),
-        first_here.view.time_s - first.view.time_s,
-    )
-    problems = compared.problems
+    assert set(names.values()) == set(scene.cameras), "cameras"
+    problems: list[str] = []
+
+    def compare(where: str, what: str, off: float, most: float) -> None:
+        if off > most:
+            problems.append(f"{where}: {what} differs by {off:.3g}")
+
+    first, here = truth.frames_of(next(iter(names)))[0].view, scene.frames_of(next(iter(names.values())))[0].view
+    world_from_truth, shift_s = here.world_from_cam @ invert(first.world_from_cam), here.time_s - first.time_s
+    apart = lambda found, expected: float(np.abs(found - world_from_truth @ expected).max())
     for theirs, ours in names.items():
-        a, b = truth.frames_of(theirs), scene.frames_of(ours)
-        if len(a) != len(b):
-            problems.append(f"camera {ours}: {len(b)} frames, expected {len(a)}")
-        for one, other in zip(a, b):
-            compared.frame(one, other, pose, time_s, intrinsics_px, color_levels)
+        originals, images = truth.frames_of(theirs), scene.frames_of(ours)
+        compare(f"camera {ours}", "number of frames", abs(len(originals) - len(images)), 0)
+        for a, b in zip(originals, images):
+            where, ca, cb = f"frame {b.id}", a.view.camera, b.view.camera
+            off = max(abs(getattr(ca, name) - getattr(cb, name)) for name in ("fx", "fy", "cx", "cy"))
+            compare(where, "intrinsics", off, intrinsics_px)
+            compare(where, "pose", apart(b.view.world_from_cam, a.view.world_from_cam), pose)
+            compare(where, "time", abs(b.view.time_s - a.view.time_s - shift_s), time_s)
+            one, other = read_image(truth, a).astype(int), read_image(scene, b).astype(int)
+            compare(where, "colour", float(np.abs(one - other).mean()), color_levels)
     if sweeps:
-        if len(truth.sweeps) != len(scene.sweeps):
-            problems.append(f"{len(scene.sweeps)} sweeps, expected {len(truth.sweeps)}")
-        for one, other in zip(truth.sweeps, scene.sweeps):
-            compared.sweep(one, other, pose, time_s)
-            compared.cloud(one, other, cloud_m, cloud_share, intensity, dt_s)
-    compared.tracks(labels or {}, box_pose, box_size_m, missing_tracks)
+        compare("LiDAR", "number of sweeps", abs(len(truth.sweeps) - len(scene.sweeps)), 0)
+    for a, b in zip(truth.sweeps, scene.sweeps if sweeps else ()):
+        where, one, other = f"sweep {b.id}", read_points(truth, a), read_points(scene, b)
+        compare(where, "pose", apart(b.world_from_lidar, a.world_from_lidar), pose)
+        compare(where, "time", abs(b.time_s - a.time_s - shift_s), time_s)
+        if cloud_share == 1:
+            compare(where, "number of points", abs(len(one.xyz) - len(other.xyz)), 0)
+        if not len(one.xyz) or not len(other.xyz):
+            continue
+        expected = transform_points(world_from_truth @ a.world_from_lidar, one.xyz.astype(np.float64))
+        found = transform_points(b.world_from_lidar, other.xyz.astype(np.float64))
+        distance, partner = KDTree(expected).query(found)
+        back, _ = KDTree(found).query(expected)
+        if (share := min(float((distance <= cloud_m).mean()), float((back <= cloud_m).mean()))) < cloud_share:
+            worst = max(distance.max(), back.max())
+            problems.append(f"{where}: {share:.2%} of points lie within {cloud_m} m of their partners, worst {worst} m")
+        near = distance <= cloud_m
+        if intensity is not None and near.any():
+            compare(where, "intensity", np.abs(other.intensity - one.intensity[partner])[near].max(), intensity)
+        if dt_s is not None and near.any():
+            at, expected_at = (points.dt_s.astype(float) + s.time_s for points, s in ((other, b), (one, a)))
+            compare(where, "time of points", np.abs(at - shift_s - expected_at[partner])[near].max(), dt_s)
+    left = {track.id: track for track in scene.tracks}
+    missing = []
+    for track in truth.tracks:
+        partner = _partner(track, left, world_from_truth, shift_s)
+        if partner is None:
+            missing.append(track.id)
+            continue
+        del left[partner.id]
+        where, label = f"track {partner.id} (truth {track.id})", (labels or {}).get(track.label, track.label)
+        if partner.label != label:
+            problems.append(f"{where}: class {partner.label}, expected {label}")
+        compare(where, "size", float(np.abs(partner.size_m - track.size_m).max()), box_size_m)
+        for time, expected in zip(track.times_s, track.world_from_object, strict=True):
+            found = partner.pose_at(float(time) + shift_s)
+            compare(where, f"box at {time:.3f} s", np.inf if found is None else apart(found, expected), box_pose)
+    if len(missing) > missing_tracks:
+        problems.append(f"tracks {', '.join(missing)} are missing")
+    if left:
+        problems.append(f"tracks {', '.join(left)} are in the scene, not in the log")
     assert not problems, "\n".join(problems)
 
 
@@ -135,112 +173,6 @@ def assert_refused(ingest: Callable[[Path, Path], Scene], source: Path, out: Pat
     left = [path.name for path in out.parent.iterdir() if path.name.startswith((out.name, f".{out.name}"))]
     assert not left, f"something half-written is left: {left}"
     return error
-
-
-@dataclass(frozen=True, eq=False)
-class _Comparison:
-    """Two logs, how one lies in the other's world and clock, and what differs so far."""
-
-    truth: Scene
-    scene: Scene
-    world_from_truth: NDArray[np.float64]
-    shift_s: float
-    problems: list[str] = field(default_factory=list)
-
-    def posed(
-        self,
-        where: str,
-        found: NDArray[np.float64],
-        expected: NDArray[np.float64],
-        late_s: float,
-        pose: float,
-        time_s: float,
-    ) -> None:
-        """Pose and time of an image or sweep."""
-        if (off := _pose_difference(found, self.world_from_truth @ expected)) > pose:
-            self.problems.append(f"{where}: pose differs by {off:.3g}")
-        if (off := abs(late_s - self.shift_s)) > time_s:
-            self.problems.append(f"{where}: time differs by {off:.3g} s")
-
-    def frame(self, a: Frame, b: Frame, pose: float, time_s: float, intrinsics_px: float, color_levels: float) -> None:
-        """An image ``b`` of the scene with its original."""
-        where = f"frame {b.id}"
-        ca, cb = a.view.camera, b.view.camera
-        if (ca.width, ca.height) != (cb.width, cb.height):
-            self.problems.append(f"{where}: size {cb.width}x{cb.height}, expected {ca.width}x{ca.height}")
-            return
-        off = max(abs(getattr(ca, name) - getattr(cb, name)) for name in ("fx", "fy", "cx", "cy"))
-        if off > intrinsics_px:
-            self.problems.append(f"{where}: intrinsics differ by {off:.3g} px")
-        self.posed(where, b.view.world_from_cam, a.view.world_from_cam, b.view.time_s - a.view.time_s, pose, time_s)
-        one, other = read_image(self.truth, a).astype(int), read_image(self.scene, b).astype(int)
-        if (mean := float(np.abs(one - other).mean())) > color_levels:
-            self.problems.append(f"{where}: colours differ by {mean:.3g} levels on average")
-
-    def sweep(self, a: Sweep, b: Sweep, pose: float, time_s: float) -> None:
-        """Pose and time of a sweep ``b`` of the scene."""
-        self.posed(f"sweep {b.id}", b.world_from_lidar, a.world_from_lidar, b.time_s - a.time_s, pose, time_s)
-
-    def cloud(
-        self, a: Sweep, b: Sweep, cloud_m: float, cloud_share: float, intensity: float | None, dt_s: float | None
-    ) -> None:
-        """The points of a sweep ``b`` of the scene."""
-        where = f"sweep {b.id}"
-        one, other = read_points(self.truth, a), read_points(self.scene, b)
-        if cloud_share == 1 and len(one.xyz) != len(other.xyz):
-            self.problems.append(f"{where}: {len(other.xyz)} points, expected {len(one.xyz)}")
-        if not len(one.xyz) or not len(other.xyz):
-            return
-        expected = transform_points(self.world_from_truth @ a.world_from_lidar, one.xyz.astype(np.float64))
-        found = transform_points(b.world_from_lidar, other.xyz.astype(np.float64))
-        distance, partner = KDTree(expected).query(found)
-        back, _ = KDTree(found).query(expected)
-        share = min(float((distance <= cloud_m).mean()), float((back <= cloud_m).mean()))
-        if share < cloud_share:
-            worst = max(distance.max(), back.max())
-            self.problems.append(
-                f"{where}: {share:.2%} of points lie within {cloud_m} m of their partners, worst {worst:.3g} m"
-            )
-        near = distance <= cloud_m
-        if intensity is not None and near.any():
-            off = float(np.abs(other.intensity - one.intensity[partner])[near].max())
-            if off > intensity:
-                self.problems.append(f"{where}: intensity differs by {off:.3g}")
-        if dt_s is not None and near.any():
-            at, expected_at = (t.dt_s.astype(float) + s.time_s for t, s in ((other, b), (one, a)))
-            expected_at, at = expected_at[partner], at - self.shift_s
-            if (off := float(np.abs(at - expected_at)[near].max())) > dt_s:
-                self.problems.append(f"{where}: point times differ by {off:.3g} s")
-
-    def tracks(self, labels: Mapping[str, str], box_pose: float, box_size_m: float, missing_tracks: int) -> None:
-        """All tracked boxes."""
-        left = {track.id: track for track in self.scene.tracks}
-        missing = []
-        for track in self.truth.tracks:
-            partner = _partner(track, left, self.world_from_truth, self.shift_s)
-            if partner is None:
-                missing.append(track.id)
-                continue
-            del left[partner.id]
-            where = f"track {partner.id} (truth {track.id})"
-            if partner.label != (label := labels.get(track.label, track.label)):
-                self.problems.append(f"{where}: class {partner.label}, expected {label}")
-            if (off := float(np.abs(partner.size_m - track.size_m).max())) > box_size_m:
-                self.problems.append(f"{where}: size {partner.size_m} differs from {track.size_m} by {off:.3g} m")
-            for time, pose in zip(track.times_s, track.world_from_object, strict=True):
-                found = partner.pose_at(float(time) + self.shift_s)
-                if found is None:
-                    self.problems.append(f"{where}: no box at {time:.3f} s")
-                elif (off := _pose_difference(found, self.world_from_truth @ pose)) > box_pose:
-                    self.problems.append(f"{where}: pose at {time:.3f} s differs by {off:.3g}")
-        if len(missing) > missing_tracks:
-            self.problems.append(f"tracks {', '.join(missing)} are missing")
-        if left:
-            self.problems.append(f"tracks {', '.join(left)} are in the scene, not in the log")
-
-
-def _pose_difference(pose: NDArray[np.float64], expected: NDArray[np.float64]) -> float:
-    return float(np.abs(pose - expected).max())
 
 
 def _partner(

@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 import torch
 import toy_inception
-import toy_vit
 from test_i3d import made_up
 
 from mudg.base import store
-from mudg.networks import clip_image, dinov2, i3d, inception
+from mudg.networks import i3d, inception
 
 PATH = Path(__file__).parent / "golden" / "score_networks.safetensors"
 KEPT = 48
@@ -46,18 +45,6 @@ def i3d_values() -> dict[str, np.ndarray]:
     return {"i3d.400": i3d.I3DFeatures(made_up())(frames[None])[:, : 4 * KEPT].numpy()}
 
 
-@torch.no_grad()
-def vit_values() -> dict[str, np.ndarray]:
-    """Features of a small DINOv2 with resized positions, and of a small CLIP tower."""
-    tower = clip_image.ClipImageFeatures(toy_vit.clip_state())
-    return {
-        "dinov2": (
-            dinov2.DinoFeatures(toy_vit.dino_state())(torch.stack([dinov2.prepared(p) for p in pictures()])).numpy()
-        ),
-        "clip": tower(torch.stack([clip_image.prepared(p, tower.side) for p in pictures()])).numpy(),
-    }
-
-
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    store.write_safetensors(PATH, {**inception_values(), **i3d_values(), **vit_values()})
+    store.write_safetensors(PATH, {**inception_values(), **i3d_values()})

@@ -28,7 +28,7 @@ from mudg.formats.exporters import alpasim
 from mudg.formats.exporters.alpasim import LANE_M, lanes_beside, opendrive, to_alpasim
 from mudg.formats.splats.cloud import SplatScene
 from mudg.gaussians.storage import save_model
-from mudg.scene.road import Road
+from mudg.scene.motion import Road
 from mudg.steps.export import Export
 
 TIMES = np.array([0.0, 0.2, 0.4])

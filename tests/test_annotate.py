@@ -18,10 +18,8 @@ from mudg.base.run_folder import RunDir
 from mudg.base.types import EgoPath, Ref, Source, Sweep, View
 from mudg.core.depth import ray_elevation
 from mudg.labels import annotate
-from mudg.labels import annotate as annotate_depth
 from mudg.labels.annotate import LABELLERS, nearest_sweeps, steady_bottom
-from mudg.labels.by_geometry import find_sky, label_by_network
-from mudg.labels.inputs import TRAIN_ID_OF, LabelInput, Labels, Prediction, box_outline
+from mudg.labels.inputs import TRAIN_ID_OF, LabelInput, Labels, Prediction, box_outline, find_sky, label_by_network
 from mudg.labels.settings import AnnotateConfig
 from mudg.networks.folders import CPU
 from mudg.scene.check import check_scene
@@ -115,7 +113,8 @@ def test_elevation_of_rays_and_sky_above_the_horizon() -> None:
 
 
 def test_stage_makes_a_labelled_scene_and_leaves_the_given_one_alone(tmp_path: Path) -> None:
-    plain = STREET.write(tmp_path / "plain", labels=False)
+    street = replace(STREET, times=(0.0, 0.3))
+    plain = street.write(tmp_path / "plain", labels=False, width=160, height=80)
     files = {p: p.read_bytes() for p in (tmp_path / "plain").rglob("*") if p.is_file()}
     out = Annotate(scene=tmp_path / "plain", out=tmp_path / "labelled", settings=AnnotateConfig(depth=True)).run()
     scene = read_scene(out)
@@ -124,7 +123,7 @@ def test_stage_makes_a_labelled_scene_and_leaves_the_given_one_alone(tmp_path: P
     for frame, before in zip(scene.frames, plain.frames, strict=True):
         assert (read_image(scene, frame) == read_image(plain, before)).all()
         assert set(frame.labels) == {"semantics", "sky", "semantics_confidence", "depth", "depth_confidence", "dynamic"}
-        _, truth, _ = STREET.image(frame.view)
+        _, truth, _ = street.image(frame.view)
         assert overlap(read_label(scene, frame, "semantics"), truth, "road") > 0.9
     assert (read_points(scene, scene.sweeps[1]).xyz == read_points(plain, plain.sweeps[1]).xyz).all()
     assert dict(scene.split) == dict(plain.split) and any("not truth" in note for note in scene.source.notes)
@@ -204,7 +203,7 @@ def test_a_label_that_is_there_stays_and_depth_without_lidar_too(tmp_path: Path)
     given, classes = given_at(STREET, lidar=False)
     labels = labelled(given, classes)
     network = lambda _: pytest.fail("asked")
-    assert annotate_depth.with_network(network, given, labels, "front/000000", tmp_path) is labels
+    assert annotate.with_network(network, given, labels, "front/000000", tmp_path) is labels
     assert (tmp_path / "front" / "000000.filled.json").is_file()
 
 
@@ -226,7 +225,7 @@ def test_depth_comes_from_the_network_where_it_fits_the_lidar(tmp_path: Path, mo
     (tmp_path / "weights").mkdir()
     (tmp_path / "weights" / "config.json").write_text('{"model_type": "depth_anything"}')
     network = lambda given: Prediction(next(answers), "depth")
-    monkeypatch.setattr(annotate_depth, "load_depth_network", lambda *_: network)
+    monkeypatch.setattr(annotate, "load_depth_network", lambda *_: network)
     config = AnnotateConfig(depth_network=str(tmp_path / "weights"), processes=1)
     scene = read_scene(Annotate(scene=tmp_path / "plain", out=tmp_path / "out", settings=config).run())
     plain_config = AnnotateConfig(processes=1)
@@ -246,10 +245,10 @@ def test_depth_comes_from_the_network_where_it_fits_the_lidar(tmp_path: Path, mo
 
 def test_what_labellers_and_depth_networks_need_is_named(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="contradicts"):
-        annotate_depth.digests(AnnotateConfig(depth=False, depth_network="x"))
+        annotate.digests(AnnotateConfig(depth=False, depth_network="x"))
     with pytest.raises(ResourceError, match="weights"):
-        annotate_depth.digests(AnnotateConfig(depth_network=str(tmp_path)))
-    assert set(annotate_depth.digests(AnnotateConfig())) == {"weights"}
+        annotate.digests(AnnotateConfig(depth_network=str(tmp_path)))
+    assert set(annotate.digests(AnnotateConfig())) == {"weights"}
     with pytest.raises(ResourceError, match="weights"):
         LABELLERS["network"](str(tmp_path / "nothing"), CPU)
 

@@ -20,7 +20,6 @@ from roundtrip import needs_native
 from mudg.base.errors import InputError
 from mudg.base.types import Camera
 from mudg.city import light as photos
-from mudg.formats.importers import kitti360, waymo
 from mudg.scene import labels
 from mudg.scene.read import check_image, decode_image
 from mudg.scoring.detections import read_mask
@@ -126,9 +125,8 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "image of a scene, checked": ("RGB", lambda path: check_image(path.read_bytes(), "here", CAMERA)),
     "lane mask": ("L", read_mask),
     "texture": ("RGB", photos.surface),
-    "label": ("L", lambda path: labels._decode_grey(path.read_bytes(), "here")),
-    "label of KITTI-360": ("L", kitti360._grey),
-    "label of Waymo": ("I;16", lambda path: waymo.panoptic_ids(path.read_bytes(), CAMERA, "here")),
+    "label": ("L", lambda path: labels.decode_grey(path.read_bytes(), "here")),
+    "label of 16 bits": ("I;16", lambda path: labels.decode_grey(path.read_bytes(), "here", (16,))),
 }
 
 

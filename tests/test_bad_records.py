@@ -22,8 +22,8 @@ import pytest
 import write_av2
 import write_nuscenes
 from bad_logs import Change
-from pandas_pickles import frame_bytes, write_frame
 from roundtrip import needs_native
+from write_pandaset import frame_bytes, write_frame
 
 from mudg.formats.importers.common import ImportOptions
 from mudg.formats.importers.pandaset import gunzip, parse_frame, read_frame
@@ -70,7 +70,7 @@ def flipped(at: float) -> Change:
 
 
 CLOUDS: dict[tuple[str, str], tuple[Change, str]] = {
-    ("custom", "declares 10^12 points"): (npz(tall, "xyz.npy"), "cut off"),
+    ("custom", "declares 10^12 points"): (npz(tall, "xyz.npy"), "not a readable NPZ"),
     ("custom", "wrong checksum"): (flipped(0.5), "not a readable NPZ"),
     ("pandaset", "wrong checksum"): (lambda c: c[:-8] + bytes([c[-8] ^ 1]) + c[-7:], "damaged"),
     ("argoverse2", "no table"): (lambda c: b"FEA1" + c[4:], "table cannot be read"),

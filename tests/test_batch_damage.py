@@ -13,7 +13,7 @@ from test_batches import Scenes
 from test_damaged_models import ends_in_words
 
 from mudg.base.errors import MudgError
-from mudg.fleet import status
+from mudg.fleet import records as status
 from mudg.fleet.work import peak_of
 from mudg.steps import batching
 

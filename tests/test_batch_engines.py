@@ -21,7 +21,7 @@ import pytest
 import slurm_here
 
 from mudg import app
-from mudg.fleet import status
+from mudg.fleet import records as status
 from mudg.fleet.plan import Entry, plan_of
 from mudg.fleet.records import BatchFolder, Ended
 
@@ -85,12 +85,6 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     found = ends(made.folder / "out")
     assert len(found) == SCENES and sorted(found.values()).count("3") == 2
     return found
-
-
-def test_several_at_a_time(tmp_path: Path, undisturbed: dict[str, str]) -> None:
-    made = ListOfScenes(tmp_path)
-    assert made.start(tmp_path / "out", "--jobs", "3").wait(300) == 12
-    assert ends(tmp_path / "out") == undisturbed and made.runs() == SCENES
 
 
 def test_numbered_tasks(tmp_path: Path, undisturbed: dict[str, str]) -> None:
@@ -207,60 +201,6 @@ def test_chaos(tmp_path: Path, undisturbed: dict[str, str]) -> None:
     print(f"{killed} drivers killed, runs beyond the first of a scene: {made.runs() - SCENES}")
     assert made.runs() - SCENES <= killed
     assert not list((out / "_batch/work").iterdir()) and not list((out / "_batch").glob("owner*"))
-
-
-# real steps ---------------------------------------------------------------------------------------
-
-CITIES = int(os.environ.get("MUDG_TEST_CITIES", "200"))
-TINY = (
-    "ingest.city.n_frames=6 ingest.city.width=96 ingest.city.height=64 ingest.city.cameras=[front] "
-    "ingest.city.lidar_beams=16 ingest.contact_sheet=false fit.iterations=20 fit.start.gaussians=2000"
-).split()
-
-
-class Cities:
-    """A list of generated cities, each ingested, fused and fitted in the smallest size."""
-
-    def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        self.listed = folder / "list.txt"
-        self.listed.write_text("".join(f"city name=c{number:03d} seed={number}\n" for number in range(CITIES)))
-
-    def start(self, out: Path, *more: str, **environment: str) -> subprocess.Popen[bytes]:
-        words = f"batch run --list {self.listed} --out {out} --quiet --stages ingest fuse fit".split()
-        command = [sys.executable, "-m", "mudg", *words, *more, "--set", *TINY]
-        return subprocess.Popen(command, env={**os.environ, **environment})
-
-
-def digests(out: Path) -> dict[str, str]:
-    """Scene and step -> hash of the result's manifest."""
-    assert not list((out / "_batch").glob("failed/*")), "a step has failed"
-    records = [json.loads(path.read_text()) for path in (out / "_batch/done").glob("*.json")]
-    return {f"{one['scene']} {one['stage']}": one["digest"] for one in records}
-
-
-@pytest.fixture(scope="module")
-def cities(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """What two local workers make of the cities."""
-    folder = tmp_path_factory.mktemp("cities")
-    began = time.monotonic()
-    assert Cities(folder).start(folder / "out", "--jobs", "2").wait(40 * CITIES + 60) == 0
-    print(f"{CITIES} cities through local: {time.monotonic() - began:.0f} s")
-    found = digests(folder / "out")
-    assert len(found) == 3 * CITIES == len(set(found.values())), "every city is another one"
-    return found
-
-
-def test_cities_through_numbered_tasks_of_which_one_is_killed(tmp_path: Path, cities: dict[str, str]) -> None:
-    made, out, began = Cities(tmp_path), tmp_path / "out", time.monotonic()
-    first, second = (made.start(out, "--shard", "env/2", JOB_COMPLETION_INDEX=str(index)) for index in range(2))
-    wait_until(lambda: len(list((out / "_batch/done").glob("*"))) >= 2, 300)
-    first.kill()
-    first.wait()
-    again = made.start(out, "--shard", "env/2", JOB_COMPLETION_INDEX="0")  # as a scheduler does
-    assert (second.wait(40 * CITIES + 60), again.wait(40 * CITIES + 60)) == (0, 0)
-    print(f"{CITIES} cities through two tasks, one of them killed: {time.monotonic() - began:.0f} s")
-    assert digests(out) == cities
 
 
 def wait_until(condition, seconds: float) -> None:

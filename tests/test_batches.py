@@ -18,14 +18,15 @@ import pytest
 
 from mudg import app
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.fleet import engines, status, work
+from mudg.fleet import engines, work
+from mudg.fleet import records as status
 from mudg.fleet.engines import LocalRun
 from mudg.fleet.plan import Entry, command_of, parse_shard, plan_of, read_list, shard_of
 from mudg.fleet.records import BatchFolder, Ended, this_host
 from mudg.fleet.settings import BatchConfig
 from mudg.fleet.work import Job, Stop, last_words, run_step
 from mudg.steps import batching
-from mudg.steps.batch import stage_lines
+from mudg.steps.run import stage_lines
 from mudg.steps.settings import RunConfig
 
 STEP = """
@@ -172,12 +173,6 @@ def test_bad_lists_are_refused_with_their_line(tmp_path: Path, text: str, words:
         read_list(tmp_path / "list.txt")
 
 
-def test_shards_are_a_partition() -> None:
-    entries = [Entry(str(n), str(n)) for n in range(60)]
-    parts = [[e for e in entries if shard_of(e.name, 3) == i] for i in range(3)]
-    assert sorted(int(e.name) for part in parts for e in part) == list(range(60)) and min(map(len, parts)) >= 10
-
-
 @pytest.mark.parametrize(
     ("text", "environment", "wanted"),
     [
@@ -199,6 +194,8 @@ def test_what_is_no_shard_is_refused(text: str) -> None:
     for environment in ({}, {"JOB_COMPLETION_INDEX": "7"}, {"JOB_COMPLETION_INDEX": "x"}):
         with pytest.raises(UsageError, match="shard|numbered"):
             parse_shard(text, environment)
+    parts = Counter(shard_of(str(number), 3) for number in range(60))
+    assert set(parts) == {0, 1, 2} and min(parts.values()) >= 10
 
 
 # ---- scenes --------------------------------------------------------------------------------------
@@ -294,14 +291,12 @@ def test_a_killed_step_is_tried_again_alone_and_with_less(tmp_path: Path, monkey
     made.entries.append(Entry("s2", "/logs/2"))
     made.does("s2", "kill -9 $$")
     assert made.run(threads=4) == {"failed": 1} and "also alone" in next(made.batch.records("failed")).words
-
-
-def test_too_few_programs_and_processes(tmp_path: Path) -> None:
+    made.entries.append(Entry("s3", "/logs/3"))
+    made.does("s3", "exit 0")
+    made.run()
+    assert "it ended well but wrote nothing" in {record.words for record in made.batch.records("failed")}
     with pytest.raises(UsageError, match="no such program"):
         run_step(["/no/such/program", "mudg"], tmp_path, 1, Stop())
-    made = Scenes(tmp_path, 1)
-    made.does("s0", "exit 0")
-    assert made.run() == {"failed": 1} and next(made.batch.records("failed")).words == "it ended well but wrote nothing"
 
 
 # ---- drivers -------------------------------------------------------------------------------------
@@ -443,21 +438,6 @@ def test_a_slurm_task_stops_for_its_checkpoint(tmp_path: Path) -> None:
         assert answers[0].function() == {"done": 2}
     finally:
         signal.signal(signal.SIGTERM, handler)
-
-
-@pytest.mark.slow
-def test_submitit_runs_the_tasks(tmp_path: Path) -> None:
-    """Its executor for this machine pickles and starts a task as that for Slurm does."""
-    submitit = pytest.importorskip("submitit")
-    made = Scenes(tmp_path, 3)
-    made.batch.begin(made.plan, made.entries)
-    executor = submitit.LocalExecutor(tmp_path / "jobs")
-    executor.update_parameters(timeout_min=5)
-    task = executor.submit(engines.SlurmTask(Job(made.batch, made.plan), made.entries))
-    assert task.result() == {"done": 3}
-    Scenes(tmp_path / "b").run()
-    others = BatchFolder(tmp_path / "b/out").records("done")
-    assert made.digests() == {one.scene: one.digest for one in others}
 
 
 @pytest.mark.parametrize("option", ["array=0-3", "time=1\n#SBATCH --wrap=x", "--partition=gpu", ""])

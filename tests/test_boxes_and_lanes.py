@@ -53,8 +53,6 @@ def test_a_box_ahead_projects_to_its_front_face_scaled_and_truncated() -> None:
     ((found, truth),) = street_scores.nta_truths(VIEW, [track("car", 0, 0, 11)])
     assert found.label == "car"
     assert truth.tolist() == [216, 136, 264, 184]
-    ((_, published),) = street_scores.nta_truths(VIEW, [track("car", 0, 0, 11)], as_published=True)
-    assert published.tolist() == truth.tolist()  # nothing is behind the camera
     camera = Camera("front", 960, 800, 480.0, 480.0, 481.0, 400.0)
     ((_, truth),) = street_scores.nta_truths(View(camera, np.eye(4), 0.0), [track("car", 0, 0, 11)])
     # Left: (481 - 48) / 2 = 216.5 -> 216; top: (400 - 48) * 0.4 = 140.8 -> 140.
@@ -67,19 +65,6 @@ def test_a_box_ahead_projects_to_its_front_face_scaled_and_truncated() -> None:
 )
 def test_people_and_what_is_behind_or_not_whole_in_the_image_do_not_count(other: Track) -> None:
     assert street_scores.nta_truths(VIEW, [other]) == []
-
-
-def test_a_box_beside_the_camera_becomes_garbage_only_as_published() -> None:
-    beside = track("car", -3.0, 0.0, 0.4, (1.0, 1.0, 4.0))  # from 1.6 m behind the camera to 2.4 m ahead
-    cut = street_scores.clipped_box(VIEW, beside.world_from_object[0], beside.size_m)
-    garbage = street_scores.published_box(VIEW, beside.world_from_object[0], beside.size_m)
-    # Corners behind the camera change sides: the published box reaches far to the right of a car on the left.
-    assert garbage[2] > 480 * 1.2
-    assert cut is None or cut[2] <= 240 - 240 * 2.5 / 2.4 + 1e-6
-    # Tuned to fall inside the image: kept as published, dropped when cut.
-    small = track("car", -0.4, 0.0, 0.0, (0.2, 0.2, 2.0))
-    assert street_scores.nta_truths(VIEW, [small]) == []
-    assert len(street_scores.nta_truths(VIEW, [small], as_published=True)) == 1
 
 
 def test_the_nearest_centre_decides_not_the_best_overlap() -> None:

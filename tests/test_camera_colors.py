@@ -1,7 +1,5 @@
 """Cameras of different exposure: the maps that are found, and that clouds, conditions and fits use them."""
 
-import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,9 +9,7 @@ import torch
 from fit_settings import fit_config
 
 from mudg.base import config as configuration
-from mudg.base import store
 from mudg.base.camera_colors import SAME_COLORS, CameraColors, ColorMap
-from mudg.base.errors import InputError
 from mudg.base.types import Photo
 from mudg.core.calibration import match_cameras
 from mudg.core.raster.rasterize import RasterConfig
@@ -170,12 +166,3 @@ def test_a_scene_has_common_colors_and_every_camera_shows_its_own(city, tmp_path
         render_view(model, front, RasterConfig(near_m=0.2)).rgb,
         render_view(replace(model, colors=SAME_COLORS), front, RasterConfig(near_m=0.2)).rgb,
     )
-
-
-def test_damaged_maps_are_refused(city, tmp_path):
-    shutil.copytree(city[1].parent / "dark_fuse", tmp_path / "fuse")
-    head = store.read_json(tmp_path / "fuse" / "fuse.json")
-    head["camera_colors"]["to_common"]["front_left"]["gain"] = [1.0, -1.0, 1.0]
-    (tmp_path / "fuse" / "fuse.json").write_text(json.dumps(head))
-    with pytest.raises(InputError, match="fuse.json is malformed"):
-        read_fused(tmp_path / "fuse")

@@ -16,6 +16,7 @@ from mudg.base.types import Gaussians, Track
 from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.core.table import Table
 from mudg.gaussians import fit, trust
+from mudg.gaussians.corrections import UNCORRECTED
 from mudg.gaussians.model import SceneModel, compose
 from mudg.gaussians.nodes import RigidNode, SkyNode, StaticNode
 from mudg.gaussians.rendering import render_condition
@@ -83,7 +84,7 @@ def test_sums_are_those_of_every_gaussians_weight_in_double_precision():
     alone = replace(in_double(gaussians), extra=torch.eye(ROWS, dtype=torch.float64))
     weights = rasterize(alone, view.view, RasterConfig(backend="torch", near_m=0.2)).extra
     with torch.no_grad():
-        images = difference_images(model, rasterize(gaussians, view.view, RASTER), view, None)
+        images = difference_images(model, rasterize(gaussians, view.view, RASTER), view, UNCORRECTED)
     expected = torch.einsum("nhw,khw->kn", weights, images.double())
     found = weight_sums(model, view, RASTER)
     assert (expected[0] > 1).sum() > ROWS // 2
@@ -95,7 +96,7 @@ def test_images_of_differences():
     model, view = tiny_model(), photograph().as_tensors()
     with torch.no_grad():
         render = rasterize(compose(model, 0.0, semantics=False), view.view, RASTER)
-    used, color, lidar, depth = difference_images(model, render, view, None)
+    used, color, lidar, depth = difference_images(model, render, view, UNCORRECTED)
     assert used[-4:].sum() == 0 and used[:-4].min() == 1
     assert color[-4:].abs().sum() == 0 and color.max() > 0.05
     assert int(lidar.sum()) == 100

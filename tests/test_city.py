@@ -346,7 +346,8 @@ def assert_same_truth(one: CityTruth, other: CityTruth) -> None:
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
-def test_rebuilt_from_the_recipe_bit_for_bit(world: CityWorld) -> None:
+def test_rebuilt_from_the_recipe_bit_for_bit() -> None:
+    world = CityWorld(replace(CONFIG, light="night", wet=0.5, snow_cover=0.3, fog_visibility_m=300.0))
     source, view = world.source(), world.frame_views("front")[4]
     stored = json.loads(json.dumps(dict(source.recipe or {})))
     again = CityWorld.from_source(Source(source.dataset, source.licence, stored, source.notes))

@@ -120,10 +120,3 @@ def test_lamps_light_the_road_at_night() -> None:
     shown = light.response.decode(truth.rgb)[road][:, 1] / np.maximum(surfaces.albedo[road][:, 1], 1e-3)
     assert np.corrcoef(level, shown)[0, 1] > 0.85  # shadows of what stands between are all that differs
     assert np.median(shown / (level + light.surroundings.ambient[1])) == pytest.approx(1, abs=0.2)
-
-
-def test_a_city_in_bad_weather_is_rebuilt_from_its_recipe() -> None:
-    world = CityWorld(replace(CLEAR, light="night", wet=0.5, snow_cover=0.3, fog_visibility_m=300.0))
-    again = CityWorld.from_source(world.source())
-    at = world.frame_views("front")[0]
-    np.testing.assert_array_equal(world.render(at).rgb, again.render(at).rgb)

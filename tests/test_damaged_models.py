@@ -25,7 +25,7 @@ from mudg.baselines.emernerf import load_field, save_field
 from mudg.baselines.emernerf_field import Budget
 from mudg.core.table import Table
 from mudg.diffusion import model_files
-from mudg.gaussians.appearance import COLOR, Appearance
+from mudg.gaussians.corrections import COLOR, Appearance
 from mudg.gaussians.storage import StartFit, all_classes, kind_of, load_appearance, save_appearance, save_model
 from mudg.labels import street_net
 from mudg.steps.fitted import FittedScene

@@ -6,6 +6,8 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,6 +46,14 @@ def write_set(run: tuple[Path, Path], name: str, out: Path, path: Path | None = 
     scene, fit = run
     chosen = DatasetConfig(**settings)
     return Dataset(format=name, runs=(fit,), scene=scene, path=path, out=out, settings=chosen).run()
+
+
+def provenance(out: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (out / "provenance.jsonl").read_text().splitlines()]
+
+
+def labeller_of(run: tuple[Path, Path], lidar: str = "") -> Labeller:
+    return Labeller(Session(run[1], scene=run[0]), lidar)
 
 
 # -- formats ---------------------------------------------------------------------------------------
@@ -99,13 +109,13 @@ def test_rectangles_and_truncation() -> None:
 
 def test_kitti_is_read_again_with_the_same_pixels_and_boxes(run: tuple[Path, Path], tmp_path: Path) -> None:
     out = write_set(run, "kitti", tmp_path / "kitti", cameras=("front",), shifts_m=(0.0, 0.5), least_pixels=1)
-    lines = [json.loads(line) for line in (out / "provenance.jsonl").read_text().splitlines()]
+    lines = provenance(out)
     assert [line["view"].split("/")[0] for line in lines[:: len(lines) - 1]] == ["front_recorded", "front_shift+0.5"]
     number = next(index for index, line in enumerate(lines) if "car" in line["labels"])
     mudg.ingest(str(out), out=tmp_path / "back", sequence=f"{number:06d}", test_every=0)
     back = mudg.read_scene(tmp_path / "back")
     (frame,) = back.frames
-    labelled = Labeller(Session(run[1], scene=run[0])).label("x", labelled_view(run, lines[number]), ("rgb",))
+    labelled = labeller_of(run).label("x", labelled_view(run, lines[number]), ("rgb",))
     written = np.asarray(Image.open(out / "image_2" / f"{number:06d}.png"))
     assert np.array_equal(labelled.layers["rgb"], written)
     assert np.array_equal(np.asarray(Image.open(tmp_path / "back" / frame.image.path)), written)
@@ -148,12 +158,12 @@ def test_coco_agrees_with_its_panoptic_images_and_pycocotools_reads_its_masks(
 def test_a_sequence_of_kitti_is_read_again_with_its_poses_tracks_and_scans(
     run: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    chosen = {"cameras": ("front",), "shifts_m": (0.0, 0.5), "least_pixels": 1, "lidar": "vlp16"}
+    chosen = {"cameras": ("front",), "shifts_m": (0.0, 0.5), "every": 2, "least_pixels": 1, "lidar": "vlp16"}
     out = write_set(run, "kitti-tracking", tmp_path / "kitti", **chosen)
     assert (out / "ImageSets/train.txt").read_text().split() == ["0000", "0001"]
     mudg.ingest(str(out), out=tmp_path / "back", sequence="0001", test_every=0)
     back = mudg.read_scene(tmp_path / "back")
-    lines = [json.loads(line) for line in (out / "provenance.jsonl").read_text().splitlines()]
+    lines = provenance(out)
     lines = [line for line in lines if line["view"].startswith("front_shift")]
     theirs = [frame.view.world_from_cam for frame in back.frames_of(next(iter(back.cameras)))]
     mine = [np.array(line["world_from_camera"]) for line in lines]
@@ -166,7 +176,7 @@ def test_a_sequence_of_kitti_is_read_again_with_its_poses_tracks_and_scans(
             pose = ids["car"].pose_at(back.frames[index].view.time_s)
             there = geometry.invert(mine[index])[:3] @ np.array([*box["position_world_m"], 1.0])
             assert np.abs(there - (geometry.invert(theirs[index]) @ pose)[:3, 3]).max() < 1e-3
-    labeller = Labeller(Session(run[1], scene=run[0]), "vlp16")
+    labeller = labeller_of(run, "vlp16")
     again = labeller.label("x", labelled_view(run, lines[0]), ("rgb",)).sweep
     points = mudg.read_points(back, back.sweeps[0])
     assert again is not None and len(points.xyz) == len(again.reply.xyz) > 50
@@ -177,7 +187,7 @@ def test_a_sequence_of_kitti_is_read_again_with_its_poses_tracks_and_scans(
 
 
 def test_returns_lie_on_what_the_log_measured_and_are_counted_by_box(run: tuple[Path, Path]) -> None:
-    labeller = Labeller(Session(run[1], scene=run[0]), "hdl64")
+    labeller = labeller_of(run, "hdl64")
     scene, view = labeller.scene, labeller.scene.frames_of("front")[2].view
     labelled = labeller.label("x", view, ("rgb",))
     world = geometry.transform_points(labelled.sweep.world_from_lidar, labelled.sweep.reply.xyz.astype(float))
@@ -198,8 +208,10 @@ def test_drives_of_one_split_share_no_list_with_those_of_the_other(tmp_path: Pat
         for (scene, fit, _, _), name, split in zip(runs, ("a", "b"), ("train", "val"), strict=True)
     ]
     for name in ("kitti", "coco", "nuscenes"):
-        work = FakeWork(tmp_path / name)
-        summary = write.write_dataset(name, DatasetConfig(cameras=("front",)), drives, work)
+        (tmp_path / name).mkdir()
+        summary = write.write_dataset(
+            name, DatasetConfig(cameras=("front",)), drives, SimpleNamespace(path=tmp_path / name)
+        )
         assert summary["images"] == 10
     lists = {split: (tmp_path / f"kitti/ImageSets/{split}.txt").read_text().split() for split in ("train", "val")}
     assert (lists["train"], lists["val"]) == ([f"{n:06d}" for n in range(5)], [f"{n:06d}" for n in range(5, 10)])
@@ -210,14 +222,6 @@ def test_drives_of_one_split_share_no_list_with_those_of_the_other(tmp_path: Pat
     assert splits == {"train": ["scene-a-recorded"], "val": ["scene-b-recorded"]}
 
 
-class FakeWork:
-    """The folder of a result."""
-
-    def __init__(self, path: Path) -> None:
-        path.mkdir()
-        self.path = path
-
-
 def test_a_path_of_your_own_stands_for_the_shifts(run: tuple[Path, Path], tmp_path: Path) -> None:
     scene = mudg.read_scene(run[0])
     poses = [frame.view.world_from_cam.copy() for frame in scene.frames_of("front")[1:3]]
@@ -226,7 +230,7 @@ def test_a_path_of_your_own_stands_for_the_shifts(run: tuple[Path, Path], tmp_pa
     file = tmp_path / "drone.txt"
     file.write_text("".join(" ".join(map(repr, pose[:3].ravel().tolist())) + "\n" for pose in poses))
     out = write_set(run, "coco", tmp_path / "coco", file, cameras=("front",), fov_deg=70.0)
-    lines = [json.loads(line) for line in (out / "provenance.jsonl").read_text().splitlines()]
+    lines = provenance(out)
     assert [line["view"] for line in lines] == ["drone/000000", "drone/000001"]
     assert np.abs(np.array([line["world_from_camera"] for line in lines]) - poses).max() < 1e-9
     views = as_dataset(run[1], run[0], path=file, cameras="front", fov_deg=70.0, lidar="vlp16")
@@ -248,8 +252,8 @@ def test_its_own_reader_loads_123d(run: tuple[Path, Path], tmp_path: Path) -> No
     assert {path.name for path in out.iterdir()} >= {"logs", "provenance.jsonl"} and not (out / "samples").exists()
     builder = ArrowSceneBuilder(out / "logs", tmp_path)
     (scene,) = builder.get_scenes(SceneFilter(iteration_threshold=100), SequentialExecutor())
-    lines = [json.loads(line) for line in (out / "provenance.jsonl").read_text().splitlines()]
-    labeller = Labeller(Session(run[1], scene=run[0]), "vlp16")
+    lines = provenance(out)
+    labeller = labeller_of(run, "vlp16")
     assert scene.number_of_iterations == len(lines)
     for index, line in enumerate(lines):
         labelled = labeller.label("x", labelled_view(run, line), ("rgb",))
@@ -301,7 +305,7 @@ def test_a_full_disk_is_said_before_anything_is_drawn(
 
 
 def test_objects_seen_from_unknown_sides_and_tiny_ones_are_left_out(run: tuple[Path, Path]) -> None:
-    labeller = Labeller(Session(run[1], scene=run[0]))
+    labeller = labeller_of(run)
     recorded = labeller.scene.frames_of("front")[1].view
     here = labeller.label("x", recorded, ("rgb",))
     (car,) = (box for box in here.boxes if box.label == "car")
@@ -402,7 +406,7 @@ def overlap(a: tuple[float, ...], b: tuple[float, ...]) -> float:
 def test_nuscenes_tables_refer_to_each_other_and_boxes_lie_where_they_are(
     run: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    chosen = {"cameras": ("front",), "shifts_m": (0.0, 0.5), "least_pixels": 1, "lidar": "vlp16"}
+    chosen = {"cameras": ("front",), "shifts_m": (0.0, 0.5), "every": 2, "least_pixels": 1, "lidar": "vlp16"}
     out = write_set(run, "nuscenes", tmp_path / "nuscenes", **chosen)
     tables = {path.stem: json.loads(path.read_text()) for path in (out / "v1.0-mini").glob("*.json")}
     known = {name: {row["token"]: row for row in rows} for name, rows in tables.items()}
@@ -419,7 +423,7 @@ def test_nuscenes_tables_refer_to_each_other_and_boxes_lie_where_they_are(
                     assert value in known[target], f"{name}.{key}"
                 if key in ("prev", "next") and value:
                     assert known[name][value][{"prev": "next", "next": "prev"}[key]] == row["token"]
-    lines = {line["view"]: line for line in map(json.loads, (out / "provenance.jsonl").read_text().splitlines())}
+    lines = {line["view"]: line for line in provenance(out)}
     matrix = lambda row: geometry.from_rotation_translation(
         geometry.matrix_from_quaternion(row["rotation"]), row["translation"]
     )
@@ -449,7 +453,7 @@ def test_layers_of_render_are_those_of_the_views_and_say_how_far_to_trust_them(
     scene, fit = run
     names = ("instances", "normals", "motion", "distance", "confidence")
     out = mudg.render(scene, fit, out=tmp_path / "r", shifts_m=(0.0, 0.5), layers=names, video=False)
-    labeller = Labeller(Session(fit, scene=scene))
+    labeller = labeller_of(run)
     for folder in ("front_recorded", "front_shift+0.5"):
         index = json.loads((out / "layers" / folder / "layers.json").read_text())
         assert list(index["objects"].values()) == list(labeller.names)

@@ -151,7 +151,7 @@ def test_opacity_reset_only_lowers_and_needles_are_shortened():
     with torch.no_grad():
         model.table["logits"][0] = -6.0
     model.table.moment1["logits"] += 1
-    reset_opacity(model, SETTINGS)
+    reset_opacity(model)
     opacity = torch.sigmoid(model.table["logits"])
     assert opacity.max().item() == pytest.approx(0.01, rel=1e-4)
     assert opacity[0] < 0.005

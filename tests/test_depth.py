@@ -114,17 +114,6 @@ def test_a_few_measurements_are_enough_for_finite_depth(count: int) -> None:
     assert (dense.depth > 0).all()
 
 
-def test_same_in_same_out_and_inputs_untouched() -> None:
-    rgb, depth, sky = street()
-    measured = sampled(depth)
-    copies = rgb.copy(), measured.copy(), sky.copy()
-    beyond = np.zeros_like(sky)
-    first, second = (complete_depth(rgb, measured, sky, beyond) for _ in range(2))
-    assert np.array_equal(first.depth, second.depth)
-    for now, before in zip((rgb, measured, sky), copies, strict=True):
-        assert np.array_equal(now, before, equal_nan=now.dtype == np.float32)
-
-
 def test_what_does_not_answer_is_far() -> None:
     view = View(CAMERA, LEVEL, 0.0)
     rgb = np.full((HEIGHT, WIDTH, 3), 100, np.uint8)

@@ -8,7 +8,7 @@ import math
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,6 @@ from toy_scene import ToyStreet
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
 from mudg.diffusion.settings import ConvertConfig
 from mudg.labels import depthlab
-from mudg.labels import depthlab as conversion
 from mudg.labels.depth_networks import kind_of, load_depth_network
 from mudg.labels.depthlab import DepthLab, DepthLabSampling, clip_crop, known_depth, linear_fill, prepare
 from mudg.labels.inputs import DepthInput
@@ -52,10 +51,9 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str,
 def converted(published: tuple[Path, dict[str, Any]], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The converted folder, with a sampling for small images."""
     to = tmp_path_factory.mktemp("weights") / "depthlab"
-    conversion.convert_folder(published[0], to, None, 20_000)
-    sampling = {"processing_px": 768, "steps": 50, "strength": 0.8, "normalize_scale": 1.0}
-    assert json.loads((to / "model.json").read_text())["sampling"] == sampling
-    return describe(to, sampling={"processing_px": 48, "steps": 5, "strength": 0.8, "normalize_scale": 1.0})
+    depthlab.convert_folder(published[0], to, None, 20_000)
+    assert json.loads((to / "model.json").read_text())["sampling"] == asdict(DepthLabSampling())
+    return describe(to, sampling=asdict(SAMPLING))
 
 
 def describe(folder: Path, **other: object) -> Path:
@@ -69,23 +67,28 @@ def describe(folder: Path, **other: object) -> Path:
 
 
 def test_conversion_keeps_every_value(published: tuple[Path, dict[str, Any]], converted: Path) -> None:
-    folder, made = published
+    made = published[1]
     told = json.loads((converted / "model.json").read_text())
     assert kind_of(converted) == told["kind"] == "depthlab"
-    parts = depthlab.read_parts(converted, told)
-    for name in ("denoising_unet", "mapping_layer", "vae"):
-        assert same(getattr(parts, name).state_dict(), made[name].state_dict())
-    beginning = {k: v for k, v in made["reference_unet"].state_dict().items() if not k.startswith("conv_") or "in" in k}
-    assert same(parts.reference_unet.state_dict(), beginning)
+    model = DepthLab(converted)
+    found = {**model.networks, "mapping_layer": model.mapping}
+    for name in ("denoising_unet", "vae"):
+        assert same(found[name].state_dict(), made[name].state_dict())
+    assert same(found["mapping_layer"], made["mapping_layer"].state_dict())
+    spare, reference = ("conv_norm_out", "conv_out"), found["reference_unet"].state_dict()
+    assert all(
+        torch.equal(reference[k], v) for k, v in made["reference_unet"].state_dict().items() if not k.startswith(spare)
+    )
+    assert not any(value.any() for name, value in reference.items() if name.startswith(spare))
     vision = {k: v for k, v in made["clip"].state_dict().items() if k.startswith(("vision_model", "visual_projection"))}
-    assert same(parts.image_encoder.state_dict(), vision)
+    assert same(found["image_encoder"].state_dict(), vision)
     image = torch.rand(1, 3, 28, 28, generator=torch.Generator().manual_seed(0))
     expected = made["clip"].visual_projection(made["clip"].vision_model(image).pooler_output)
-    assert torch.allclose(parts.image_encoder(image).image_embeds, expected, atol=1e-6)
-    assert (parts.denoising_unet.config.in_channels, parts.reference_unet.config.in_channels) == (12, 4)
-    assert len(told["parts"]["denoising_unet"]["files"]) > 1  # cut to the size that was asked for
+    assert torch.allclose(found["image_encoder"](image).image_embeds, expected, atol=1e-6)
+    assert [found[name].config.in_channels for name in ("denoising_unet", "reference_unet")] == [12, 4]
+    assert len(list((converted / "denoising_unet").glob("*.safetensors"))) > 1  # cut to the size that was asked for
     listed = {source["file"] for source in told["facts"]["sources"]}
-    assert {f"DepthLab/{name}" for name in conversion.PICKLES.values()} < listed
+    assert {f"DepthLab/{part}.pth" for part in ("denoising_unet", "reference_unet", "mapping_layer")} < listed
     assert all(len(source["sha256"]) == 64 for source in told["facts"]["sources"])
     assert {path.suffix for path in converted.rglob("*") if path.is_file()} == {".safetensors", ".json", ".md"}
 
@@ -95,14 +98,9 @@ def same(found: dict[str, Tensor], expected: dict[str, Tensor]) -> bool:
 
 
 def test_files_of_other_ages_give_the_same(published: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
-    """CLIP as a pickle, with the table that it once held and a default said twice; the autoencoder's attention under
-    its old names."""
+    """A CLIP that says a default twice; the autoencoder's attention under its old names; half precision."""
     folder, made = tmp_path / "copy", published[1]
     shutil.copytree(published[0], folder)
-    clip = made["clip"].state_dict()
-    (folder / CLIP / "model.safetensors").unlink()
-    older = {**clip, "vision_model.embeddings.position_ids": torch.arange(5)[None]}
-    torch.save(older, folder / CLIP / "pytorch_model.bin")
     told = json.loads((folder / CLIP / "config.json").read_text())
     inner = {**told["vision_config"], "projection_dim": 512, "num_beams": 1, "torch_dtype": None}
     (folder / CLIP / "config.json").write_text(json.dumps({**told, "vision_config": inner}))
@@ -113,12 +111,12 @@ def test_files_of_other_ages_give_the_same(published: tuple[Path, dict[str, Any]
         renamed[name] = value
     file = folder / "marigold-depth-v1-0" / "vae" / "diffusion_pytorch_model.safetensors"
     save_file(renamed, file, metadata={"format": "pt"})
-    conversion.convert_folder(folder, tmp_path / "out", torch.float16, 1 << 20)
-    parts = depthlab.read_parts(tmp_path / "out", json.loads((tmp_path / "out" / "model.json").read_text()))
+    depthlab.convert_folder(folder, tmp_path / "out", torch.float16, 1 << 20)
+    networks = DepthLab(tmp_path / "out").networks
     rounded = {name: value.half().float() for name, value in made["vae"].state_dict().items()}
-    assert renamed.keys() != rounded.keys() and same(parts.vae.state_dict(), rounded)
-    found = parts.image_encoder.visual_projection.weight
-    assert torch.equal(found, clip["visual_projection.weight"].half().float())
+    assert renamed.keys() != rounded.keys() and same(networks["vae"].state_dict(), rounded)
+    found = networks["image_encoder"].visual_projection.weight
+    assert torch.equal(found, made["clip"].visual_projection.weight.half().float())
 
 
 @pytest.mark.slow
@@ -175,13 +173,10 @@ def without(file: str) -> Callable[[Path], None]:
 BAD = {
     "a missing file": (without("DepthLab/reference_unet.pth"), r"missing[\s\S]*reference_unet\.pth"),
     "no base": (without("marigold-depth-v1-0/unet/config.json"), r"is missing[\s\S]*marigold-depth-v1-0"),
-    "no encoder weights": (without(f"{CLIP}/model.safetensors"), r"is missing[\s\S]*model\.safetensors"),
+    "no encoder weights": (without(f"{CLIP}/model.safetensors"), r"CLIPModel"),
     "code": (edited("mapping_layer.pth", lambda s: s.update(x=Hostile())), r"was not loaded[\s\S]*mkdir"),
     "a missing tensor": (edited("denoising_unet.pth", lambda s: s.pop("conv_out.bias")), r"1 missing: conv_out\.bias"),
-    "an unknown tensor": (
-        edited("reference_unet.pth", lambda s: s.update({"conv_out.bias": torch.ones(4)})),
-        r"1 unexpected: conv_out\.bias",
-    ),
+    "an unknown tensor": (edited("reference_unet.pth", lambda s: s.update(x=torch.ones(4))), "1 unexpected: x"),
     "another shape": (
         edited("denoising_unet.pth", lambda s: s.update({"conv_in.weight": torch.ones(8, 8, 3, 3)})),
         r"conv_in\.weight \(8, 8, 3, 3\) instead of \(8, 12, 3, 3\)",
@@ -208,7 +203,7 @@ def test_what_is_not_depthlab_is_refused(
     monkeypatch.chdir(tmp_path)
     spoil(tmp_path / "from")
     with pytest.raises(InputError, match=message):
-        conversion.convert_folder(tmp_path / "from", tmp_path / "out", None, 1 << 20)
+        depthlab.convert_folder(tmp_path / "from", tmp_path / "out", None, 1 << 20)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["from"]
 
 
@@ -224,22 +219,19 @@ def test_a_converted_folder_that_changed_or_lacks_a_package_is_refused(
         load_depth_network(folder)
     file.write_bytes(content)
     told = json.loads((folder / "model.json").read_text())
-    parts, wide = told["parts"], {**told["parts"]["vae"]["config"], "latent_channels": 8}
     for other, message in (
-        ({"schema": 2}, "not a DepthLab model of this version"),
+        ({"schema": 1}, "not a DepthLab model of this version"),
         ({"sampling": {"steps": 50}}, "the field 'processing_px' is missing"),
-        ({"parts": {**parts, "vae": {}}}, "KeyError: 'config'"),
-        (
-            {"parts": {**parts, "mapping_layer": {**parts["mapping_layer"], "config": {"a": 1}}}},
-            "description of a network",
-        ),
-        ({"parts": {**parts, "vae": {**parts["vae"], "config": wide}}}, "not the network it should be"),
-        ({"scheduler": {"_class_name": "LCMScheduler"}}, "LCMScheduler"),
+        ({"files": None}, "a DepthLab model"),
     ):
         (folder / "model.json").write_text(json.dumps({**told, **other}))
         with pytest.raises(InputError, match=message):
             load_depth_network(folder)
-    (folder / "model.json").write_text(json.dumps(told))
+    schedule = folder / "scheduler" / "scheduler_config.json"
+    schedule.write_text(json.dumps({"_class_name": "LCMScheduler"}))
+    files = {name: sha256 for name, sha256 in told["files"].items() if not name.startswith("scheduler")}
+    with pytest.raises(InputError, match="LCMScheduler"):
+        load_depth_network(describe(folder, **{**told, "files": files}))
     tiny_networks.hide(monkeypatch, "diffusers")
     with pytest.raises(ResourceError, match=r"mudg\[models\]"):
         load_depth_network(folder)
@@ -274,23 +266,23 @@ def test_linear_interpolation_is_exact_on_planes_and_zero_outside() -> None:
 
 def test_what_is_prepared_spans_the_known_depth() -> None:
     given, _ = street(30, 50)
-    made = prepare(given, replace(SAMPLING, normalize_scale=0.5), 4, 28)
+    made = prepare(given, 48, 4, 28)
     assert made.size == (28, 48) and made.image.shape == (1, 3, 28, 48)
     seen = np.isfinite(given.measured) & ~given.sky
     assert (made.low_m, made.high_m) == (given.measured[seen].min(), given.measured[seen].max())
     known = made.missing == 0
     for plane in (made.nearest, made.linear):
-        assert float(plane[known].min()) == pytest.approx(-0.5, abs=1e-5)
-        assert float(plane[known].max()) == pytest.approx(0.5, abs=1e-5)
+        assert float(plane[known].min()) == pytest.approx(-1, abs=1e-5)
+        assert float(plane[known].max()) == pytest.approx(1, abs=1e-5)
     assert torch.equal(made.nearest[known], made.linear[known]) and set(made.missing.unique().tolist()) == {0.0, 1.0}
-    same_size = prepare(given, replace(SAMPLING, processing_px=50), 8, 28)
+    same_size = prepare(given, 50, 8, 28)
     assert same_size.image.shape == (1, 3, 32, 56)
     assert torch.equal(same_size.image[..., :30, 50:], same_size.image[..., :30, 49:50].expand(-1, -1, -1, 6))
     assert np.array_equal(same_size.missing[0, 0, :30, :50].numpy() == 0, seen)
     assert np.array_equal(((same_size.image[0, :, :30, :50].permute(1, 2, 0) + 1) * 127.5).round().numpy(), given.rgb)
     in_the_sky = np.where(given.sky, np.float32(50), np.float32(np.nan))  # is not known
     with pytest.raises(InputError, match="LiDAR"):
-        prepare(DepthInput(given.rgb, in_the_sky, given.filled, given.sky), SAMPLING, 2, 28)
+        prepare(DepthInput(given.rgb, in_the_sky, given.filled, given.sky), 48, 2, 28)
 
 
 @pytest.mark.parametrize(("height", "width"), [(48, 72), (90, 40), (10, 12)])
@@ -380,9 +372,9 @@ def twin(made: dict[str, Any], inputs: depthlab.Prepared, noise: Tensor, samplin
 
 def test_denoising_is_that_of_a_twin_written_out(converted: Path, tmp_path: Path) -> None:
     made = tiny_networks.depthlab(tmp_path)
-    model = DepthLab.load(converted)
+    model = DepthLab(converted)
     given, _ = street(30, 50, measured=0.4)  # 28 x 48 of processing: odd sizes on the way down
-    inputs = prepare(given, SAMPLING, 2, 28)
+    inputs = prepare(given, SAMPLING.processing_px, 2, 28)
     noise = torch.randn(1, 4, 14, 24, generator=torch.Generator().manual_seed(1))
     found = model.predict(inputs, noise)
     with torch.no_grad():
@@ -408,7 +400,7 @@ def test_the_number_of_steps_is_honoured(converted: Path) -> None:
         model = load_depth_network(converted, steps=steps)
         assert isinstance(model, DepthLab)
         calls: list[int] = []
-        model._parts.denoising_unet.register_forward_pre_hook(lambda _, __, calls=calls: calls.append(1))
+        model.networks["denoising_unet"].register_forward_pre_hook(lambda _, __, calls=calls: calls.append(1))
         model(given)
         assert len(calls) == made
     for steps, message in ((1, "at least 2"), (2000, "<= 1000")):

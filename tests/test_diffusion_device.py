@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from pretend_device import copies, pretend_device
+from pretend_device import Transfer, pretend_device, transfers
 from test_published import some_condition
 from toy_clips import HEIGHT, WIDTH, interrupted_at, losses_of, made_up_clip, tiny, with_settings, write_clips
 from toy_published import tiny_model, write_tiny
@@ -19,7 +19,6 @@ from toy_scene import ToyStreet
 from mudg.base import log, store
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.types import Condition
-from mudg.core.depth import fit_depth
 from mudg.diffusion import model_files, parallel
 from mudg.diffusion.model import MDM
 from mudg.diffusion.models import model_config
@@ -46,6 +45,11 @@ def far_apart(one: torch.Tensor, other: torch.Tensor) -> float:
     assert torch.equal(a.isnan(), b.isnan()) and not a.isinf().any()
     a, b = a.nan_to_num(), b.nan_to_num()
     return float((a - b).abs().max() / a.abs().max().clamp(min=1e-12))
+
+
+def crossed(seen: list[Transfer], way: str, more_than: int = 1) -> list[int]:
+    """Sizes of the tensors that went that way, sorted; single numbers are left out."""
+    return sorted(copy.values for copy in seen if copy.way == way and copy.values > more_than)
 
 
 def check_same_clip(one: GeneratedClip, other: GeneratedClip) -> None:
@@ -93,16 +97,16 @@ def test_a_clip_of_the_small_model_is_the_same_on_a_device_and_crosses_once(smal
     clip, finished = small.sampled_and_finished(condition, fine, request)
     with pretend_device() as there:
         small.to(there)
-        with copies() as crossed:
+        with transfers() as seen:
             clip_there, finished_there = small.sampled_and_finished(condition, fine, request)
     check_same_clip(clip, clip_there)
     check_same_clip(finished, finished_there)
     noise = [sum(clip.latents[m].numel() for m in clip.latents)] * 3  # a draw at the start and one between steps
-    assert sorted(crossed.to_device) == sorted([*(x.numel() for c in (condition, fine) for x in tensors_of(c)), *noise])
+    assert crossed(seen, "there") == sorted([*(x.numel() for c in (condition, fine) for x in tensors_of(c)), *noise])
     names = ("rgb", "depth", "semantics", "confidence", "log_error")
     back = [getattr(c, name).numel() for c in (clip, finished) for name in names]
     latents, fits = [z.numel() for z in clip.latents.values()], [4] * len(clip.depth_fits)
-    assert sorted(crossed.to_host) == sorted(back + latents + fits)
+    assert crossed(seen, "back") == sorted(back + latents + fits)
 
 
 def test_a_clip_of_the_published_kind_is_the_same_on_a_device_and_crosses_once():
@@ -110,30 +114,17 @@ def test_a_clip_of_the_published_kind_is_the_same_on_a_device_and_crosses_once()
     here = generated(model, condition, request)
     with pretend_device() as there:
         model.to(there)
-        with copies() as crossed:
+        with transfers() as seen:
             made = generated(model, condition, request)
     check_same_clip(here, made)
     latent = here.latents["rgb"].numel()
-    large = [n for n in crossed.to_device if n > 64]  # besides: labels, statistics of colours
     posterior, noise = [latent] * 2, [3 * latent] * 3  # of both planes; at the start and after each step
     palette = [19 * 3]
     given = [x.numel() for x in tensors_of(condition)]
-    assert sorted(large) == sorted(n for n in given + posterior + noise + palette if n > 64)
+    # besides: labels, statistics of colours
+    assert crossed(seen, "there", 64) == sorted(n for n in given + posterior + noise + palette if n > 64)
     back = [x.numel() for x in (here.rgb, here.depth, here.semantics, here.confidence, *here.latents.values())]
-    assert sorted(n for n in crossed.to_host if n > 4) == sorted(back)
-
-
-def test_depth_is_fitted_alike_on_a_device():
-    generator = torch.Generator().manual_seed(3)
-    measured = 5 + 40 * torch.rand(1, 20, 30, generator=generator)
-    made = 1.3 * measured + 2 + torch.randn(measured.shape, generator=generator)
-    made[:, :3] = 70.0
-    valid = torch.rand(measured.shape, generator=generator) > 0.3
-    here = fit_depth(made, measured, valid)
-    with pretend_device() as there:
-        fit = fit_depth(made.to(there), measured.to(there), valid.to(there))
-    assert (fit.scale, fit.shift_m) == pytest.approx((here.scale, here.shift_m), rel=1e-9)
-    assert fit.used and fit.residual == pytest.approx(here.residual, rel=1e-9)
+    assert crossed(seen, "back", 4) == sorted(back)
 
 
 # training -----------------------------------------------------------------------------------------
@@ -222,12 +213,12 @@ def test_pretrained_networks_compute_on_the_device_and_answer_on_the_cpu():
         return [*segmenter.classes(rgb), depth(asked).values]
 
     here = answers(torch.device("cpu"))
-    with pretend_device() as place, copies() as crossed:
+    with pretend_device() as place, transfers() as seen:
         there = answers(place)
     for a, b in zip(here, there, strict=True):
         assert isinstance(b, np.ndarray) and np.allclose(a, b, atol=1e-5)
-    assert crossed.to_host == [3 * 600, 600]  # probabilities, depth
-    assert sorted(crossed.to_device)[-2:] == [3 * 600, 3 * 600]  # two images
+    assert crossed(seen, "back") == [600, 3 * 600]  # depth, probabilities
+    assert crossed(seen, "there")[-2:] == [3 * 600, 3 * 600]  # two images
 
 
 def test_what_a_device_does_not_do_is_said(street, small, tmp_path, monkeypatch):

@@ -277,13 +277,6 @@ def broken_links(page: Path) -> list[str]:
     return problems
 
 
-def wrong_lengths(page: Path) -> list[str]:
-    """Linked files of which the page says another number of lines."""
-    text = page.read_text(encoding="utf-8")
-    claims = re.findall(r"\]\(([^)\s]+\.py)\)[^.\n]* (\d+) lines", text)
-    return [p for p, n in claims if len((page.parent / p).read_text(encoding="utf-8").splitlines()) != int(n)]
-
-
 @pytest.mark.parametrize("page", TEXTS, ids=name_of)
 def test_flags_settings_paths_names_and_links_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
@@ -292,7 +285,6 @@ def test_flags_settings_paths_names_and_links_exist(page: Path) -> None:
     assert not unknown_paths(text)
     assert not unknown_names(text)
     assert not broken_links(page)
-    assert not wrong_lengths(page)
 
 
 def rows_after(text: str, heading: str) -> dict[str, list[str]]:
@@ -350,6 +342,3 @@ def test_what_does_not_exist_is_found(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("# One head\n[a](other.md) [b](#one-head) [c](#two)", encoding="utf-8")
     assert broken_links(page) == ["other.md", "#two"]
-    (tmp_path / "code.py").write_text("a = 1\n", encoding="utf-8")
-    page.write_text("[code](code.py) has 2 lines", encoding="utf-8")
-    assert wrong_lengths(page) == ["code.py"]

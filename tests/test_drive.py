@@ -14,7 +14,7 @@ from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera
-from mudg.scene.road import Road
+from mudg.scene.motion import Road
 from mudg.sim.drive import SURROUNDINGS, BicycleState, Box, Car, Cockpit, Controls, Drive, Following, RoadUser
 from mudg.sim.pilots import DriverView, EdgePilot, PlanPilot, RoutePilot
 from mudg.sim.session import Session

@@ -82,14 +82,6 @@ def test_frames_are_counted_by_the_reference_and_held_out_together(tmp_path: Pat
     assert sorted(i for i, s in scene.split.items() if s == "test") == ["a/000003", "b/000003", "c/000000"]
 
 
-def test_workers_and_resolution_change_nothing_but_size(tmp_path: Path) -> None:
-    drive = made(tmp_path / "log")
-    one = write_log(drive, tmp_path / "one", ImportOptions(resolution=16))
-    four = write_log(drive, tmp_path / "four", ImportOptions(resolution=16, workers=4))
-    assert (tmp_path / "one" / "scene.json").read_bytes() == (tmp_path / "four" / "scene.json").read_bytes()
-    assert (one.cameras["a"].width, four.cameras["a"].fx) == (16, 15.0)
-
-
 def test_missing_files_are_counted_per_sensor_or_left_out(tmp_path: Path) -> None:
     drive = made(tmp_path / "log")
     (tmp_path / "log" / "b2.png").unlink()

@@ -20,7 +20,6 @@ from mudg.base.palette import ID
 from mudg.base.types import Camera, FusedCloud, PointCloud, Track, View
 from mudg.baselines.bezier import BezierNode
 from mudg.baselines.omnire import DeformedNode
-from mudg.benchmarks.cities import city_keys
 from mudg.city import layout as rec
 from mudg.city.config import CityConfig
 from mudg.city.world import CityWorld
@@ -533,7 +532,9 @@ def test_the_city_is_drawn_again_with_an_object_elsewhere_or_with_another_look()
     track = city.tracks()[number - 1]
     assert city.instance_of(track.id) == number
     assert not (city.rearranged({track.id: None}).render(frame).instance == number).any()
-    keys = city_keys(Motion.recorded(track.times_s, track.world_from_object), track.size_m[2])
+    poses = Motion.recorded(track.times_s, track.world_from_object).poses
+    yaws = np.unwrap([geometry.yaw_of(pose) for pose in poses])
+    keys = np.column_stack([poses[:, :2, 3], poses[:, 2, 3] - track.size_m[2] / 2, yaws])
     for same in (city.rearranged({track.id: keys}), city.recast(track.id, city.objects[number - 1])):
         assert np.array_equal(same.render(frame).rgb, truth.rgb)
     away = city.rearranged({track.id: keys + np.array([0, 0.5, 0, 0])}).render(frame)

@@ -24,7 +24,6 @@ EVERY_VERB = """
 - sky: {image: sky.png, yaw_deg: 20}
 - weather: {fog: {visibility_m: 150}, rain: {mm_h: 10}, wet: 0.8, puddles: 0.3, snow: {cover: 0.6, mm_h: 2}}
 - light: {time: dusk, exposure_ev: -1.5}
-- season: {leaves: autumn}
 """
 
 

@@ -18,7 +18,7 @@ from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
 from mudg.editing.apply import complete_asset, hidden_by
 from mudg.editing.model import SHOWN, Hidden, continued, noted, shaded_cells, with_closed_sides, without_traces
-from mudg.editing.plan import Actor, EditWorld, plan_edits, shown_anew
+from mudg.editing.plan import Actor, EditWorld, plan_edits, shown_sides
 from mudg.editing.script import parse_edits
 from mudg.gaussians.model import CERTAINTY, SceneModel
 from mudg.gaussians.nodes import RigidNode, SkyNode, StaticNode
@@ -319,7 +319,7 @@ def test_only_what_is_seen_from_another_side_is_closed(text: str, views: list[Vi
     """Of a vehicle that moves, and of one that another path shows."""
     ego = Motion.recorded(np.array(TIMES, float), np.stack([geometry.yaw_matrix(0.0)] * len(TIMES)))
     plan = plan_edits(parse_edits(text, "sides"), EditWorld({"car": ACTOR}, ego), lambda source: None)
-    assert shown_anew(plan, VIEWS, views) == ({"car"} if closed else set())
+    assert shown_sides(plan, VIEWS, views)[1] == ({"car"} if closed else set())
 
 
 def test_an_asset_has_all_its_sides() -> None:

@@ -45,9 +45,8 @@ from mudg.sim.session import CameraRequest, Instant, Session
 from mudg.steps.edit import Edit
 from mudg.steps.render import RenderViews
 from mudg.steps.synthesize import Synthesize
-from mudg.viewer.live import FrameRequest, FrameSource
 from mudg.viewer.settings import ViewConfig
-from mudg.viewer.view import server_of
+from mudg.viewer.view import FrameRequest, FrameSource, server_of
 
 CAR = (0.6, 1.0, 1.0)
 
@@ -236,8 +235,10 @@ def test_a_repaired_view_is_the_mean_of_render_and_generated_view(run: Path, tmp
     inputs, loaded = JobInputs(run / "scene", run / "fuse", run / FITTED), files.load(model)
     result = step.run()
     for name, factor in (("front_recorded", 0.5), ("front_shift+1.5", 1.5)):
-        for render, one in zip(views_of(plain, name), views_of(result, name), strict=True):
-            view = view_maker(again, inputs, [render.view], loaded, None).make([render.view], 0, None)[2][0]
+        pairs = list(zip(views_of(plain, name), views_of(result, name), strict=True))
+        maker = view_maker(again, inputs, [pairs[0][0].view], loaded, None)
+        for render, one in pairs:
+            view = maker.make([render.view], 0, None)[2][0]
             weight = factor * view.confidence
             share = (weight / (1 + weight)).numpy()
             wanted = (1 - share) * render.rgb.numpy() + share * view.rgb.numpy()

@@ -17,9 +17,9 @@ from mudg import app, steps
 from mudg.base import store
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.run_folder import RunDir
-from mudg.steps.batch import stage_lines
 from mudg.steps.command import parse, words_of
 from mudg.steps.engine import Make, Output, Result, paths_of
+from mudg.steps.run import stage_lines
 from mudg.steps.step import Flag
 
 LINES = {
@@ -147,6 +147,11 @@ class Lines(Output):
         return {"files": len(texts)}
 
 
+def interrupted(number: int) -> None:
+    if number == 1:
+        raise KeyboardInterrupt
+
+
 @pytest.fixture
 def lines(tmp_path: Path) -> Lines:
     """Two files as inputs."""
@@ -177,12 +182,6 @@ def test_another_result_is_replaced_only_on_demand_and_only_when_the_new_one_is_
     lines: Lines, tmp_path: Path
 ) -> None:
     lines.run()
-
-    def interrupted(number: int) -> None:
-        assert (tmp_path / "out" / "0.txt").read_text() == "a"
-        if number == 1:
-            raise KeyboardInterrupt
-
     other = replace(lines, end="!", overwrite=True)
     with pytest.raises(KeyboardInterrupt):
         replace(other, stop=interrupted).run()
@@ -195,10 +194,6 @@ def test_another_result_is_replaced_only_on_demand_and_only_when_the_new_one_is_
 
 
 def test_an_interrupted_step_says_so_lets_go_and_goes_on(lines: Lines, tmp_path: Path) -> None:
-    def interrupted(number: int) -> None:
-        if number == 1:
-            raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
         replace(lines, stop=interrupted).run()
     assert store.read_json(tmp_path / "out" / "run.json")["state"] == "interrupted"
@@ -226,15 +221,9 @@ def test_what_cannot_be_done_is_refused_before_anything_is_written(lines: Lines,
 
 
 class OneFile(Lines):
-    """The same in one file."""
-
-    @property
-    def is_file(self) -> bool:
-        """Yes."""
-        return True
+    is_file = True
 
     def written(self, texts: list[str], work: Any) -> dict[str, Any]:
-        """All texts."""
         (self.stop or str)(0)
         store.write_text(work.path, "".join(texts))
         return {"files": len(texts)}

@@ -20,8 +20,8 @@ import mudg
 from mudg import app
 from mudg.base import geometry, store
 from mudg.base.errors import UsageError
-from mudg.base.plugins import GROUP, load_plugin, plugins
 from mudg.base.types import Scene
+from mudg.base.versions import GROUP, load_plugin, plugins
 from mudg.core.metrics import METRICS
 from mudg.formats.splats.formats import FORMATS
 from mudg.gaussians.recipes import RECIPES

@@ -78,18 +78,11 @@ def test_errors_of_the_system_are_put_in_words(
     assert what in said and "what to do" in said and "Traceback" not in said
 
 
-def test_mistakes_of_the_program_stay_what_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mistakes_of_the_program_stay_what_they_are() -> None:
     for error in (KeyError("a"), RuntimeError("shape mismatch"), ImportError("no module"), ZeroDivisionError()):
         assert failures.in_words(error) is None
     own = InputError("x")
     assert failures.in_words(own) is own
-
-    def fail(_args: object) -> dict[str, object]:
-        raise KeyError("a")
-
-    monkeypatch.setattr(Learn, "run", fail)
-    with pytest.raises(KeyError):
-        app.main(["learn", "--out", "x"])
 
 
 def test_an_allocation_that_cannot_succeed_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:

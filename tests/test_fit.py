@@ -29,7 +29,7 @@ from mudg.gaussians import fit
 from mudg.gaussians import start as fit_start
 from mudg.gaussians import trust as fit_trust
 from mudg.gaussians import views as fit_views
-from mudg.gaussians.appearance import Appearance
+from mudg.gaussians.corrections import Appearance
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.schedule import FiniteCheck
@@ -92,14 +92,6 @@ def test_it_learns(world, learnt, tmp_path):
         assert semantics[int(uv[0, 1]), int(uv[0, 0])] == ID["car"]
 
 
-def test_same_in_same_out(world, tmp_path):
-    first = fit_to(world, tmp_path / "a", settings(iterations=12)).run()
-    second = fit_to(world, tmp_path / "b", settings(iterations=12)).run()
-    assert fitted_bytes(first) == fitted_bytes(second)
-    other = fit_to(world, tmp_path / "c", settings(iterations=12, seed=1)).run()
-    assert fitted_bytes(other) != fitted_bytes(first)
-
-
 def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypatch):
     """Ctrl-C and SIGTERM before and after virtual views join, a densification and an opacity reset; learnt poses and
     all. Bit for bit."""
@@ -120,10 +112,9 @@ def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypat
     assert fitted_bytes(replace(step, out=parts).run()) == fitted_bytes(whole)
 
 
-@pytest.mark.parametrize("densify", ["gradient", "none"])
-def test_results_depend_neither_on_threads_nor_on_what_is_remembered(world, tmp_path, monkeypatch, densify):
+def test_results_depend_neither_on_threads_nor_on_what_is_remembered(world, tmp_path, monkeypatch):
     """Row counts kept between densifications, and any number of threads: the same bytes."""
-    config = settings(iterations=22, densify__kind=densify)
+    config = settings(iterations=22)
     first = fit_to(world, tmp_path / "a", config).run()
 
     def counted_again(model):
@@ -218,8 +209,7 @@ def test_a_non_finite_loss_is_named_and_changes_nothing(world, tmp_path, monkeyp
     assert stepped == [1, 2, 3, 4]
 
 
-@pytest.mark.parametrize("at_once", [True, False])
-def test_a_non_finite_gradient_is_named_and_never_reaches_the_parameters(world, at_once):
+def test_a_non_finite_gradient_is_named_and_never_reaches_the_parameters(world):
     scene = read_scene(world["scene"])
     frames = fit_views.training_frames(scene, ())
     classes = fit_views.classes_of(scene, frames, {})
@@ -229,7 +219,7 @@ def test_a_non_finite_gradient_is_named_and_never_reaches_the_parameters(world, 
     model.table["log_scales"].grad[3, 1] = float("inf")
 
     def check_two_views():
-        check = FiniteCheck(9, at_once)
+        check = FiniteCheck(9)
         check.gradients("front/000001", model, Appearance({}))
         check.gradients("front/000002", model, Appearance({}))
         check.refuse()
@@ -377,7 +367,7 @@ def test_what_only_virtual_views_see():
     hidden_y = 0.45 * 2  # the box spans |y| < 0.45 at x = 3, so it hides |y| < 0.9 of the wall at x = 6
     column = np.arange(cam.width) + 0.5
     witness = np.where(np.abs((column - cam.cx) / cam.fx * 3) < 0.45, 3.0, 6.0).astype(np.float32)
-    recorded = fit_trust._Witness(ahead, np.repeat(witness[None], cam.height, 0))
+    recorded = (ahead, np.repeat(witness[None], cam.height, 0))
     shape = (cam.height, cam.width)
     black, depth = np.zeros((*shape, 3), np.uint8), np.full(shape, 6.0, np.float32)
     shown = fit_views.StoredView("side", side, "virtual", black, depth=depth)
@@ -399,7 +389,7 @@ def test_what_a_moving_object_shows_is_asked_where_the_object_was():
     shape = (cam.height, cam.width)
     black, depth = np.zeros((*shape, 3), np.uint8), np.full(shape, 5.2, np.float32)
     shown = fit_views.StoredView("v", now, "virtual", black, depth=depth)
-    witness = fit_trust._Witness(late, np.full(shape, 5.2, np.float32))
+    witness = (late, np.full(shape, 5.2, np.float32))
     middle = (cam.height // 2, cam.width // 2)
     assert not fit_trust._unseen(shown, [witness], [(node.size_m, node.pose_matrix)])[middle]
     assert fit_trust._unseen(shown, [witness], [])[middle]  # without the box the point stays 40 m to the side

@@ -17,32 +17,25 @@ import torch
 from fit_settings import fit_config, fit_to, interrupted, small_fit
 from pretend_device import Transfer, pretend_device, transfers
 from test_scene_options import EVERYTHING, written_world
-from test_score_metrics import lpips_state
 from toy_world import camera, view_at
 
 from mudg.base import store
-from mudg.base.camera_colors import CameraColors, ColorMap
 from mudg.base.config import result_settings
 from mudg.base.errors import NumericsError, ResourceError, UsageError
-from mudg.benchmarks import chain, cities, rows
+from mudg.benchmarks import chain, rows
 from mudg.benchmarks.settings import BenchConfig
 from mudg.core import native_ops
 from mudg.core.raster import rasterize as place
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
-from mudg.editing.settings import RenderConfig, ScoreConfig
 from mudg.gaussians import fit
-from mudg.gaussians.appearance import Appearance
+from mudg.gaussians.corrections import Appearance
 from mudg.gaussians.densify import DensifySettings, DensifyStats, densify
-from mudg.gaussians.model import SceneModel, compose
-from mudg.gaussians.nodes import SkyNode, StaticNode
-from mudg.gaussians.perception import perception_of
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.nodes import StaticNode
 from mudg.gaussians.rendering import render_planes
 from mudg.gaussians.schedule import FiniteCheck
-from mudg.gaussians.settings import FitConfig, VirtualConfig
-from mudg.scene.observations import read_observations
-from mudg.scoring import score
-from mudg.steps.render import RenderViews, Score
+from mudg.gaussians.settings import FitConfig
 from mudg.steps.settings import RunConfig, with_device
 
 SIZE, FRAMES = (36, 24), 4
@@ -227,7 +220,7 @@ def test_what_is_not_finite_is_found_in_one_look(world):
     with pretend_device() as there:
         table = Table({"means": torch.zeros(3, 3), "logits": torch.zeros(3)}).to(there)
         model = SceneModel(table, (StaticNode(),), None, (), 0)
-        check = FiniteCheck(7, at_once=False)
+        check = FiniteCheck(7)
         with transfers() as seen:
             table["means"].grad = torch.zeros(3, 3, device=there)
             table["logits"].grad = torch.full((3,), torch.inf, device=there)
@@ -268,64 +261,6 @@ def test_a_fitted_scene_moves_and_renders_the_same(plain_fit):
         assert torch.equal(mine[1], theirs[1])
 
 
-def test_objects_stand_on_another_device_where_they_do_here(plain_fit):
-    model = fit.load_model(plain_fit)
-    node = model.dynamic_object("walker")
-    node.add_offsets(*(0.1 * values + 0.05 for values in node.offset_values()))
-    with pretend_device() as there:
-        moved = model.to(there)
-        for time_s in (0.0, 0.25, 0.4, 9.0):
-            there, here = (compose(one, time_s).means.cpu() for one in (moved, model))
-            torch.testing.assert_close(there, here, atol=1e-6, rtol=1e-6)
-        far = moved.dynamic_object("walker")
-        with transfers() as seen:
-            first = far.pose_matrix(0.25)
-            for _ in range(3):
-                assert (far.pose_matrix(0.25) == first).all()
-        assert len(seen) == 0
-        assert (first == node.pose_matrix(0.25)).all()
-        far.add_offsets(*far.offset_values())
-        node.add_offsets(*node.offset_values())
-        torch.testing.assert_close(compose(moved, 0.25).means.cpu(), compose(model, 0.25).means, atol=1e-6, rtol=1e-6)
-
-
-def test_the_sky_and_colors_of_cameras_are_there_without_a_copy():
-    sky = SkyNode.uniform(8)
-    sky.table["panorama"].detach().copy_(torch.rand(1, 3, 8, 16, generator=torch.Generator().manual_seed(0)))
-    for yaw_rad in (0.0, 2.0):
-        view = view_at(0.3, camera(width=50, height=30), yaw_rad=yaw_rad)
-        here = sky.coarse_picture(view)
-        with pretend_device() as there:
-            moved = sky.to(there)
-            with transfers() as seen:
-                made = moved.coarse_picture(view)
-            assert not seen
-            torch.testing.assert_close(made.cpu(), here, atol=1e-5, rtol=1e-5)
-    colors = CameraColors("front", {"rear": ColorMap((1.1, 0.9, 1.3), (0.02, -0.01, 0.1))})
-    rgb = torch.rand(3, 5, 4, generator=torch.Generator().manual_seed(0))
-    with pretend_device() as there:
-        moved = rgb.to(there)
-        assert colors.image_of("front", moved) is moved
-        assert torch.equal(colors.image_of("rear", moved).cpu(), colors.image_of("rear", rgb))
-        with transfers() as seen:
-            colors.image_of("rear", moved)
-        assert not seen
-
-
-@pytest.mark.parametrize("kind", ["filters", "lpips"])
-def test_perceptual_distances_are_those_of_the_cpu(tmp_path, kind):
-    store.write_safetensors(tmp_path / "lpips.safetensors", lpips_state())
-    config = VirtualConfig(perception=kind, lpips_weights=str(tmp_path / "lpips.safetensors"))
-    draw = torch.Generator().manual_seed(0)
-    rgb, truth_rgb, weight = (torch.rand(count, 40, 48, generator=draw) for count in (3, 3, 1))
-    with twins():
-        here = perception_of(config)(rgb, truth_rgb, weight)
-    with pretend_device() as there:
-        made = perception_of(config, there)(*(image.to(there) for image in (rgb, truth_rgb, weight)))
-        assert made.device == there
-        torch.testing.assert_close(made.cpu(), here, atol=1e-6, rtol=1e-5)
-
-
 # ---- which device --------------------------------------------------------------------------------
 
 
@@ -361,42 +296,12 @@ def test_steps_and_benchmarks_follow_the_device_of_a_run_unless_they_have_their_
     assert with_device(RunConfig()) == RunConfig()
     assert result_settings(made) == result_settings(RunConfig())
     assert "device" not in json.dumps(result_settings(made))
-    config = BenchConfig(device="cuda:1", methods=("street_gaussians",), variant=("wide=width_px:64",))
-    fits = [row.fit for row in rows.shift_rows(config)] + [row.fit for row in rows.real_rows(config) if row.varied]
-    assert len(fits) == 3
-    every = (*fits, rows.usual_fit(config), cities.fit_settings(config))
+    config = BenchConfig(device="cuda:1", methods=("street_gaussians", "mudg_s"))
+    fits = [row.fit for row in rows.method_rows(config)]
+    assert len(fits) == 2
+    every = (*fits, rows.usual_fit(config))
     assert {one.device for one in every} == {"cuda:1"}
     monkeypatch.setattr(chain, "drawing_device", lambda wanted, purpose: PRETEND if wanted == "cuda:1" else CPU)
     assert chain.at_once(config) == 1
     assert chain.at_once(replace(config, processes=3)) == 3
     assert chain.at_once(replace(config, device="cpu")) == os.cpu_count()
-
-
-# ---- render and score ----------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_render_and_score_on_another_device(world, plain_fit, tmp_path, monkeypatch):
-    drawn = RenderConfig(cameras=("front",), shifts_m=(0.0,), video=False, raster="torch", device="cpu")
-    step = RenderViews(scene=world["scene"], model=plain_fit, out=tmp_path / "here", settings=drawn)
-    with twins():
-        here = step.run()
-    step = replace(step, settings=replace(drawn, device="pretend"))
-    with pretend_device():
-        there = replace(step, out=tmp_path / "there").run()
-        assert step.run() == here  # a result is one on any device
-    mine, theirs = (read_observations(folder / "front_recorded") for folder in (there, here))
-    for index in range(len(mine)):
-        torch.testing.assert_close(mine[index].rgb, theirs[index].rgb, atol=1 / 254, rtol=0)
-    config = ScoreConfig(baseline=False, perceptual_views=2, error_pictures=False, device="cpu")
-    monkeypatch.setattr(score, "computed_ahead", lambda compute, count, threads: map(compute, range(count)))
-    scored = Score(scene=world["scene"], views={"fit": here}, out=tmp_path / "score_here", settings=config)
-    with twins():
-        scored.run()
-    with pretend_device(), transfers() as seen:
-        replace(scored, out=tmp_path / "score_there", settings=replace(config, device="pretend")).run()
-    assert {copy.where.partition(":")[0] for copy in seen if copy.values > NUMBERS} == {"networks/featnets.py"}
-    found = [store.read_json(tmp_path / name / "metrics.json") for name in ("score_here", "score_there")]
-    values = [document["by_distance"][0]["values"] for document in found]
-    assert values[0]["perceptual"] == pytest.approx(values[1]["perceptual"], rel=1e-5)
-    assert {**values[0], "perceptual": 0} == {**values[1], "perceptual": 0}

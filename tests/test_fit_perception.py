@@ -12,9 +12,9 @@ from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.core.losses import lpips_distance, unit_features
 from mudg.core.metrics import Pair
-from mudg.gaussians.perception import lpips_network, perception_of
+from mudg.gaussians.fit import perception_of
 from mudg.gaussians.settings import VirtualConfig
-from mudg.networks.featnets import PerceptualDistance
+from mudg.networks.featnets import LpipsFeatures, PerceptualDistance
 
 
 def random(seed: int, *shape: int) -> torch.Tensor:
@@ -31,7 +31,7 @@ def test_gradient_of_the_loss():
 def test_the_loss_is_the_scorers_distance_where_all_is_certain(tmp_path):
     path = str(tmp_path / "lpips.safetensors")
     store.write_safetensors(Path(path), {key: value.numpy() for key, value in lpips_state().items()})
-    network = lpips_network(path)
+    network = LpipsFeatures(lpips_state())
     render, truth = random(5, 3, 48, 64).float(), random(6, 3, 48, 64).float()
     loss = perception_of(VirtualConfig(perception="lpips", lpips_weights=path))(render, truth, torch.ones(1, 48, 64))
     pair = Pair(
@@ -63,5 +63,5 @@ def test_lpips_without_or_with_other_weights_is_refused(tmp_path):
     with pytest.raises(UsageError, match="weight file"):
         perception_of(VirtualConfig(perception="lpips"))
     store.write_safetensors(tmp_path / "other.safetensors", {"x": torch.zeros(3).numpy()})
-    with pytest.raises(InputError, match="incomplete"):
+    with pytest.raises(InputError, match="not the network it should be"):
         perception_of(VirtualConfig(perception="lpips", lpips_weights=str(tmp_path / "other.safetensors")))

@@ -12,8 +12,8 @@ from mudg.base import geometry
 from mudg.base.config import to_dict
 from mudg.base.run_folder import RunDir
 from mudg.core.raster.rasterize import RasterConfig
+from mudg.gaussians import corrections as fit_poses
 from mudg.gaussians import fit
-from mudg.gaussians import poses as fit_poses
 from mudg.gaussians.model import compose
 from mudg.gaussians.rendering import outline_mask
 from mudg.scene.read import read_scene

@@ -53,7 +53,7 @@ def test_a_page_has_a_card_and_the_scores_of_every_run(tmp_path: Path) -> None:
     store.write_json(runs / "score" / "run.json", {"verb": "score", "state": "complete"})
     store.write_json(runs / "score" / "metrics.json", scores_of("kitti", 20.0))
     store.write_json(runs / "bench" / "bench.json", {"bench": "real"})
-    store.write_text(runs / "bench" / "page.html", "tables")
+    store.write_text(runs / "bench" / "bench.md", "tables")
     store.write_text(runs / "c" / "viewer_page" / "index.html", "a large viewer page")
     found = gallery.run([runs, runs / "c"], tmp_path / "pages" / "all.html")
     assert found["shown"] == 4  # c once
@@ -62,7 +62,7 @@ def test_a_page_has_a_card_and_the_scores_of_every_run(tmp_path: Path) -> None:
         run_of(tmp_path / "fleet" / name / "run" / "0123456789ab")
     assert gallery.run([tmp_path / "fleet"], tmp_path / "fleet.html")["shown"] == 2
     page = (tmp_path / "pages" / "all.html").read_text()
-    assert 'href="../runs/a%20b/report.html"' in page and 'href="../runs/bench/page.html"' in page
+    assert 'href="../runs/a%20b/report.html"' in page and 'href="../runs/bench/bench.md"' in page
     assert "viewer.html" not in page  # there is none, but a folder
     assert 'href="../runs/c/viewer_page/index.html"' in page
     assert page.count("data:image/jpeg;base64,") == 2

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mudg.base.geometry import yaw_matrix
-from mudg.labels.ground import CELL_M, distance_to_path, driven_path, fit_ground, ground_near, map_ground
+from mudg.labels.evidence import CELL_M, distance_to_path, driven_path, fit_ground, ground_near, map_ground
 
 KERB_AT_M = 4.0
 

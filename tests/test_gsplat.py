@@ -21,7 +21,6 @@ from mudg.base.types import View
 from mudg.core.raster import gsplat_cuda
 from mudg.core.raster import rasterize as raster
 from mudg.core.raster.rasterize import RasterConfig, rasterize
-from mudg.steps import doctor as diagnosis
 
 GSPLAT = RasterConfig(backend="gsplat")
 
@@ -262,14 +261,6 @@ def test_the_reason_why_it_cannot_be_used(monkeypatch: pytest.MonkeyPatch, tmp_p
     (tmp_path / "csrc.so").touch()
     assert gsplat_cuda.problem() == ""
     assert "came with it" in gsplat_cuda.status()
-    monkeypatch.setattr(diagnosis, "installed", lambda name: "1.5.3" if name == "gsplat" else "0")
-    _pretend_installed(monkeypatch, tmp_path, cuda=False)
-    assert diagnosis._optional()["gsplat"] == "1.5.3; cannot be used here: no CUDA device is available"
-    (tmp_path / "csrc.so").touch()
-    _pretend_installed(monkeypatch, tmp_path)
-    assert diagnosis._optional()["gsplat"] == "1.5.3; its kernels came with it"
-    monkeypatch.setattr(diagnosis, "installed", lambda name: None)
-    assert "pip install 'mudg[gsplat]'" in diagnosis._optional()["gsplat"]
 
 
 def test_a_missing_compiler_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:

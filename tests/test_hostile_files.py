@@ -202,9 +202,7 @@ def test_hostile_yaml_is_refused_at_once(name: str, tmp_path: Path, capsys: pyte
 LARGE = {
     "edits": "- remove: {ids: [car-001]}\n",
     "numbers": "- 1\n",
-    "texts": "- 'a'\n",
     "maps": "- {a: {b: {c: {d: 1}}}}\n",
-    "dashes": "- " * 30 + "1\n",
     "brackets": "- [[[[[[[[[[[[[[[[[[[[]]]]]]]]]]]]]]]]]]]]\n",
     "comments": "#\n",
 }

@@ -68,7 +68,7 @@ def test_short_clips_and_other_sizes_are_refused(state) -> None:
     for shape in ((1, 3, 8, 224, 224), (1, 3, 16, 256, 256), (1, 16, 3, 224, 224)):
         with pytest.raises(InputError, match="clips of one size"):
             network(torch.zeros(shape))
-    with pytest.raises(InputError, match="mine: Mixed_4e.b2a.bn.bias"):
+    with pytest.raises(InputError, match="missing: Mixed_4e.b2a.bn.bias"):
         i3d.I3DFeatures({name: value for name, value in state.items() if name != "Mixed_4e.b2a.bn.bias"}, "mine")
     refused("extra", i3d.I3DFeatures, {**state, "extra": torch.zeros(1)})
 
@@ -119,7 +119,7 @@ def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_clips_floor_and_reasons(weights: Path, tmp_path: Path) -> None:
     assert [videos.clip_count(n) for n in (0, 15, 16, 23, 24, 40)] == [0, 0, 1, 1, 2, 4]
     scene = read_scene(toy_views.write_scene(tmp_path / "scene"))
-    found = videos.videos_of(ScoreConfig(fvd_weights=str(weights), device="cpu"), scene, tmp_path)
+    found = videos.videos(scene, videos.ClipFiles(weights, "videogpt", tmp_path, torch.device("cpu")))
     same = videos.ImageSet(40, toy_views.colors)
     backwards = videos.ImageSet(40, lambda n: toy_views.colors(39 - n))
     sets = videos.TrajectorySets("front_shift+2.0", "front", 48, 32, {"a": same, "b": backwards}, None)

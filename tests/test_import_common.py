@@ -35,7 +35,7 @@ def test_every_item_is_done_once_and_a_generator_is_read_lazily(workers: int) ->
         with lock:
             done.append(n)
 
-    assert common.for_each(items(), work, workers=workers, title="t") == 20
+    common.for_each(items(), work, "t", 0, workers, str)
     assert sorted(done) == list(range(20))
     assert max(ahead) <= 2 * workers
 
@@ -55,7 +55,7 @@ def test_the_earliest_error_wins_and_names_its_item(workers: int) -> None:
             raise InputError("broken", where="scan.bin", got=str(n))
 
     with pytest.raises(InputError) as caught:
-        common.for_each(range(2000), work, workers=workers, title="t", name=lambda n: f"frame {n}")
+        common.for_each(range(2000), work, "t", 0, workers, lambda n: f"frame {n}")
     assert caught.value.got == "5"
     assert caught.value.where == "frame 5: scan.bin"
     assert len(started) < 2000

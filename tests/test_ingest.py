@@ -24,7 +24,7 @@ from mudg.formats.importers import IMPORTERS, files_of
 from mudg.formats.importers.common import ImportOptions
 from mudg.formats.settings import IngestConfig
 from mudg.scene.labels import read_label
-from mudg.scene.read import read_image, read_points, read_scene
+from mudg.scene.read import read_image, read_scene
 from mudg.scene.schema import scene_to_json_text
 from mudg.steps.ingest import Ingest
 
@@ -54,14 +54,6 @@ def test_a_kitti_folder_is_recognised_and_equals_a_direct_import(tmp_path: Path)
     assert read_image(small, small.frames[0]).shape == (b.height, b.width, 3)
     assert (small.frames[3].view.world_from_cam == direct.frames[3].view.world_from_cam).all()
     assert any("resized" in note for note in small.source.notes)
-
-
-def test_flags_reach_the_importer_and_what_is_odd_is_said(tmp_path: Path) -> None:
-    drive = made.write_raw_drive(tmp_path / "day")
-    scene = read_scene(run(drive, tmp_path / "out", frames="1:6", test_every=2, untwist="no"))
-    assert len(scene.frames) == 5
-    assert sorted(i for i, s in scene.split.items() if s == "test") == ["front/000002", "front/000004"]
-    assert not read_points(scene, scene.sweeps[0]).dt_s.any()
 
 
 def test_the_number_of_workers_changes_nothing_and_is_no_other_configuration(tmp_path: Path) -> None:

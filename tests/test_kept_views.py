@@ -15,11 +15,10 @@ import numpy as np
 import pytest
 import torch
 from fit_settings import fit_to, interrupted, small_fit, written_street
-from pretend_device import pretend_device
 from scipy.spatial import cKDTree
 from toy_world import camera, view_at
 
-from mudg.base import scratch
+from mudg.base import memory
 from mudg.base.errors import ResourceError
 from mudg.gaussians import fit, trust
 from mudg.gaussians import views as fit_views
@@ -101,23 +100,11 @@ def test_every_combination_of_fields_and_number_types_comes_back_to_the_bit(tmp_
         assert_same(found, wanted)
 
 
-def test_views_grow_on_their_device(tmp_path):
-    stored = a_view(3)
-    with pretend_device() as there:
-        view, wanted = stored.as_tensors(there), stored.as_tensors()
-        given = [getattr(view, f.name) for f in fields(view) if isinstance(getattr(view, f.name), torch.Tensor)]
-        every = (*given, view.lidar.pixel, view.lidar.depth_m)
-        assert len(given) == 6 and all(tensor.device == there for tensor in every)
-        assert torch.equal(view.lidar.pixel.cpu(), wanted.lidar.pixel)
-        for name in ("rgb", "mask", "channels"):
-            assert torch.equal(getattr(view, name).cpu(), getattr(wanted, name))
-
-
 def test_a_mapped_array_keeps_its_values_and_has_no_name(tmp_path):
-    array = scratch.mapped_array(tmp_path, (3, 5000), np.float32)
+    array = memory.mapped_array(tmp_path, (3, 5000), np.float32)
     assert not array.any()
     array[:] = np.arange(15000).reshape(3, 5000)
-    scratch.rest_mapped()
+    memory.rest_mapped()
     assert np.array_equal(array, np.arange(15000).reshape(3, 5000))
     assert not list(tmp_path.iterdir())
 
@@ -126,9 +113,9 @@ def test_a_mapped_array_that_the_disk_has_no_room_for_is_an_error_in_words(tmp_p
     def full(*_: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(scratch.os, "posix_fallocate", full, raising=False)
+    monkeypatch.setattr(memory.os, "posix_fallocate", full, raising=False)
     with pytest.raises(ResourceError, match=r"cannot make a scratch file[\s\S]*No space left"):
-        scratch.mapped_array(tmp_path, (100,), np.uint8)
+        memory.mapped_array(tmp_path, (100,), np.uint8)
 
 
 # ---- whole fits ----------------------------------------------------------------------------------
@@ -140,12 +127,12 @@ def world(tmp_path_factory) -> dict[str, Path]:
 
 
 def settings():
-    few = {"start__gaussians": 600, "densify__max_gaussians": 1000, "preview_every": 12}
-    return small_fit("mudg_s", **few, poses__learn=True)
+    few = {"start__gaussians": 600, "densify__max_gaussians": 1000, "preview_every": 8}
+    return small_fit("mudg_s", iterations=16, **few, poses__learn=True)
 
 
 def result_of(folder: Path) -> dict[str, bytes]:
-    names = ("gaussians.safetensors", "nodes.safetensors", "model.json", "preview/000012.png", "preview/000024.png")
+    names = ("gaussians.safetensors", "nodes.safetensors", "model.json", "preview/000008.png", "preview/000016.png")
     return {name: (folder / name).read_bytes() for name in names}
 
 

@@ -15,8 +15,8 @@ from mudg.base import geometry, store
 from mudg.base.errors import UsageError
 from mudg.base.geometry import invert
 from mudg.base.types import View
-from mudg.formats.importers import kitti_files as kitti_boxes
-from mudg.formats.importers.kitti_files import read_calibration_day, read_calibration_text, read_timestamps
+from mudg.formats.importers import kitti as kitti_boxes
+from mudg.formats.importers.kitti import read_calibration_day, read_calibration_text, read_timestamps
 from mudg.scene.read import read_image, read_points
 
 ingest = bad_logs.importer("kitti")

@@ -14,7 +14,6 @@ from toy_fitted import write_toy_run
 import mudg
 from mudg.base.errors import ResourceError
 from mudg.base.types import Camera, Condition, Trajectory, View
-from mudg.core import metrics
 from mudg.core.metrics import Pair
 from mudg.diffusion import views as generating
 from mudg.diffusion.settings import SynthesizeConfig
@@ -52,24 +51,6 @@ def test_a_view_that_cannot_fit_is_refused_before_the_work(tmp_path: Path, monke
         mudg.render(scene, fit, out=tmp_path / "views", width_px=1_000_000)
     assert "TiB" in refused.value.expected and refused.value.got == "64.0 GiB free"
     assert "--width-px" in refused.value.remedy
-
-
-def test_motion_found_in_bands_is_that_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    noise = torch.Generator().manual_seed(2)
-    depth = torch.rand(2, 1, 37, 23, generator=noise) * 20 + 5
-    ids = torch.randint(0, 19, (2, 37, 23), generator=noise)
-    instance = torch.randint(0, 3, (37, 23), generator=noise)
-    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
-    poses[1, 2, 3] = 0.4
-    lens = torch.tensor([20.0, 20.0, 11.5, 18.5], dtype=torch.float64)
-    frames = [metrics.TrueFrame(depth[n], ids[n], poses[n], lens) for n in (0, 1)]
-    whole = metrics.pixel_motion(*frames, {1: poses[1]}, instance)
-    monkeypatch.setattr(metrics, "WHOLE_PIXELS", 0)
-    monkeypatch.setattr(metrics, "BAND_PIXELS", 23 * 8)
-    bands = metrics.pixel_motion(*frames, {1: poses[1]}, instance)
-    assert bands.there.shape == whole.there.shape and whole.same.any()
-    torch.testing.assert_close(bands.there, whole.there, rtol=1e-6, atol=1e-6)
-    assert torch.equal(bands.same, whole.same)
 
 
 def test_trajectories_are_made_one_after_another_where_memory_lasts_for_one(

@@ -192,6 +192,7 @@ class NoCredentialsError(Exception):
         (Answer(403), "refused access"),
         (Answer(400), "cannot do"),
         (NoCredentialsError("none"), "no credentials"),
+        (ZeroDivisionError(), ""),
     ],
 )
 def test_failures_are_told(
@@ -204,19 +205,12 @@ def test_failures_are_told(
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "wJalrXUtnFEMI")
     at = Location.of("memory://bucket/x")
     for call in (at.load, lambda: at.save(b"1"), at.names, at.exists, at.tree):
-        with pytest.raises(ResourceError, match=words) as caught:
+        with pytest.raises(ResourceError if words else ZeroDivisionError, match=words or None) as caught:
             call()
+        if not words:  # a mistake of the program is not hidden
+            continue
         assert caught.value.where == "memory://bucket/x" and caught.value.remedy
         assert "wJalrXUtnFEMI" not in str(caught.value)
-
-
-def test_a_mistake_of_the_program_is_not_hidden(before: Callable[..., None]) -> None:
-    def fail(name: str, args: tuple[Any, ...], options: dict[str, Any]) -> None:
-        raise ZeroDivisionError
-
-    before(fail)
-    with pytest.raises(ZeroDivisionError):
-        Location.of("memory://bucket/x").load()
 
 
 # ---- folders -------------------------------------------------------------------------------------
@@ -228,7 +222,11 @@ def test_a_folder_goes_there_and_back(root: Location, tmp_path: Path) -> None:
     (made / ".x.abcdefgh.part").write_text("half")
     (root / "run").push(made)
     assert (root / "run").names() == ["_contents.json", "a", "empty", "manifest.json", "plain.txt", "run.json"]
+    (tmp_path / "back/a").mkdir(parents=True)
+    (tmp_path / "back/a/old").write_text("of an earlier version")
     (root / "run").fetch(tmp_path / "back")
+    assert (tmp_path / "back/a/old").exists()
+    (root / "run").fetch(tmp_path / "back", mirror=True)
     (made / "lock").unlink()
     (made / ".x.abcdefgh.part").unlink()
     assert content(tmp_path / "back") == content(made)
@@ -372,16 +370,6 @@ def test_a_fetch_goes_on_with_the_files_that_are_here(
     assert content(tmp_path / "back") == content(made)
     run.fetch(tmp_path / "back")
     assert len(asked) == 6, "what is here is not fetched again"
-
-
-def test_a_mirror_holds_nothing_else(root: Location, tmp_path: Path) -> None:
-    (root / "run").push(folder_of(tmp_path))
-    (tmp_path / "back/a").mkdir(parents=True)
-    (tmp_path / "back/a/old").write_text("of an earlier version")
-    (root / "run").fetch(tmp_path / "back")
-    assert (tmp_path / "back/a/old").exists()
-    (root / "run").fetch(tmp_path / "back", mirror=True)
-    assert content(tmp_path / "back") == content(tmp_path / "made")
 
 
 def test_a_full_disk_is_told_before_anything_is_fetched(

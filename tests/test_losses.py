@@ -117,7 +117,7 @@ def test_sky_semantics_and_objects_at_known_values():
     values = losses.object_map(torch.tensor([[[0.5, 0.999, 0.5]]], dtype=torch.float64), INSIDE)[0, 0]
     assert values[[0, 2]].tolist() == pytest.approx([math.log(2)] * 2) and values[1] < 0.01
     with pytest.raises(InputError, match="wrong shape"):
-        losses.l1_map(torch.zeros(3, 2, 2), torch.zeros(1, 2, 2))
+        losses.ssim_map(torch.zeros(3, 2, 2), torch.zeros(1, 2, 2))
 
 
 def distance(a: Tensor, b: Tensor) -> float:

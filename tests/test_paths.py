@@ -120,7 +120,7 @@ def test_a_far_path_is_drawn_with_a_warning_and_nothing_is_half_written(
     mudg.render(scene, fit, out=tmp_path / "far", path=tmp_path / "far.txt", width_px=40, video=False)
     assert "1 of 1 views are more than 5 m" in capsys.readouterr().err
     (tmp_path / "bad.txt").write_text("1 2 3\n")
-    refused("not a pose", mudg.render, scene, fit, out=tmp_path / "bad", path=tmp_path / "bad.txt")
+    refused("wrong number of values", mudg.render, scene, fit, out=tmp_path / "bad", path=tmp_path / "bad.txt")
     assert not (tmp_path / "bad").exists()
-    with pytest.raises(UsageError, match="without repairs and sweeps"):
+    with pytest.raises(UsageError, match="drawn without sweeps"):
         mudg.render(scene, fit, out=tmp_path / "x", path=tmp_path / "far.txt", lidar="scene")

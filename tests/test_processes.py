@@ -45,9 +45,7 @@ def folders(root: Path, *names: str) -> list[Path]:
 def test_an_error_crosses_a_process_boundary_as_it_is() -> None:
     sent = NumericsError("a loss is not finite", where="view 3, step 9", got="nan", remedy="look")
     error = error_from_record(json.loads(json.dumps(error_record(sent))))
-    assert isinstance(error, NumericsError)
-    assert (error.what, error.where, error.got, error.remedy) == (sent.what, sent.where, sent.got, sent.remedy)
-    assert error.exit_code == 6
+    assert isinstance(error, NumericsError) and (error.what, error.fields) == (sent.what, sent.fields)
 
 
 def mark(folder: Path) -> None:
@@ -75,13 +73,8 @@ def test_after_an_error_no_call_begins_any_more(tmp_path: Path) -> None:
     with pytest.raises(NumericsError, match="not finite"):
         list(run_in_processes(begin_and_fail, [(place, place.name == "a") for place in places], 2))
     assert {place.name for place in places if (place / "begun").exists()} <= {"a", "b"}
-
-
-def test_calls_end_in_any_order_and_all_are_told(tmp_path: Path) -> None:
-    places = folders(tmp_path, *"abcde")
     found = run_in_processes(begin_and_fail, [(place, False) for place in places], 3)
-    assert sorted(found) == [(n, None) for n in range(5)]
-    assert all((place / "begun").exists() for place in places) and list(run_in_processes(begin_and_fail, [], 2)) == []
+    assert sorted(found) == [(n, None) for n in range(6)] and all((place / "begun").exists() for place in places)
 
 
 def test_workers_of_a_parent_that_is_killed_end(tmp_path: Path) -> None:

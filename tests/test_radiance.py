@@ -308,12 +308,11 @@ def test_pixels_and_lidar_are_rays_of_the_world(world):
 
 def test_a_batch_of_pixels_shows_what_the_rays_meet(world):
     state, _ = started(world)
-    batch = state.pixels.batch(40, 0.25, seeds.torch_generator(0, 1, "batch"))
-    assert batch.rgb.shape == (40, 3) and batch.sky.dtype == torch.bool
-    assert not (batch.sky & (batch.rays.directions[:, 2] < -0.05)).any()  # no sky below the horizon
-    state.pixels.note(batch.cells, torch.ones(40))
-    assert (state.pixels.errors[batch.cells] == 1.0).all()
+    rays, (rgb, _, sky), cells = state.pixels.batch(40, 0.25, seeds.torch_generator(0, 1, "batch"))
+    assert rgb.shape == (40, 3) and sky.dtype == torch.bool
+    assert not (sky & (rays.directions[:, 2] < -0.05)).any()  # no sky below the horizon
+    state.pixels.note(cells, torch.ones(40))
+    assert (state.pixels.errors[cells] == 1.0).all()
     state.pixels.errors.zero_()
     state.pixels.errors[3] = 1.0
-    chosen = state.pixels.batch(40, 1.0, seeds.torch_generator(0, 2, "batch"))
-    assert (chosen.cells == 3).all()
+    assert (state.pixels.batch(40, 1.0, seeds.torch_generator(0, 2, "batch"))[2] == 3).all()

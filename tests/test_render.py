@@ -9,41 +9,30 @@ import av
 import numpy as np
 import pytest
 import torch
-from fit_settings import fit_config
 from refusals import refused
-from toy_world import CAR_SIZE, car_pose, fused_cloud, write_scene
+from toy_world import write_scene
 
-from mudg.base import geometry, store
+from mudg.base import store
 from mudg.base.errors import UsageError
 from mudg.base.palette import ID
-from mudg.core.raster.rasterize import RasterConfig
 from mudg.editing import render
 from mudg.editing.settings import RenderConfig
-from mudg.gaussians import fit
-from mudg.scene.clouds import write_fused
 from mudg.scene.observations import list_observation_sets, read_observations
-from mudg.scene.read import read_scene
-from mudg.steps.fit import Fit
 from mudg.steps.render import RenderViews
 
 FRAMES = 4
-SHIFTS = (0.0, 2.0, -3.0)
+
+
+@pytest.fixture
+def world(street_run: Path) -> dict[str, Path]:
+    return {"scene": street_run / "scene", "model": street_run / "fit" / "street_gaussians"}
 
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory) -> dict[str, Path]:
-    root = tmp_path_factory.mktemp("world")
-    write_scene(root / "scene", frames=FRAMES, cameras=("front", "left"), width=60, height=40)
-    write_fused(root / "fuse", fused_cloud(FRAMES), {})
-    config = fit_config(method="street_gaussians", iterations=60, start__gaussians=900, densify__max_gaussians=1500)
-    Fit(scene=root / "scene", fused=root / "fuse", out=root / "fit", settings=config).run()
-    return {"scene": root / "scene", "model": root / "fit"}
-
-
-@pytest.fixture(scope="module")
-def rendered(world, tmp_path_factory) -> Path:
-    settings = RenderConfig(shifts_m=SHIFTS)
-    return RenderViews(**world, out=tmp_path_factory.mktemp("r") / "out", settings=settings).run()
+def rendered(street_run: Path, tmp_path_factory) -> Path:
+    parts = {"scene": street_run / "scene", "model": street_run / "fit" / "street_gaussians"}
+    settings = RenderConfig(shifts_m=(0.0, 2.0, -3.0))
+    return RenderViews(**parts, out=tmp_path_factory.mktemp("r") / "out", settings=settings).run()
 
 
 def test_one_folder_and_video_per_trajectory(rendered):
@@ -105,20 +94,8 @@ def test_continues_after_an_interruption_and_reuses_what_is_finished(world, tmp_
     assert not calls
 
 
-def test_removing_the_car_shows_what_is_behind_it(world, tmp_path):
-    config = RenderConfig(shifts_m=(0.0,), video=False)
-    (tmp_path / "edits.yaml").write_text("- remove: {ids: [car], close_street: false}\n")
-    folder = RenderViews(**world, edits=tmp_path / "edits.yaml", out=tmp_path / "out", settings=config).run()
-    seen = read_observations(folder / "front_recorded")[1]
-    with_car = fit.render_view(fit.load_model(world["model"]), seen.view, RasterConfig())
-    uv, _ = geometry.project(seen.view, (car_pose(seen.view.time_s)[:3, 3] - [0, 0, CAR_SIZE[2] / 4])[None])
-    row, column = int(uv[0, 1]), int(uv[0, 0])
-    assert with_car.semantics[row, column] == ID["car"]
-    assert seen.semantics[row, column] != ID["car"]
-
-
-def test_any_camera_any_width(world):
-    scene = read_scene(world["scene"])
+def test_any_camera_any_width(tmp_path):
+    scene = write_scene(tmp_path / "scene", frames=2, cameras=("front", "left"), width=60, height=40)
     paths = render.trajectories(scene, RenderConfig(cameras=("left",), shifts_m=(0.0, -1.5), width_px=30))
     assert [path.name for path in paths] == ["left_recorded", "left_shift-1.5"]
     assert paths[0].views[0].camera.width == 30

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy import ndimage
-from test_clips import RULES, image_of_wall, some_clip, stripes, view_at, wall
+from test_clips import RULES, image_of_wall, stripes, view_at, wall
 from test_mdm import TINY, randomised, some_condition, some_ids
 from toy_clips import made_up_clip, with_patch
 
@@ -104,13 +104,13 @@ def test_what_a_render_shows_in_the_box_of_an_object_moves_with_it():
     assert bool(made.warped[0, 0][beside].all())
 
 
-@pytest.mark.parametrize(("alpha", "depth", "expected"), [(0.4, 40.0, "far"), (0.6, 40.0, 40.0), (1.0, 5000.0, "far")])
+@pytest.mark.parametrize(("alpha", "depth", "expected"), [(0.4, 40.0, None), (0.6, 40.0, 40.0), (1.0, 5000.0, None)])
 def test_what_the_render_hardly_covers_is_far_away(alpha, depth, expected):
-    made = build_conditions(
-        NOTHING, [], [view_at()], [], RULES, render_at=lambda view: flat_render(view, depth, alpha)
-    )[0]
-    assert not bool(made.valid.any())
-    assert bool((made.depth == (FAR_M if expected == "far" else expected)).all())
+    render_at = lambda view: flat_render(view, depth, alpha)
+    made = build_conditions(NOTHING, [], [view_at()], [], RULES, render_at=render_at)[0]
+    assert not bool(made.valid.any()) and bool((made.depth == (expected or FAR_M)).all())
+    published = build_conditions(NOTHING, [], [view_at()], [], replace(RULES, published=True), render_at=render_at)[0]
+    assert published.renders is None and not bool(published.depth.any())
 
 
 @pytest.mark.parametrize(
@@ -222,11 +222,6 @@ def test_renders_at_the_small_size_are_means_and_picks():
     assert set(shown.semantics.unique().tolist()) <= {3, 7}
 
 
-def test_the_published_condition_has_no_renders():
-    made = build_conditions(NOTHING, [], [view_at()], [], replace(RULES, published=True), render_at=flat_render)[0]
-    assert made.renders is None and not bool(made.depth.any())
-
-
 # training clips -----------------------------------------------------------------------------------
 
 
@@ -298,25 +293,6 @@ def test_clip_and_patch_are_varied_in_the_same_way():
     assert seen == {(False, False), (False, True), (True, False), (True, True)}
 
 
-@pytest.mark.parametrize(("size", "side"), [((192, 128), 96), ((48, 32), 60), ((304, 80), 96), ((32, 16), 24)])
-def test_patches_of_all_scales_have_one_side(size, side):
-    assert city_clips.patch_side(size) == side
-    for scale in (2, 3, 4):
-        full = some_clip(1, size[1] * scale, size[0] * scale)
-        full = replace(full, condition=replace(full.condition, semantics=None))
-        found = city_clips.cut_patch(full, scale, side, np.random.default_rng(scale))
-        assert found.clip.rgb.shape[-2:] == (side, side) and found.scale == scale
-        top, left = found.row * scale, found.column * scale
-        assert top + side <= size[1] * scale and left + side <= size[0] * scale
-        here = (..., slice(top, top + side), slice(left, left + side))
-        for name in ("rgb", "depth", "depth_valid", "semantics"):
-            assert torch.equal(getattr(found.clip, name), getattr(full, name)[here]), name
-        for name in ("color", "depth", "valid", "warped", "backdrop"):
-            assert torch.equal(getattr(found.clip.condition, name), getattr(full.condition, name)[here]), name
-        assert found.clip.condition.semantics is None
-        assert found.clip.condition.views[0].camera.width == side
-
-
 def test_clips_of_a_fitted_city_show_its_full_size_in_their_patches():
     if native.library() is None:
         pytest.skip("the native library is not built")
@@ -338,6 +314,7 @@ def test_clips_of_a_fitted_city_show_its_full_size_in_their_patches():
         truth = torch.from_numpy(log.truth(view).rgb).permute(2, 0, 1).float()
         rows, columns = (slice(3 * start, 3 * start + 60) for start in (fine.row, fine.column))
         assert torch.equal(fine.clip.rgb[0], truth[:, rows, columns])
+        assert fine.clip.condition.views[0].camera.width == 60
         assert fine.clip.condition.renders.color.shape == (1, 3, 60, 60)
         assert clip.condition.renders.color.shape == (1, 3, 32, 48)
 
@@ -416,12 +393,9 @@ def test_no_render_is_told_from_an_empty_one():
     assert torch.equal(both.planes[:1], missing.planes)
 
 
-def test_a_model_without_renders_ignores_them():
+def test_a_model_without_renders_ignores_them_and_one_with_them_does_not_give_them_up():
     model, plain = randomised(TINY), some_condition()
     first, second = (model.sample(c, SampleRequest(1)) for c in (plain, with_renders(plain)))
     assert torch.equal(first.rgb, second.rgb) and torch.equal(first.depth, second.depth)
-
-
-def test_renders_are_not_given_up_again():
     with pytest.raises(UsageError, match="another kind"):
         extended(randomised(WITH_RENDERS), TINY)

@@ -120,9 +120,7 @@ def test_the_page_is_well_formed_escapes_texts_and_loads_nothing(page: str) -> N
     assert "&lt;toy&gt; &amp; co" in page
 
 
-def test_the_report_holds_commands_that_can_be_copied_and_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_report_holds_commands_that_can_be_copied_and_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     out = finished_run(Path("my run"))
     nodes = [{"kind": "static", "name": "background"}, {"kind": "rigid", "name": "car 1", "label": "car"}]
@@ -131,8 +129,8 @@ def test_the_report_holds_commands_that_can_be_copied_and_work(
     blocks = [html.unescape(found) for found in re.findall(r'class="commands">.*?<pre>(.*?)</pre>', text, re.DOTALL)]
     lines = [line for block in blocks for line in block.splitlines()]
     verbs = [shlex.split(line)[1] for line in lines if line.startswith("mudg ")]
-    assert {"view", "page", "edit", "render", "export", "asset", "run", "score"} <= set(verbs)
-    for line in lines:  # the score of this run is real, with its run.yaml
+    assert {"view", "page", "edit", "render", "export", "asset", "run"} <= set(verbs)
+    for line in lines:
         if line.startswith("mudg "):
             args, _ = app.parse(shlex.split(line)[1:])
             for given in (getattr(args, name, None) for name in ("source", "scene")):
@@ -140,10 +138,6 @@ def test_the_report_holds_commands_that_can_be_copied_and_work(
     assert subprocess.run(next(x for x in lines if x.startswith("printf")), shell=True, check=True).returncode == 0
     script = read_edits(Path("edits.yaml")) if Path("edits.yaml").exists() else None
     assert script is not None and [(e.verb, list(e.settings.ids)) for e in script.edits] == [("remove", ["car 1"])]
-    before = store.digest(out / "score")
-    capsys.readouterr()
-    assert app.main(shlex.split(next(x for x in lines if x.startswith("mudg score")))[1:]) == 0
-    assert "reused" in capsys.readouterr().err and store.digest(out / "score") == before
     assert len(blocks) == text.count('class="commands"') and "navigator.clipboard" in text
 
 

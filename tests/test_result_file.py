@@ -19,7 +19,7 @@ from faults import failing, in_child, killed, points
 from test_gallery import run_of
 from toy_fitted import write_toy_run
 
-from mudg import FittedScene, app
+from mudg import app
 from mudg.base import store
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, take_lock
@@ -119,28 +119,18 @@ def test_replacing_killed_at_any_moment_loses_neither(name: str, nth: int, toy: 
             shutil.rmtree(folder)
 
 
-@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "mcap"])
-def test_another_result_is_replaced_on_demand_only(
-    name: str, toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out, _, other = COMMANDS[name]
-    assert command(name, toy, tmp_path)() == 0
-    before = pair(tmp_path / out)
-    stamp = (tmp_path / out).stat().st_mtime_ns
-    assert command(name, toy, tmp_path)() == 0 and (tmp_path / out).stat().st_mtime_ns == stamp
-    assert command(name, toy, tmp_path, other)() == 2 and "the file exists" in capsys.readouterr().err
-    assert folder_of(tmp_path) == before and command(name, toy, tmp_path, f"{other} --overwrite")() == 0
-    assert pair(tmp_path / out)[out] != before[out]
-
-
 @pytest.mark.parametrize("name", COMMANDS)
-def test_files_without_a_description_and_altered_ones(
+def test_files_of_others_and_altered_ones_are_replaced_on_demand_only(
     name: str, toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / COMMANDS[name][0]
     about = out.with_name(f"{out.name}.json")
     assert command(name, toy, tmp_path)() == 0
-    whole = folder_of(tmp_path)
+    whole, stamp = folder_of(tmp_path), out.stat().st_mtime_ns
+    assert command(name, toy, tmp_path)() == 0 and out.stat().st_mtime_ns == stamp
+    if (other := COMMANDS[name][2]) != "--overwrite":
+        assert command(name, toy, tmp_path, other)() == 2 and "the file exists" in capsys.readouterr().err
+        assert folder_of(tmp_path) == whole
     about.unlink()  # nothing says what the file is
     assert command(name, toy, tmp_path)() == 2 and "exists" in capsys.readouterr().err
     about.write_bytes(whole[about.name])
@@ -327,20 +317,13 @@ def test_a_folder_that_another_process_filled_meanwhile_is_not_taken_over(
 
     begin = RunDir._begin
 
-    def later(run: RunDir, config: Any) -> None:
+    def later(run: RunDir, *given: Any) -> None:
         monkeypatch.setattr(RunDir, "_begin", begin)
         fill(1)
-        begin(run, config)
+        begin(run, *given)
 
     monkeypatch.setattr(RunDir, "_begin", later)
     with pytest.raises((ResourceError, UsageError)):
         fill(2)
     assert (tmp_path / "out" / "out.txt").read_text() == "1"
     store.verify_manifest(tmp_path / "out")
-
-
-def test_an_object_of_an_edited_scene_takes_the_description_along(toy: Path, tmp_path: Path) -> None:
-    out = tmp_path / "a.safetensors"
-    assert command("asset", toy, tmp_path)() == 0
-    FittedScene.read(toy / "fit", "cpu").export_asset("car-1", out)
-    pair(out)

@@ -18,7 +18,7 @@ import roundtrip
 import write_av2
 import write_custom
 import write_nuplan
-from pandas_pickles import write_frame
+from write_pandaset import write_frame
 
 from mudg.base.geometry import invert
 from mudg.base.types import EgoPath, Scene, Sweep, SweepPoints

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import socket
 from pathlib import Path
@@ -13,7 +12,7 @@ from refusals import refused
 
 from mudg.base import store
 from mudg.base.errors import IntegrityError, ResourceError, UsageError
-from mudg.base.run_folder import Replacement, RunDir, VerbOutput, is_temporary, refuse_overlap, run_state
+from mudg.base.run_folder import Replacement, RunDir, VerbOutput, refuse_overlap
 
 OUTPUT = VerbOutput("fit", 1, ("out.txt", "rows/*.txt", "steps/"))
 SETTINGS = {"nested": {"x": 0.5}}
@@ -39,19 +38,6 @@ def contents(folder: Path) -> dict[str, str]:
 # reused, continued, refused -----------------------------------------------------------------------
 
 
-def test_run_folder_is_reused_only_when_it_verifies(tmp_path: Path) -> None:
-    made = run(tmp_path / "r")
-    assert not made.complete
-    store.write_text(made.path / "out.txt", "result")
-    made.log(step=1, loss=0.5)
-    made.finish({"psnr": 30.0})
-    again = run(tmp_path / "r")
-    assert again.complete and store.read_json(again.path / "run.json")["summary"] == {"psnr": 30.0}
-    (made.path / "out.txt").write_text("altered")
-    refused("--overwrite", run, tmp_path / "r", raises=IntegrityError)
-    assert not run(tmp_path / "r", overwrite=True).complete and (made.path / "out.txt").read_text() == "altered"
-
-
 def test_run_folder_refuses_another_configuration_and_names_the_difference(tmp_path: Path) -> None:
     run(tmp_path / "r").finish()
     refused("value: 1 there, 2 asked", run, tmp_path / "r", value=2, raises=UsageError)
@@ -64,17 +50,6 @@ def test_a_run_that_failed_before_it_made_anything_is_in_nobodys_way(tmp_path: P
     assert not corrected.complete
     store.write_text(corrected.path / "out.txt", "half")
     refused("value: 2 there, 1 asked", run, tmp_path / "r", raises=UsageError)
-
-
-def test_interrupted_run_continues_and_a_crash_before_the_state_is_not_complete(tmp_path: Path) -> None:
-    made = run(tmp_path / "r")
-    store.write_text(made.path / "out.txt", "half")
-    made.pause()
-    assert json.loads((tmp_path / "r" / "run.json").read_text())["state"] == "interrupted"
-    again = run(tmp_path / "r", overwrite=True)  # the same command continues, whatever else it says
-    assert not again.complete and (again.path / "out.txt").read_text() == "half"
-    store.write_manifest(again.path)  # a crash between manifest and state
-    assert not run(tmp_path / "r").complete
 
 
 def test_lock_of_a_live_process_is_respected_and_of_a_dead_one_taken_over(tmp_path: Path) -> None:
@@ -154,30 +129,16 @@ def test_only_files_of_the_old_result_are_removed_and_others_named_and_kept(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["elsewhere", "r"] and run(folder, 2).complete
 
 
-def test_a_file_of_somebody_else_with_the_name_of_a_new_one_gets_another(tmp_path: Path) -> None:
-    folder = finished(tmp_path / "r").path
-    (folder / "rows" / "2.txt").write_text("mine")
-    finished(folder, 2, overwrite=True)
-    assert (folder / "rows" / "2.txt").read_text() == "row" and (folder / "rows" / "2.txt.kept1").read_text() == "mine"
-
-
 def test_a_manifest_names_nothing_outside_its_folder(tmp_path: Path) -> None:
     folder = finished(tmp_path / "r").path
+    (folder / "rows" / "2.txt").write_text("mine")  # gets another name
     (tmp_path / "precious").write_text("x")
     manifest = store.read_json(folder / "manifest.json")
     manifest["files"] |= dict.fromkeys(("../precious", str(tmp_path / "precious")), {"bytes": 1, "sha256": "0"})
     store.write_json(folder / "manifest.json", manifest)
     finished(folder, 2, overwrite=True)
     assert (tmp_path / "precious").read_text() == "x"
-
-
-def test_names_of_temporary_files(tmp_path: Path) -> None:
-    with store.atomic_path(tmp_path / "picture.png") as path:
-        assert is_temporary(path.name)
-    for name in (".run.abcd_f12.part.json", ".scene.123-456.part/images/a.png"):
-        assert is_temporary(name)
-    for name in (".r.new.part", "a.part", ".bashrc", "film.part.mp4"):
-        assert not is_temporary(name)
+    assert (folder / "rows" / "2.txt").read_text() == "row" and (folder / "rows" / "2.txt.kept1").read_text() == "mine"
 
 
 # replaced when the new result is finished ---------------------------------------------------------
@@ -186,8 +147,9 @@ def test_names_of_temporary_files(tmp_path: Path) -> None:
 def test_the_old_result_stands_until_the_new_one_is_finished(tmp_path: Path) -> None:
     folder = finished(tmp_path / "r").path
     before = contents(folder)
+    digest = store.digest(tmp_path)
     new = run(folder, 2, overwrite=True)
-    assert new.path != folder and new.path.parent == folder.parent
+    assert new.path == Replacement.at(folder).staging and store.digest(tmp_path) == digest
     store.write_text(new.path / "out.txt", "half")
     new.log(step=1)
     assert contents(folder) == before
@@ -206,10 +168,11 @@ def test_a_finished_result_of_the_same_settings_is_reused_with_overwrite_too(tmp
     folder = finished(tmp_path / "r").path
     assert run(folder, overwrite=True).complete
     (folder / "out.txt").write_text("altered")
+    refused("--overwrite", run, folder, raises=IntegrityError)
     assert finished(folder, overwrite=True).path == folder and (folder / "out.txt").read_text() == "result 1"
 
 
-def test_a_replacement_goes_on_when_the_old_result_was_taken_away(tmp_path: Path) -> None:
+def test_a_replacement_goes_on_when_the_old_result_was_taken_away_and_a_link_stays_one(tmp_path: Path) -> None:
     folder = finished(tmp_path / "r").path
     store.write_text(run(folder, 2, overwrite=True).path / "out.txt", "half")
     folder.rename(tmp_path / "away")
@@ -217,14 +180,9 @@ def test_a_replacement_goes_on_when_the_old_result_was_taken_away(tmp_path: Path
     assert (again.path / "out.txt").read_text() == "half"
     finished(folder, 2)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["away", "r"]
-
-
-def test_a_link_to_a_folder_stays_a_link(tmp_path: Path) -> None:
-    finished(tmp_path / "real")
-    (tmp_path / "r").symlink_to("real")
-    finished(tmp_path / "r", 2, overwrite=True)
-    assert (tmp_path / "r").is_symlink() and (tmp_path / "real" / "out.txt").read_text() == "result 2"
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["r", "real"]
+    (tmp_path / "link").symlink_to("r")
+    finished(tmp_path / "link", 3, overwrite=True)
+    assert (tmp_path / "link").is_symlink() and (folder / "out.txt").read_text() == "result 3"
 
 
 def test_a_folder_that_cannot_be_renamed_is_refused_before_the_work(
@@ -340,14 +298,6 @@ def test_a_failed_second_rename_is_undone(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.undo()
     assert run(folder).complete and run(folder, 2, overwrite=True).complete
     assert contents(folder)["out.txt"] == "result 2"
-
-
-def test_a_reader_of_a_folder_of_results_does_not_see_staging_folders(tmp_path: Path) -> None:
-    finished(tmp_path / "root" / "a")
-    before = store.digest(tmp_path / "root")
-    run(tmp_path / "root" / "a", 2, overwrite=True).log(step=1)
-    assert store.digest(tmp_path / "root") == before and run_state(tmp_path / "nothing there") == {}
-    assert Replacement.at(tmp_path / "root" / "a").staging.is_dir()
 
 
 # inputs and outputs apart -------------------------------------------------------------------------

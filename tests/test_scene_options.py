@@ -72,7 +72,7 @@ def world(tmp_path_factory) -> dict[str, Path]:
 
 
 def settings(method: str = "mudg_s", **changes) -> FitConfig:
-    few = {"iterations": 30, "start__gaussians": 700, "densify__max_gaussians": 1200, "virtual__probability": 0.4}
+    few = {"iterations": 20, "start__gaussians": 700, "densify__max_gaussians": 1200, "virtual__probability": 0.4}
     return small_fit(method, **{**few, **EVERYTHING, **changes})
 
 
@@ -80,7 +80,7 @@ def test_interrupted_and_resumed_equals_uninterrupted_with_everything_on(world, 
     config = settings()
     step = fit_to(world, tmp_path / "whole", config, observations=(world["virtual"],))
     whole = step.run()
-    with interrupted(17):
+    with interrupted(13):
         replace(step, out=tmp_path / "parts").run()
     parts = replace(step, out=tmp_path / "parts").run()
     assert fitted_bytes(parts) == fitted_bytes(whole)

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import toy_inception
 import toy_views
 
 from mudg.base import store
@@ -179,16 +178,3 @@ def test_weights_are_checked_before_the_work(tmp_path: Path) -> None:
         with pytest.raises(error, match=what):
             Score(scene=scene, views=views, out=out, settings=ScoreConfig(fid_weights=str(weights))).run()
         assert not (out / "truth").exists()
-
-
-@pytest.mark.parametrize("suffix", [pytest.param(".pth", marks=pytest.mark.slow), ".safetensors"])
-def test_the_network_itself_from_a_file(tmp_path: Path, suffix: str) -> None:
-    state = toy_inception.state()
-    path = tmp_path / f"weights{suffix}"
-    if suffix == ".pth":
-        torch.save(state, path, _use_new_zipfile_serialization=False)
-    else:
-        store.write_safetensors(path, state)
-    found = FeatureFiles(path, "pytorch-fid", tmp_path / "features", CPU).of(ImageSet(2, toy_views.colors))
-    images = torch.stack([inception.prepared(toy_views.colors(n), "pytorch-fid") for n in range(2)])
-    assert np.allclose(found, inception.InceptionFeatures(state)(images).numpy(), atol=1e-5)

@@ -24,7 +24,6 @@ from mudg.base.errors import ResourceError
 from mudg.base.palette import CLASSES, ID, UNLABELLED
 from mudg.labels import segmenters
 from mudg.labels.segmenters import KINDS, Segmenter, match_classes
-from mudg.networks import folders
 
 NAMES = {"0": "Road", "1": "traffic light", "2": "sky", "3": "unicorn"}
 MEAN, DEVIATION = [0.5, 0.5, 0.5], [0.25, 0.25, 0.25]
@@ -161,32 +160,3 @@ def test_what_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     refused("models", Segmenter.load, tmp_path, raises=ResourceError)
     assert match_classes(NAMES, "here").tolist() == [ID["road"], ID["traffic light"], ID["sky"], UNLABELLED]
     refused("Cityscapes", match_classes, {"0": "cat", "1": "dog"}, "here")
-
-
-def test_a_network_is_found_in_the_cache_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    revision = "0123456789abcdef0123456789abcdef01234567"
-    home = tmp_path / "hub/models--a-town--streets.b0"
-    segformer(home / "snapshots" / revision)
-    (home / "refs").mkdir()
-    (home / "refs/main").write_text(revision)
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
-    for name in ("a-town/streets.b0", f"a-town/streets.b0@{revision}"):
-        found = folders.find(name)
-        assert found == home / "snapshots" / revision and folders.title(found) == "a-town/streets.b0@0123456789ab"
-    assert isinstance(Segmenter.load("a-town/streets.b0"), Segmenter)
-    for name in ("a-town/streets.b1", "a-town/streets.b0@other"):
-        with pytest.raises(ResourceError, match="no copy of such a repository") as caught:
-            folders.find(name)
-        assert "hf download a-town/streets" in str(caught.value.remedy)
-
-
-def test_a_folder_goes_before_the_cache_and_paths_are_left_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "weights/net").mkdir(parents=True)
-    monkeypatch.chdir(tmp_path)
-    assert folders.find("weights/net") == Path("weights/net")
-    assert folders.find(tmp_path / "nowhere/at/all") == tmp_path / "nowhere/at/all"
-    assert folders.title("weights/net") == "net"
-    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    refused("no such folder, nor the package", folders.find, "weights/other", raises=ResourceError)

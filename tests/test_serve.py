@@ -19,7 +19,7 @@ from test_edit import toy
 from mudg.base import geometry
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.types import Camera, Scene
-from mudg.scene.road import Road
+from mudg.scene.motion import Road
 from mudg.sim import CameraRequest, Instant, Pinhole, Session, wire
 from mudg.sim.drive import BicycleState, Drive
 from mudg.sim.pilots import DriverView, PlanPilot, Policy

@@ -13,8 +13,8 @@ from mudg.base import geometry
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, EgoPath, Frame, Scene, View
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.core.shutter import Readout, as_read, moved_by, points_as_read, readout_of
 from mudg.core.table import Table
+from mudg.core.trajectory import Readout, as_read, moved_by, points_as_read, readout_of
 from mudg.editing.render import trajectories
 from mudg.editing.settings import RenderConfig
 from mudg.gaussians.model import SceneModel, compose, compose_as_read

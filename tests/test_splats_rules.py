@@ -45,84 +45,64 @@ def at_time(times: list[float], values: np.ndarray, time_s: float, turns: bool =
     return geometry.slerp(a, b, u) if turns else (1 - u) * a + u * b
 
 
-def gltf_problems(content: bytes) -> list[str]:
+def check_gltf(content: bytes) -> None:
     """What a validator would say of a GLB file."""
     document, data = slow.open_glb(content)
-    found = []
-    if document["asset"]["version"] != "2.0" or "KHR_gaussian_splatting" not in document["extensionsUsed"]:
-        found.append("asset or extensionsUsed")
-    if document["buffers"] != [{"byteLength": len(data) - (-document["buffers"][0]["byteLength"] % 4)}]:
-        found.append("buffer length")
+    assert document["asset"]["version"] == "2.0" and "KHR_gaussian_splatting" in document["extensionsUsed"]
+    assert document["buffers"] == [{"byteLength": len(data) - (-document["buffers"][0]["byteLength"] % 4)}]
     ends = 0
     for view in document["bufferViews"]:
-        found += ["views overlap"] if view["byteOffset"] < ends else []
+        assert view["byteOffset"] >= ends
         ends = view["byteOffset"] + view["byteLength"]
-    found += ["view beyond buffer"] if ends > len(data) else []
-    used = {index for mesh in document["meshes"] for p in mesh["primitives"] for index in p["attributes"].values()}
-    used |= {s[side] for a in document.get("animations", []) for s in a["samplers"] for side in ("input", "output")}
-    found += ["unused accessor"] if used != set(range(len(document["accessors"]))) else []
-    for mesh in document["meshes"]:
-        for primitive in mesh["primitives"]:
-            found += primitive_problems(document, data, primitive)
-    for animation in document.get("animations", []):
-        found += animation_problems(document, data, animation)
+    assert ends <= len(data)
+    animations, primitives = document.get("animations", []), [p for m in document["meshes"] for p in m["primitives"]]
+    used = {index for primitive in primitives for index in primitive["attributes"].values()}
+    used |= {s[side] for a in animations for s in a["samplers"] for side in ("input", "output")}
+    assert used == set(range(len(document["accessors"])))
+    for primitive in primitives:
+        check_primitive(document, data, primitive)
+    for animation in animations:
+        check_animation(document, data, animation)
     for node in document["nodes"]:
-        found += ["node rotation"] if abs(np.linalg.norm(node.get("rotation", [0, 0, 0, 1])) - 1) > 1e-6 else []
-        found += ["node scale"] if min(node.get("scale", [1])) <= 0 else []
-    return found
+        assert abs(np.linalg.norm(node.get("rotation", [0, 0, 0, 1])) - 1) < 1e-6 and min(node.get("scale", [1])) > 0
 
 
-def primitive_problems(document: dict[str, Any], data: bytes, primitive: dict[str, Any]) -> list[str]:
-    found, attributes = [], primitive["attributes"]
-    kind = primitive["extensions"]["KHR_gaussian_splatting"]
-    if (
-        primitive["mode"] != 0
-        or kind["kernel"] != "ellipse"
-        or kind["colorSpace"] not in ("srgb_rec709_display", "lin_rec709_display")
-    ):
-        found.append("primitive")
+def check_primitive(document: dict[str, Any], data: bytes, primitive: dict[str, Any]) -> None:
+    attributes, kind = primitive["attributes"], primitive["extensions"]["KHR_gaussian_splatting"]
+    assert primitive["mode"] == 0 and kind["kernel"] == "ellipse"
+    assert kind["colorSpace"] in ("srgb_rec709_display", "lin_rec709_display")
     values = {name: np.array(slow.accessor(document, data, index)) for name, index in attributes.items()}
-    counts = {len(rows) for rows in values.values()}
-    found += ["counts"] if len(counts) != 1 else []
+    assert len({len(rows) for rows in values.values()}) == 1
     place = document["accessors"][attributes["POSITION"]]
-    exact = np.array([place["min"], place["max"]], np.float32)
-    if not np.array_equal(exact, np.array([values["POSITION"].min(0), values["POSITION"].max(0)], np.float32)):
-        found.append("bounds of positions")
-    found += ["rotation"] if np.abs(np.linalg.norm(values[PREFIX + "ROTATION"], axis=1) - 1).max() > 1e-5 else []
-    found += ["scale"] if (values[PREFIX + "SCALE"] <= 0).any() else []
+    bounds = [values["POSITION"].min(0), values["POSITION"].max(0)]
+    assert np.array_equal(np.array([place["min"], place["max"]], np.float32), np.array(bounds, np.float32))
+    assert np.abs(np.linalg.norm(values[PREFIX + "ROTATION"], axis=1) - 1).max() < 1e-5
+    assert (values[PREFIX + "SCALE"] > 0).all()
     for name in (PREFIX + "OPACITY", "COLOR_0"):
-        found += [name] if (values[name] < 0).any() or (values[name] > 1).any() else []
+        assert (values[name] >= 0).all() and (values[name] <= 1).all()
     bands = {name for name in attributes if name.startswith(PREFIX + "SH_")}
-    degree = int(np.sqrt(len(bands))) - 1
-    if bands != {f"{PREFIX}SH_DEGREE_{d}_COEF_{n}" for d in range(degree + 1) for n in range(2 * d + 1)}:
-        found.append("harmonics")
-    return found
+    degrees = range(int(np.sqrt(len(bands))))
+    assert bands == {f"{PREFIX}SH_DEGREE_{d}_COEF_{n}" for d in degrees for n in range(2 * d + 1)}
 
 
-def animation_problems(document: dict[str, Any], data: bytes, animation: dict[str, Any]) -> list[str]:
-    found, targets = [], [(c["target"]["node"], c["target"]["path"]) for c in animation["channels"]]
-    found += ["a target twice"] if len(set(targets)) != len(targets) else []
+def check_animation(document: dict[str, Any], data: bytes, animation: dict[str, Any]) -> None:
+    targets = [(c["target"]["node"], c["target"]["path"]) for c in animation["channels"]]
+    assert len(set(targets)) == len(targets)
     for channel in animation["channels"]:
-        sampler = animation["samplers"][channel["sampler"]]
+        sampler, path = animation["samplers"][channel["sampler"]], channel["target"]["path"]
         times = np.array(slow.accessor(document, data, sampler["input"]))[:, 0]
-        given, values = (
-            document["accessors"][sampler["input"]],
-            np.array(slow.accessor(document, data, sampler["output"])),
-        )
-        found += ["times"] if times[0] < 0 or (np.diff(times) <= 0).any() else []
-        found += ["bounds of times"] if [given["min"][0], given["max"][0]] != [times[0], times[-1]] else []
-        found += ["keys"] if len(values) != len(times) else []
-        if channel["target"]["path"] == "rotation":
-            found += ["rotations"] if np.abs(np.linalg.norm(values, axis=1) - 1).max() > 1e-6 else []
-        if channel["target"]["path"] == "scale":
-            found += ["scales"] if (values <= 0).any() or sampler["interpolation"] != "STEP" else []
-    return found
+        given = document["accessors"][sampler["input"]]
+        values = np.array(slow.accessor(document, data, sampler["output"]))
+        assert times[0] >= 0 and (np.diff(times) > 0).all() and len(values) == len(times)
+        assert [given["min"][0], given["max"][0]] == [times[0], times[-1]]
+        assert path != "rotation" or np.abs(np.linalg.norm(values, axis=1) - 1).max() < 1e-6
+        assert path != "scale" or ((values > 0).all() and sampler["interpolation"] == "STEP")
 
 
 @pytest.mark.parametrize(("degree", "time_s"), [(0, None), (2, None), (3, 0.5)])
 def test_a_glb_keeps_the_rules(degree: int, time_s: float | None) -> None:
     scene = replace(toy_splats.scene(degree), file_from_world=file_from_world("glb", "viewer"))
-    assert gltf_problems(gltf.to_bytes(scene, time_s)) == []
+    check_gltf(gltf.to_bytes(scene, time_s))
 
 
 @pytest.mark.parametrize("time_s", [-0.5, -0.1, 0.25, 0.4, 0.9, 1.0])
@@ -158,29 +138,20 @@ def test_a_glb_moves_as_the_scene_does(time_s: float) -> None:
     assert np.abs(ordered(np.concatenate(shown)) - moment(stiff, time_s)).max() < 1e-4
 
 
-def usd_problems(prim: dict[str, Any]) -> list[str]:
+def check_usd(prim: dict[str, Any]) -> None:
     """What NVIDIA's and our rules say of a field of particles."""
-    found = []
-    count = len(prim["orientations"])
-    degree = prim["radiance:sphericalHarmonicsDegree"]
+    count, degree = len(prim["orientations"]), prim["radiance:sphericalHarmonicsDegree"]
     places = list(prim["positions"].values()) if isinstance(prim["positions"], dict) else [prim["positions"]]
-    if {len(prim[name]) for name in ("scales", "opacities")} | {len(place) for place in places} != {count}:
-        found.append("lengths")
-    if len(prim["radiance:sphericalHarmonicsCoefficients"]) != count * (degree + 1) ** 2:
-        found.append("harmonics")
-    if prim["_metadata"] != {"elementSize": str((degree + 1) ** 2)}:
-        found.append("elementSize")
-    found += ["orientations"] if np.abs(np.linalg.norm(prim["orientations"], axis=1) - 1).max() > 1e-5 else []
-    found += ["scales"] if np.min(prim["scales"]) <= 0 else []
-    found += ["opacities"] if np.min(prim["opacities"]) < 0 or np.max(prim["opacities"]) > 1 else []
+    assert {len(prim[name]) for name in ("scales", "opacities")} | {len(place) for place in places} == {count}
+    assert len(prim["radiance:sphericalHarmonicsCoefficients"]) == count * (degree + 1) ** 2
+    assert prim["_metadata"] == {"elementSize": str((degree + 1) ** 2)}
+    assert np.abs(np.linalg.norm(prim["orientations"], axis=1) - 1).max() < 1e-5
+    assert np.min(prim["scales"]) > 0 and np.min(prim["opacities"]) >= 0 and np.max(prim["opacities"]) <= 1
     low, high = np.array(prim["extent"])
     reach = 3 * np.max(prim["scales"], 1)[:, None]
     for place in np.array(places):
-        found += ["extent"] if (place - reach < low - 1e-4).any() or (place + reach > high + 1e-4).any() else []
-    found += (
-        ["hints"] if (prim["projectionModeHint"], prim["sortingModeHint"]) != ("perspective", "cameraDistance") else []
-    )
-    return found
+        assert (place - reach > low - 1e-4).all() and (place + reach < high + 1e-4).all()
+    assert (prim["projectionModeHint"], prim["sortingModeHint"]) == ("perspective", "cameraDistance")
 
 
 @pytest.mark.parametrize(("degree", "time_s"), [(0, None), (3, None), (1, 0.5)])
@@ -192,7 +163,7 @@ def test_usd_keeps_the_rules(degree: int, time_s: float | None) -> None:
     assert len(nodes) == (3 if time_s is None else 1)
     for node in nodes:
         assert node["splats"]["type"] == "ParticleField3DGaussianSplat"
-        assert usd_problems(node["splats"]) == []
+        check_usd(node["splats"])
 
 
 @pytest.mark.parametrize("time_s", [-0.5, -0.1, 0.25, 0.4, 0.9, 1.0])
@@ -275,5 +246,5 @@ def test_empty_nodes_do_no_harm() -> None:
         *(getattr(scene.nodes[0].cloud, name)[:0] for name in ("means", "quats", "log_scales", "logits", "sh"))
     )
     bare = replace(scene, nodes=(replace(scene.nodes[0], cloud=nothing), *scene.nodes[1:]))
-    assert gltf_problems(gltf.to_bytes(bare)) == []
+    check_gltf(gltf.to_bytes(bare))
     assert slow.parse_usda(usd.to_text(bare).decode())["World"]["background"]["splats"]["positions"] == []

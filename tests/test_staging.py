@@ -15,8 +15,7 @@ from mudg.base import staging, store
 from mudg.base.errors import ResourceError
 from mudg.base.location import Location
 from mudg.editing.settings import ScoreConfig
-from mudg.steps.render import Score
-from mudg.steps.view import Report
+from mudg.steps.render import Report, Score
 
 fsspec = pytest.importorskip("fsspec", reason="the store in memory is fsspec's")
 
@@ -155,10 +154,11 @@ def test_what_cannot_be_is_refused(words: str, said: str, command: Callable[...,
 
 def test_two_commands_do_not_share_a_scratch_folder(scratch: Path, scene: Path) -> None:
     """Not at the same time, and not that of another user."""
-    args = Report(runs=(scene,), out=Path("memory://bucket/page.html"))
+    args, seen = Report(runs=(scene,), out=Path("memory://bucket/page.html")), list[Path]()
 
     def write(inner: Any) -> dict[str, Any]:
         (folder,) = scratch.iterdir()
+        seen.append(folder)
         store.write_json(folder / "lock", {"pid": 1, "host": __import__("socket").gethostname()})
         refused("another process", staging.run_staged, "report", args, write, scratch, raises=ResourceError)
         inner.out.write_text("page")
@@ -166,6 +166,5 @@ def test_two_commands_do_not_share_a_scratch_folder(scratch: Path, scene: Path) 
 
     staging.run_staged("report", args, write, scratch)
     (scratch / "elsewhere").mkdir()
-    name = staging._Staging.of("report", args, scratch).folder
-    name.symlink_to(scratch / "elsewhere")
+    seen[0].symlink_to(scratch / "elsewhere")
     refused("somebody else", staging.run_staged, "report", args, write, scratch, raises=ResourceError)

@@ -174,31 +174,6 @@ def test_commands_from_store_to_store(root: Location, tmp_path: Path, capfd: pyt
     assert not any((tmp_path / "scratch").iterdir())
 
 
-MEMORY = """
-import re, sys
-from pathlib import Path
-from mudg.base.location import Location
-
-def peak():  # of this program alone: what getrusage says begins with the parent's
-    return int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
-
-at = Location.of(sys.argv[1])
-at.exists()
-before = peak()
-at.push(Path(sys.argv[2]))
-at.fetch(Path(sys.argv[3]))
-print((peak() - before) / 1024)
-"""
-
-
-def test_memory_does_not_grow_with_the_folder(root: Location, tmp_path: Path) -> None:
-    made = folder_of(tmp_path, 200 << 20, 100 << 20, *[8 << 20] * 20)
-    words = [sys.executable, "-c", MEMORY, str(root / "run"), str(made), str(tmp_path / "back")]
-    grown = float(subprocess.run(words, capture_output=True, text=True, check=True).stdout)
-    print(f"memory grew by {grown:.0f} MiB for 460 MiB")
-    assert 0 < grown < 300
-
-
 class _Unreliable(http.server.BaseHTTPRequestHandler):
     """Passes requests on to a server; every seventh is answered with a failure, every eleventh answer never arrives."""
 

@@ -11,7 +11,7 @@ from tiny_networks import small_mdm
 from toy_scene import ToyStreet
 
 from mudg import app
-from mudg.base import palette, scratch
+from mudg.base import memory, palette
 from mudg.base.errors import InputError, UsageError
 from mudg.core import trajectory
 from mudg.diffusion import condition, model_files, views
@@ -129,10 +129,10 @@ def test_trajectories_share_what_was_read_and_prepared_and_nothing_changes(world
 
 
 def test_conditions_in_files_change_nothing(world, large, tmp_path, monkeypatch):
-    mapped, map_array = [], scratch.mapped_array
+    mapped, map_array = [], memory.mapped_array
     monkeypatch.setattr(condition, "LARGE_PIXELS", 0)
     noted = lambda folder, *asked: mapped.append(folder) or map_array(folder, *asked)
-    monkeypatch.setattr(scratch, "mapped_array", noted)
+    monkeypatch.setattr(memory, "mapped_array", noted)
     filed = made(world, tmp_path / "filed", full_size=True)
     first = read_observations(large / "front_shift+1.0")[2]
     assert first.rgb.shape[1:] == first.semantics.shape == (64, 96) and first.view.camera.width == 96

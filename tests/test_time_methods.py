@@ -20,25 +20,21 @@ from mudg.base import geometry
 from mudg.base.errors import UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Track
-from mudg.baselines import emernerf as radiance_loop
-from mudg.baselines import emernerf as rays
 from mudg.baselines import pvg
 from mudg.baselines.bezier import BezierNode, bernstein, distance_change, fit_path
-from mudg.baselines.omnire import DeformationField, DeformedNode
+from mudg.baselines.omnire import DeformationField, DeformedNode, FlatNetwork, waves
 from mudg.baselines.pvg import VibrationNode, starting_columns
 from mudg.baselines.s3gaussian import HexPlaneNode, plane_smoothness
-from mudg.baselines.timed import FlatNetwork, waves
 from mudg.core import losses, metrics
 from mudg.core.grids import PlaneSizes
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
 from mudg.gaussians import densify, fit, nodes
-from mudg.gaussians import views as fit_views
 from mudg.gaussians.model import SceneModel, compose
 from mudg.gaussians.nodes import NodeRows, RigidNode, StaticNode
 from mudg.gaussians.recipes import RECIPES
 from mudg.gaussians.settings import METHODS, PUBLISHED, WEIGHTS
-from mudg.gaussians.start import columns_from_points
+from mudg.gaussians.start import StartPoints
 from mudg.scene import fuse
 from mudg.scene.clouds import read_fused
 from mudg.scene.read import read_scene
@@ -75,6 +71,11 @@ def world(tmp_path_factory) -> dict[str, Path]:
 def cars_that_walk(monkeypatch):
     """The one object of the toy street may deform, too."""
     monkeypatch.setattr(nodes, "LIMBED_LABELS", nodes.LIMBED_LABELS | {"car"})
+
+
+def black_points(xyz: np.ndarray) -> dict[str, torch.Tensor]:
+    black = np.zeros((len(xyz), 3), np.uint8)
+    return StartPoints(xyz, black, black[:, 0], np.full(len(xyz), 0.1, np.float32)).columns((), 0)
 
 
 # ---- vibration -----------------------------------------------------------------------------------
@@ -117,9 +118,7 @@ def test_vibration_agrees_with_a_plain_loop_and_its_slopes_with_differences():
 def test_what_changes_in_time_is_split_in_time(step, late, rows):
     """Of three Gaussians with small image gradients, one has a gradient of tau and a long life: it becomes two, late in
     the run three."""
-    columns = columns_from_points(
-        np.zeros((4, 3), np.float32), np.zeros((4, 3), np.uint8), None, (), 0, np.full(4, 0.1, np.float32)
-    )
+    columns = black_points(np.zeros((4, 3), np.float32))
     columns |= starting_columns(4, torch.zeros(4), 0.2) | {"log_beta": torch.tensor([0.1, 0.1, 0.1, 0.005]).log()}
     model = SceneModel(
         Table(columns, {"node": torch.zeros(4, dtype=torch.int32)}), (VibrationNode("b", 0.0, 0.1),), None, (), 0
@@ -183,9 +182,7 @@ def test_a_flat_network_is_the_network_it_stands_for():
 def test_a_deformed_object_stays_one_through_everything_a_scene_does():
     """At first it is rigid; then it moves as the field says, otherwise for other times and objects, saved and alone."""
     field, node = person()
-    columns = columns_from_points(
-        np.random.default_rng(1).random((4, 3), np.float32) - 0.5, np.zeros((4, 3), np.uint8), None, (), 0
-    )
+    columns = black_points(np.random.default_rng(1).random((4, 3), np.float32) - 0.5)
     scene = SceneModel(
         Table(columns, {"node": torch.ones(4, dtype=torch.int32)}), (StaticNode(), node, field), None, (), 0
     )
@@ -429,31 +426,6 @@ def test_boxes_change_a_method_if_and_only_if_it_knows_them(tracked_or_not, tmp_
     assert (tracked != untracked != garbled) is METHODS[method].boxes
 
 
-@pytest.mark.parametrize("method", FITTED_ALONE)
-def test_a_method_learns_from_what_the_table_says_and_from_nothing_else(tracked_or_not, tmp_path, monkeypatch, method):
-    """Without the depths, the sky or the classes of recorded views another scene comes out if and only if the row names
-    them."""
-    row, load = METHODS[method], fit_views.load_recorded
-    reader = rays if row.scene == "radiance" else fit
-
-    def fitted_without(field: str) -> dict[str, bytes]:
-        with monkeypatch.context() as patched:
-            bare = lambda *given: ((n, replace(view, **{field: None})) for n, view in load(*given))
-            patched.setattr(reader, "load_recorded", bare)
-            if (row.scene, field) == ("radiance", "lidar"):
-                patched.setattr(radiance_loop, "lidar_rays", lambda scene: None)
-            folder = fitted_to(tracked_or_not, "tracked", tmp_path / field, method, 3)
-        return {file.name: file.read_bytes() for file in folder.glob("*.safetensors") if file.stem in FITTED}
-
-    usual = fitted_without("depth")  # which recorded views never have
-    fields = {"lidar": "lidar", "sky": "sky", "semantics": "channels"}
-    changed = {name for name, field in fields.items() if fitted_without(field) != usual}
-    assert {"color", *changed} == set(row.supervision)
-    if row.scene == "gaussians":
-        model = fit.load_model(tmp_path / "depth" / "tracked")
-        assert (model.sky is not None, bool(model.node_names())) == ("sky" in row.nodes, "objects" in row.nodes)
-
-
 def test_a_static_scene_starts_with_what_moved(tracked_or_not, tmp_path):
     """Points lie on the car wherever a sweep met it, and nowhere above the road it has not reached."""
     model = fit.load_model(fitted_to(tracked_or_not, "tracked", tmp_path, "gs3d", 1))
@@ -478,22 +450,15 @@ def test_a_cloud_without_boxes_has_the_settings_of_the_one_with_them(tracked_or_
     assert (fine.colors.to_common.keys(), coarse.colors.to_common.keys()) == ({"left"}, set())
 
 
-@pytest.mark.parametrize("method", BOX_FREE)
-@pytest.mark.parametrize(
-    "changes", [{"poses__learn": True}, {"objects__deformable": False}, {"loss__object_weight": 0.1}]
-)
-def test_settings_about_boxes_are_refused_by_methods_without_them(world, tmp_path, method, changes):
-    step = fit_to(world, tmp_path / "fit", small_fit(method, **changes))
-    refused("knows nothing of it", step.run, raises=UsageError)
-    assert not (tmp_path / "fit").exists()
-
-
 @pytest.mark.parametrize("method", RECIPES)
 def test_what_a_method_cannot_follow_is_refused(world, tmp_path, method):
     fit_to_world = partial(Fit, scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit")
-    for weight in WEIGHTS.get(method, ()):
-        step = fit_to_world(settings=small_fit(method, **{weight.replace(".", "__"): 0.33}))
-        refused("published weights of its own", step.run, raises=UsageError)
+    about_boxes = {"poses__learn": True, "objects__deformable": False, "loss__object_weight": 0.1}
+    foreign = [("published weights of its own", {name.replace(".", "__"): 0.33}) for name in WEIGHTS.get(method, ())]
+    foreign += [("knows nothing of it", dict([one])) for one in about_boxes.items() if method in BOX_FREE]
+    for said, changes in foreign:
+        refused(said, fit_to_world(settings=small_fit(method, **changes)).run, raises=UsageError)
+    assert not (tmp_path / "fit").exists()
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "model.json").write_text("{}")
     step = fit_to_world(start_from=tmp_path / "other", settings=small_fit(method))

@@ -25,7 +25,6 @@ import write_waymo
 from refusals import refused
 from roundtrip import needs_native
 
-from mudg.base import log
 from mudg.formats import unknown_fields
 from mudg.formats.importers import IMPORTERS
 from mudg.formats.importers.clouds import read_cloud
@@ -192,20 +191,6 @@ def test_hostile_names_are_short_plain_and_few(
     # of the 1000 that are collected
     assert line.endswith(" and 992 more in sample_annotation.json, which this program does not know")
     assert len(line) < 8 * 64 + 100 and line.isprintable() and line.count("', '") == 7
-
-
-def test_silence_is_kept_and_nothing_is_collected_outside_of_an_import(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    np.savez(tmp_path / "a.npz", xyz=np.ones((2, 3)), foo=np.ones(2))
-    read_cloud(tmp_path / "a.npz")
-    with unknown_fields.named_once():
-        pass
-    assert said(capsys) == []
-    monkeypatch.setattr(log, "_quiet", True)
-    with unknown_fields.named_once():
-        read_cloud(tmp_path / "a.npz")
-    assert said(capsys) == []
 
 
 def test_fields_that_a_custom_log_names_are_known_whatever_they_are_called(

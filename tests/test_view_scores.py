@@ -17,7 +17,7 @@ from mudg.base.types import Camera, Observation, Scene, Track, View
 from mudg.city.config import CityConfig
 from mudg.city.logs import write_city
 from mudg.city.world import CityWorld
-from mudg.core import metrics, trajectory, view_metrics
+from mudg.core import metrics, trajectory
 from mudg.core.metrics import Pair, ViewFacts
 from mudg.core.street_scores import nta_truths
 from mudg.editing.settings import ScoreConfig
@@ -94,10 +94,6 @@ def test_lidar_points_measure_depth_and_color_beside_the_path_of_a_log(log_score
     assert value(log_scores, "far", HERE, "lidar_delta1") > 0.95
     assert value(log_scores, "right", HERE, "lidar_psnr") > 18  # measured 21.6: edges
     assert value(log_scores, "gray", HERE, "lidar_psnr") < 16
-    (row,) = (r for r in log_scores["results"] if (r["method"], r["trajectory"]) == ("far", HERE))
-    parts = row["details"]["points"]
-    assert parts["lidar_abs_rel_static"] == pytest.approx(0.1, abs=0.01)
-    assert parts["lidar_abs_rel_dynamic"] == pytest.approx(0.1, abs=0.02)
 
 
 def test_classes_and_lanes_of_a_log_are_carried_over_by_points_and_ground(log_scores: dict) -> None:
@@ -117,7 +113,7 @@ def test_a_still_video_does_not_flicker_and_missing_files_name_their_flags(log_s
     assert value(log_scores, "gray", HERE, "temporal_flickering") == 1.0
     assert 0.8 < value(log_scores, "right", HERE, "temporal_flickering") < 0.99
     text = score_tables.markdown(log_scores)
-    for flag in "detections lanes dino-weights clip-weights lpips-vgg-weights".split():
+    for flag in "detections lanes lpips-vgg-weights".split():
         assert f"--{flag}" in text
 
 
@@ -141,7 +137,7 @@ def boxes_json(
 
 @pytest.mark.parametrize(
     ("moved", "confidence", "category", "expected", "cars"),
-    [(0.0, 0.9, 2, 1.0, 1.0), (0.0, 0.5, 2, 0.0, 0.0), (8.0, 0.9, 2, 0.0, 0.0), (0.0, 0.9, 7, 1.0, 0.0)],
+    [(0.0, 0.9, 2, 1.0, 1.0), (0.0, 0.5, 2, 0.0, 0.0), (0.0, 0.9, 7, 1.0, 0.0)],
 )
 def test_nta_iou_from_a_file_of_boxes(
     tmp_path: Path, log_scene: Path, moved: float, confidence: float, category: int, expected: float, cars: float
@@ -187,7 +183,7 @@ def test_detected_lanes_of_a_log_are_refused(tmp_path: Path, log_scene: Path) ->
 def test_boxes_with_few_points_do_not_count(tmp_path: Path, log_scene: Path) -> None:
     scene = read_scene(log_scene)
     store.write_json(tmp_path / "boxes.json", [])
-    counting = detections.BoxDetections(scene, tmp_path / "boxes.json", as_published=False)
+    counting = detections.BoxDetections(scene, tmp_path / "boxes.json")
     view = scene.frames_of("front")[0].view
     assert [track.id for track in counting._tracks_at(view)] == ["car"]
     counting._counts[scene.sweeps[0].id]["car"] = 9
@@ -236,9 +232,6 @@ def test_vehicles_and_lanes_of_a_city_have_ceilings(city_run: tuple[Path, dict])
         assert beside["truth"] > least
         assert value(document, "gray", HERE, metric) < 0.05
     assert value(document, "right", HERE, "lane_correlation") > 0.99
-    (row,) = (r for r in document["results"] if r["method"] == "right")
-    assert row["details"]["agents"] >= 4
-    assert 50 < row["details"]["lane_mean_of_classes"] < 100
     text = (out / "metrics.md").read_text()
     assert "agent IoU: true images" in text and "NTA-IoU" not in text.split("## ")[1]  # never under the published name
 
@@ -248,7 +241,7 @@ def test_ntl_iou_from_masks(city_run: tuple[Path, dict]) -> None:
     assert value(document, "right", HERE, "ntl_iou") == 100
     assert 45 < value(document, "gray", HERE, "ntl_iou") < 50
     (row,) = (r for r in document["results"] if r["method"] == "gray")
-    assert row["ntl"]["lanes"] == 0 and 45 < row["ntl"]["against_detector"] < 50
+    assert row["ntl"]["lanes"] == 0
     assert anchors(document, HERE, "ntl_iou") == {"trajectory": HERE, "metric": "ntl_iou", "truth": 100.0}
 
 
@@ -290,7 +283,7 @@ def test_warp_error_follows_vehicles_by_their_boxes() -> None:
     poses = np.stack([np.eye(4), np.eye(4)])
     poses[1, 0, 3] = 2 / 20 * 9.0
     track = Track("car-005", "car", np.ones(3), np.array([0.0, 0.1]), poses)
-    metric = view_metrics.warp_error(metrics.ExactMotion([(5, track)]))
+    metric = metrics.warp_error(metrics.ExactMotion([(5, track)]))
     first, second = wall_pair(0, frame(8), 8), wall_pair(1, frame(10), 10)
     metric.add(metric.source(first))
     metric.add(metric.source(second))
@@ -299,7 +292,7 @@ def test_warp_error_follows_vehicles_by_their_boxes() -> None:
     # Kept: all of the vehicle, and the wall but for what the vehicle hid in either frame.
     assert motion.same[:, 8:12].all() and not motion.same[:, 12:14].any()
     assert int(motion.same.sum()) == 16 * (24 - 2)
-    darker = view_metrics.warp_error(metrics.ExactMotion([(5, track)]))
+    darker = metrics.warp_error(metrics.ExactMotion([(5, track)]))
     darker.add(wall_pair(0, frame(8) * 0.5 + 0.1, 8))
     darker.add(wall_pair(1, frame(10) * 0.5 + 0.2, 10))
     assert darker.value() == pytest.approx(0.1, abs=1e-5)
@@ -307,9 +300,9 @@ def test_warp_error_follows_vehicles_by_their_boxes() -> None:
 
 def test_vehicles_without_boxes_do_not_count_and_flickering_by_hand() -> None:
     pairs = [wall_pair(n, torch.zeros(3, 16, 24), 8) for n in (0, 1)]
-    frames = [metrics.TrueFrame.of(p.view, p.truth_depth, p.truth_semantics) for p in pairs]
+    frames = [metrics.TrueFrame(p.view, p.truth_depth, p.truth_semantics) for p in pairs]
     assert not metrics.pixel_motion(*frames).same[:, 8:12].any()
-    metric = view_metrics.temporal_flickering()
+    metric = metrics.temporal_flickering()
     assert metric.value() is None
     for tone in (0, 51, 0):
         metric.add(metric.source(Pair(torch.full((3, 4, 4), tone / 255), *[None] * 6)))

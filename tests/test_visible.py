@@ -16,7 +16,6 @@ from mudg.core.fusion import largest_beam_gap
 from mudg.core.project import RULES, HidingRule, hidden_pixels, nearer_depth, visible_depth
 
 CAMERA = Camera("front", 60, 40, 50.0, 50.0, 30.0, 20.0)
-WIDE = Camera("front", 90, 60, 80.0, 80.0, 45.0, 30.0)
 VIEW = View(CAMERA, invert(CAM_FROM_EGO_AXES), 0.0)
 
 
@@ -109,19 +108,3 @@ def test_in_a_city_most_hidden_returns_go_and_nearly_all_others_stay() -> None:
     assert hidden > 100
     assert kept < 0.5 * hidden
     assert lost < 0.012 * seen
-
-
-def test_points_seen_through_a_nearer_surface_are_dropped() -> None:
-    view = View(WIDE, np.eye(4), 0.0)
-    u, v = np.meshgrid(np.arange(20, 60) + 0.5, np.arange(10, 50) + 0.5)
-    rays = np.stack([(u - 45) / 80.0, (v - 30) / 80.0, np.ones_like(u)], -1).reshape(-1, 3)
-    fence = rays[(np.round(v.ravel()) % 3) == 1] * 5  # rows of a near surface
-    behind = rays[(np.round(v.ravel()) % 3) == 2] * 20  # between them shines a far one
-    beside = np.array([[0.5, 0.0, 1]]) * 20
-    depth = visible_depth(view, np.concatenate([fence, behind, beside, [[np.nan] * 3]]), RULES["sweep"], gap_deg=3.0)
-    known = np.isfinite(depth)
-    inner = np.zeros_like(known)
-    inner[14:46, 24:56] = True
-    assert (depth[known & inner] < 5.01).all()
-    assert (known & inner).sum() > 300
-    assert depth[30, 85] == pytest.approx(20)

@@ -20,7 +20,6 @@ from mudg.base.weather_settings import (
     FogSettings,
     LightSettings,
     RainSettings,
-    SeasonSettings,
     SnowSettings,
     WeatherSettings,
 )
@@ -34,7 +33,6 @@ from mudg.core.weather.gbuffer import (
     from_render,
     normals_from_depth,
     openness_by_class,
-    steadied,
     world_points,
     world_rays,
 )
@@ -121,16 +119,6 @@ def test_near_kerbs_stay_steep_and_far_noise_of_the_ground_does_not() -> None:
     near, far = (normals_from_depth(view, np.full((HEIGHT, WIDTH), d, np.float32), classes) for d in (5.0, 30.0))
     np.testing.assert_allclose(near[20, 30], [-1, 0, 0], atol=1e-5)
     np.testing.assert_allclose(far[20, 30], [0, 0, 1], atol=1e-5)
-
-
-def test_guessed_light_does_not_exceed_what_a_camera_exposes_for() -> None:
-    view = forward_view()
-    scene = street(view)
-    color = np.where(scene.sky[..., None], 1.0, scene.color).astype(np.float32)
-    color[:, ::2][scene.classes[:, ::2] == ID["road"]] = 0.5
-    found = weather.estimate_surroundings([(view, replace(scene, color=color))])
-    assert float((found.ambient + found.sun).mean()) < 1.41
-    assert found.airlight.max() <= 0.8
 
 
 @pytest.mark.parametrize(("time", "share"), [("overcast", 1.0), ("dusk", 0.5)])
@@ -348,18 +336,6 @@ def test_a_drive_is_edited_image_by_image() -> None:
     refused("estimated from views", weather.drive_facts, [])
 
 
-def test_ripples_of_the_ground_are_smoothed_farther_than_those_of_walls() -> None:
-    """Normals that sway by ten degrees over 12 pixels: on the road they become level, on a wall not."""
-    sway = np.broadcast_to(np.radians(10) * np.sin(np.arange(96) * 2 * np.pi / 12), (64, 96))
-    normal = np.stack([np.sin(sway), np.zeros_like(sway), np.cos(sway)], -1).astype(np.float32)
-    found = {
-        name: steadied(normal, np.full((64, 96), ID[name], np.uint8), 2)[16:-16, 24:-24, 0]
-        for name in ("road", "building")
-    }
-    assert np.abs(found["road"]).max() < np.sin(np.radians(1.5))
-    assert np.abs(found["building"]).max() > np.sin(np.radians(6))
-
-
 # --- drops, flakes and LiDAR returns --------------------------------------------------------------
 
 
@@ -524,48 +500,3 @@ def test_a_sweep_in_fog_and_rain_keeps_its_beams() -> None:
     assert len(found.xyz) < len(fog_alone.xyz)
     got = found.xyz / np.linalg.norm(found.xyz, axis=1, keepdims=True)
     assert {tuple(d) for d in np.round(got[:200], 4)} <= {tuple(d) for d in np.round(directions.astype(np.float32), 4)}
-
-
-# --- seasons --------------------------------------------------------------------------------------
-
-
-def hedge(place: float = 0.0) -> tuple[View, GBuffer]:
-    """A hedge 10 m ahead of x = 0, left half; a green wall, right half; one row of bark."""
-    view = forward_view(x=place, size=(32, 16))
-    rgb = np.zeros((16, 32, 3), np.float32) + np.array([0.1, 0.3, 0.05], np.float32)
-    rgb[3] = (0.2, 0.15, 0.1)
-    classes = np.full((16, 32), ID["vegetation"], np.uint8)
-    classes[:, 16:] = ID["wall"]
-    return view, from_render(view, rgb, np.full((16, 32), 10.0 - place, np.float32), classes)
-
-
-@pytest.mark.parametrize("leaves", ["autumn", "bare"])
-def test_only_green_plants_change_and_their_luminance_by_the_stated_factor(leaves: str) -> None:
-    view, buffer = hedge()
-    made = relight.in_season(buffer, view, SeasonSettings(leaves=leaves), 7)
-    same = np.ones((16, 32), bool)
-    same[:, :16] = False
-    same[3] = True  # bark
-    assert np.array_equal(made.color[same], buffer.color[same])
-    before, after = (c[~same] @ relight.LUMINANCE for c in (buffer.color, made.color))
-    assert np.allclose(after, before * relight.BRIGHTER[leaves], rtol=1e-5)
-    assert (made.color[~same][:, 0] > made.color[~same][:, 1]).all()  # redder than green
-    half = relight.in_season(buffer, view, SeasonSettings(leaves=leaves, amount=0.5), 7)
-    assert np.allclose(half.color, (buffer.color + made.color) / 2, atol=1e-6)
-
-
-def test_views_agree_and_a_drive_without_green_stays() -> None:
-    """The same place of the hedge has the same colour from 10 m and from 5 m."""
-    colors = []
-    for place in (0.0, 5.0):
-        view, buffer = hedge(place)
-        made = relight.in_season(buffer, view, SeasonSettings(leaves="autumn"), 7).color
-        uv, _ = geometry.project(view, np.array([[10.0, 1.0, 0.8]]))
-        colors.append(made[int(uv[0, 1]), int(uv[0, 0])])
-    assert np.abs(colors[0] - colors[1]).max() < 0.05
-    view, buffer = hedge()
-    grey = replace(buffer, color=np.full_like(buffer.color, 0.3))
-    settings = Conditions(season=SeasonSettings(leaves="bare"))
-    assert np.array_equal(relight.in_season(grey, view, settings.season, 1).color, grey.color)
-    assert not np.array_equal(weather.apply(buffer, settings, view, 0.0, 1), buffer.color)
-    assert np.array_equal(weather.apply(buffer, Conditions(), view, 0.0, 1), buffer.color)

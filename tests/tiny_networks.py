@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 import torch
 
-from mudg.diffusion.model import MDMConfig
+from mudg.diffusion import model_files
+from mudg.diffusion.model import MDM, MDMConfig
 from mudg.networks.codec import CodecConfig
 
 NAMES = {0: "Road", 1: "traffic light", 2: "sky", 3: "unicorn"}
@@ -25,6 +26,13 @@ def small_mdm(**changes: Any) -> MDMConfig:
     attention = {"spatial_attention": (False, True), "temporal_attention": (False, True)}
     codec = CodecConfig(decoder_width=8, decoder_blocks=1)
     return MDMConfig(**{**size, **attention, "codec": codec, "patch": 2, "window": 4, "area_px": 24576, **changes})
+
+
+def saved_mdm(folder: Path, **changes: Any) -> Path:
+    """Folder of a small diffusion model that uses renders, with windows of 8 frames."""
+    torch.manual_seed(0)
+    model_files.save(MDM(small_mdm(**{"window": 8, "renders": True, **changes})), folder, "a model of tests", {})
+    return folder
 
 
 def package(name: str) -> Any:

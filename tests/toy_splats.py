@@ -40,11 +40,3 @@ def scene(degree: int = 0, count: int = 5) -> SplatScene:
         SplatNode("1 person", cloud(count, degree, 3, True, 0.5), "pedestrian", (0.6, 0.6, 1.8), walk, person, bend),
     )
     return SplatScene("toy", nodes, sky=sky, facts={"method": "test"})
-
-
-def view(time_s: float = 0.5):
-    """A camera 14 m behind the origin of ``scene``."""
-    from mudg.base.types import Camera, View
-
-    mount = geometry.yaw_matrix(0.0, (-14.0, 0.0, 1.5)) @ geometry.invert(geometry.CAM_FROM_EGO_AXES)
-    return View(Camera("front", 64, 48, 50.0, 50.0, 32.0, 24.0), mount, time_s)

@@ -11,7 +11,6 @@ from pathlib import Path
 
 from mudg.base.types import View
 from mudg.viewer import view
-from mudg.viewer.live import EditFiles
 from mudg.viewer.settings import ViewConfig
 
 
@@ -29,11 +28,11 @@ def allowed(port: int, token: str, host: str = "127.0.0.1") -> dict[str, str]:
 
 @contextmanager
 def serving(
-    fit: Path, scene: Path, compare: Path | None = None, files: EditFiles | None = None, **settings: object
+    fit: Path, scene: Path, compare: Path | None = None, edits: tuple[Path, Path] | tuple[()] = (), **settings: object
 ) -> Iterator[tuple[int, str]]:
-    """Port and token of a server of a fit."""
+    """Port and token of a server of a fit. ``edits``: script that the page begins with, and where edits are saved."""
     config = ViewConfig(**{"images": 0, "browser": False, "device": "cpu", **settings})
-    server, site = view.server_of(config, fit, compare, scene, files)
+    server, site = view.server_of(config, fit, compare, scene, *edits)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
         yield server.server_address[1], site.token
@@ -44,21 +43,11 @@ def serving(
 
 def ask(port: int, method: str, path: str, body: object = None, **headers: str) -> tuple[int, bytes]:
     """Status and content of an answer."""
-    connection, answer = begin(port, method, path, body, **headers)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+    named = {"Content-Type": "application/json", **{name.replace("_", "-"): value for name, value in headers.items()}}
     try:
-        with answer:
+        connection.request(method, path, None if body is None else json.dumps(body), named)
+        with connection.getresponse() as answer:
             return answer.status, answer.read()
     finally:
         connection.close()
-
-
-def begin(
-    port: int, method: str, path: str, body: object = None, **headers: str
-) -> tuple[http.client.HTTPConnection, http.client.HTTPResponse]:
-    """An answer whose content is still to be read."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
-    named = {name.replace("_", "-"): value for name, value in headers.items()}
-    connection.request(
-        method, path, None if body is None else json.dumps(body), {"Content-Type": "application/json", **named}
-    )
-    return connection, connection.getresponse()

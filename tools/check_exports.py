@@ -34,7 +34,7 @@ from mudg.base.types import Scene
 from mudg.exporting.export import CAMERAS, SUFFIXES
 from mudg.exporting.settings import ExportConfig
 from mudg.formats.exporters.cameras import picture_names
-from mudg.formats.ncore import package
+from mudg.formats.exporters.ncore import package
 from mudg.formats.splats.cloud import SplatCloud
 from mudg.formats.splats.formats import FORMATS, read_cloud
 from mudg.scene.read import read_points, read_scene

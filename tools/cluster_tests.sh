@@ -3,8 +3,8 @@
 #
 #     tools/cluster_tests.sh [FOLDER] [pytest arguments]
 #
-# PYTHON names the python that mudg and pytest are installed for (default: python3). MUDG_TEST_CITIES: cities that go through every engine
-# (default 200); MUDG_TEST_SCENES: scenes of the largest batch (default 100000).
+# PYTHON names the python that mudg and pytest are installed for (default: python3). MUDG_TEST_SCENES: scenes of the largest batch
+# (default 100000).
 set -euo pipefail
 root=$(cd "$(dirname "$0")/.." && pwd)
 folder=${1:-${TMPDIR:-/tmp}/mudg-cluster-tests}

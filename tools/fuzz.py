@@ -29,7 +29,7 @@ with atheris.instrument_imports(include=["mudg"]):
     from mudg.base import plain_pickle, plain_yaml
     from mudg.base.errors import MudgError
     from mudg.editing.script import parse_edits
-    from mudg.formats.importers import clouds, kitti_files, waymo_logs
+    from mudg.formats.importers import clouds, kitti, waymo_logs
     from mudg.formats.splats.cloud import SplatCloud, SplatNode, SplatScene
     from mudg.formats.splats.formats import FORMATS, WriteRequest
     from mudg.scene import schema
@@ -88,9 +88,9 @@ PARSERS: dict[str, Callable[[bytes], object]] = {
     "waymo": lambda content: waymo_logs.parse_message(content, waymo_logs.FRAME, "input"),
     "range-image": matrices_of,
     "tfrecord": in_file(records_of, ".tfrecord"),
-    "calibration": in_file(kitti_files.read_calibration_text),
-    "tracklets": in_file(kitti_files.read_tracklets, ".xml"),
-    "label": in_file(lambda path: kitti_files.read_label_text(path, np.eye(4))),
+    "calibration": in_file(kitti.read_calibration_text),
+    "tracklets": in_file(kitti.read_tracklets, ".xml"),
+    "label": in_file(lambda path: kitti.read_label_text(path, np.eye(4))),
     **{
         name: (lambda read: lambda content: read(content, "input"))(one.read)
         for name, one in FORMATS.items()

@@ -1,7 +1,7 @@
 """Compare the networks and distances of the scores with the packages that published numbers are made with, on made-up
 weights.
 
-    python -m venv oracle && oracle/bin/pip install torch numpy scipy pillow tqdm transformers
+    python -m venv oracle && oracle/bin/pip install torch numpy scipy pillow tqdm
     oracle/bin/pip install --no-deps torchvision==0.28.0 pytorch-fid==0.3.0 torch-fidelity==0.4.0 lpips==0.1.4
     PYTHONPATH=src:tests oracle/bin/python tools/oracle_parity.py
 
@@ -22,7 +22,6 @@ from pathlib import Path
 import numpy as np
 import torch
 import toy_inception
-import toy_vit
 
 warnings.filterwarnings("ignore")
 LIBRARY = torch.library.Library("torchvision", "DEF")  # the CUDA build of torchvision asks for them when it is imported
@@ -103,79 +102,15 @@ def lpips() -> None:
         note(f"LPIPS, {trunk}", "lpips", abs(made / float(model(first[None] * 2 - 1, second[None] * 2 - 1)) - 1))
 
 
-@torch.no_grad()
-def transformers() -> None:
-    """DINOv2's blocks at their own size, its positions, and CLIP's tower."""
-    from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection, Dinov2Config, Dinov2Model
-
-    from mudg.networks import clip_image, dinov2
-
-    state = toy_vit.dino_state(width=128, blocks=3)
-    config = Dinov2Config(hidden_size=128, num_hidden_layers=3, num_attention_heads=2, image_size=518, patch_size=14)
-    model = Dinov2Model(config).eval()
-    model.load_state_dict(dino_names(state), strict=True)
-    network = dinov2.DinoFeatures(state)
-    for side, limit in ((518, TOLERANCE), (224, 0.05)):
-        image = torch.randn(1, 3, side, side, generator=torch.Generator().manual_seed(side))
-        found = model(pixel_values=image).last_hidden_state[:, 0]
-        what = f"DINOv2 blocks, {side} pixels" + ("" if side == 518 else ": positions by size instead of by factor")
-        note(what, "transformers", apart(network(image), found), limit)
-    state = toy_vit.clip_state(side=112)
-    config = CLIPVisionConfig(
-        hidden_size=128,
-        intermediate_size=512,
-        num_hidden_layers=2,
-        num_attention_heads=2,
-        image_size=112,
-        patch_size=14,
-        projection_dim=32,
-    )
-    model = CLIPVisionModelWithProjection(config).eval()
-    named = {k: v for k, v in toy_vit.transformers_names(state).items() if k.startswith("vis")}
-    report = model.load_state_dict(named, strict=False)
-    if report.unexpected_keys or any("position_ids" not in name for name in report.missing_keys):
-        raise SystemExit(f"CLIP's names differ: {report}")
-    image = torch.randn(2, 3, 112, 112, generator=torch.Generator().manual_seed(0))
-    found = model(pixel_values=image).image_embeds
-    note("CLIP tower with projection", "transformers", apart(clip_image.ClipImageFeatures(named)(image), found))
-
-
-def dino_names(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """The published names as version 5 of the transformers package has them."""
-    found = {
-        "embeddings.cls_token": state["cls_token"],
-        "embeddings.mask_token": state["mask_token"],
-        "embeddings.position_embeddings": state["pos_embed"],
-        "layernorm.weight": state["norm.weight"],
-        "layernorm.bias": state["norm.bias"],
-        "embeddings.patch_embeddings.projection.weight": state["patch_embed.proj.weight"],
-        "embeddings.patch_embeddings.projection.bias": state["patch_embed.proj.bias"],
-    }
-    parts = {"attn.proj": "attention.o_proj", "ls1.gamma": "layer_scale1.lambda1", "ls2.gamma": "layer_scale2.lambda1"}
-    for name, value in state.items():
-        if not name.startswith("blocks."):
-            continue
-        _, number, rest = name.split(".", 2)
-        layer = f"encoder.layer.{number}"
-        if rest.startswith("attn.qkv"):
-            for part, rows in zip("qkv", value.chunk(3), strict=True):
-                found[f"{layer}.attention.{part}_proj.{rest.rsplit('.', 1)[1]}"] = rows
-        else:
-            for ours, theirs in parts.items():
-                rest = rest.replace(ours, theirs)
-            found[f"{layer}.{rest}"] = value
-    return found
-
-
 def main() -> int:
     """Run all comparisons that the installed packages allow."""
-    parts: dict[str, Callable[[], None]] = {"inception": inception, "lpips": lpips, "transformers": transformers}
+    parts: dict[str, Callable[[], None]] = {"inception": inception, "lpips": lpips}
     for part in parts.values():
         part()
     print("| what | oracle | relative difference | limit |\n|---|---|---|---|")
     for what, oracle, difference, limit in ROWS:
         print(f"| {what} | {oracle} | {difference:.1e} | {limit:.0e} |")
-    names = ("torch", "torchvision", "pytorch-fid", "torch-fidelity", "lpips", "transformers")
+    names = ("torch", "torchvision", "pytorch-fid", "torch-fidelity", "lpips")
     print("\n" + ", ".join(f"{name} {importlib.metadata.version(name)}" for name in names))
     return int(any(difference > limit for _, _, difference, limit in ROWS))
 

@@ -101,7 +101,7 @@ for name, text in {
     "lane": "- lane_change: {id: ego, left_m: 1.5, start_s: 0, duration_s: 2}",
     "stop": "- stop: {id: car-001, at_s: 0.1}",
     "speed": "- speed: {id: car-001, factor: 0.5}", "weather": "- weather: {fog: {visibility_m: 40}}",
-    "light": "- light: {time: dusk}", "season": "- season: {leaves: autumn}",
+    "light": "- light: {time: dusk}",
     "wrong_key": "- remove: {idss: [car-001]}", "wrong_id": "- remove: {ids: [car-999]}",
 }.items():
     (edits / f"{name}.yaml").write_text(text + "\\n")

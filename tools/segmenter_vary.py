@@ -17,8 +17,7 @@ from scipy import ndimage
 from segmenter_data import Sample
 
 from mudg.base.palette import ID, UNLABELLED
-from mudg.labels.evidence import Evidence, encode
-from mudg.labels.ground import LOW_M
+from mudg.labels.evidence import LOW_M, Evidence, encode
 
 _FLAT = (ID["road"], ID["sidewalk"])
 CROP = (192, 288)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 TERMINATED = 143
+HELP = ("-h", "--help", "--help-all")
 
 
 # the command line ---------------------------------------------------------------------------------
@@ -66,7 +67,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         if words[0] in ("-V", "--version"):
             _say(f"mudg {version()}")
             return 0
-        _require_current_folder()
+        try:  # relative paths count from it, and libraries end the process without it
+            os.getcwd()
+        except OSError as error:
+            what, remedy = "the current folder is gone, or cannot be entered", "change to a folder that exists"
+            raise ResourceError(what, got=str(error), remedy=remedy) from error
         # Idle threads of OpenMP and of numpy's BLAS that spin would take the cores from others; must precede torch and
         # numpy.
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -108,15 +113,6 @@ def _smaller(words: Sequence[str]) -> str:
     return ""
 
 
-def _require_current_folder() -> None:
-    """Relative paths count from it, and libraries end the process without it."""
-    try:
-        os.getcwd()
-    except OSError as error:
-        what, remedy = "the current folder is gone, or cannot be entered", "change to a folder that exists"
-        raise ResourceError(what, got=str(error), remedy=remedy) from error
-
-
 def find_verb(words: Sequence[str]) -> tuple[str, list[str]]:
     """The verb of a command line, of one word or two, and the words behind it.
 
@@ -131,17 +127,15 @@ def find_verb(words: Sequence[str]) -> tuple[str, list[str]]:
     inside = steps.groups().get(name, [])
     if inside and rest and f"{name} {rest[0]}" in inside:
         return f"{name} {rest[0]}", rest[1:]
-    if inside and (not rest or rest[0] in ("-h", "--help", "--help-all")):
+    if inside and (not rest or rest[0] in HELP):
         return name, rest
+    what, head, wrong = f"there is no verb {name!r}", "mudg", name
     if inside:
-        near = nearest(rest[0], [verb.split(" ")[1] for verb in inside], 0.5)
-        remedy = f"did you mean `mudg {name} {near}`?" if near else f"see mudg {name} --help"
-        expected = "one of " + ", ".join(f"mudg {verb}" for verb in inside)
-        raise UsageError(f"mudg {name} has no {rest[0]!r}", expected=expected, remedy=remedy)
-    known = list(dict.fromkeys(verb.split(" ")[0] for verb in steps.VERBS))
-    near = nearest(name, known, 0.5)
-    remedy = f"did you mean `mudg {near}`?" if near else "see mudg --help"
-    raise UsageError(f"there is no verb {name!r}", expected="one of " + ", ".join(known), remedy=remedy)
+        what, head, wrong = f"mudg {name} has no {rest[0]!r}", f"mudg {name}", rest[0]
+    known = list(dict.fromkeys(verb.split(" ")[bool(inside)] for verb in inside or steps.VERBS))
+    near = nearest(wrong, known, 0.5)
+    remedy = f"did you mean `{head} {near}`?" if near else f"see {head} --help"
+    raise UsageError(what, expected=f"one of {', '.join(known)}", remedy=remedy)
 
 
 def _help(verb: str, words: Sequence[str]) -> str | None:
@@ -149,18 +143,14 @@ def _help(verb: str, words: Sequence[str]) -> str | None:
     from mudg import steps
     from mudg.steps import command
 
+    if not {*HELP} & {*words}:
+        return None
     if verb in steps.groups():
-        if not {"-h", "--help", "--help-all"} & {*words}:
-            return None
         lines = [f"usage: mudg {verb} WORD [flags]", "", *_listed(steps.groups()[verb])]
         return "\n".join([*lines, "", f"mudg {verb} WORD --help lists its flags."])
-    everything, short = "--help-all" in words, bool({"-h", "--help"} & set(words))
-    if not everything and not short:
-        return None
-    cls = steps.step_class(verb)
-    part = next((word for word in words if not word.startswith("-")), "")
+    cls, part = steps.step_class(verb), next((word for word in words if not word.startswith("-")), "")
     part, choice = part if part in cls.parts else "", command.chosen(cls, words)
-    return command.help_page(cls, everything=everything, part=part, choice=choice)
+    return command.help_page(cls, everything="--help-all" in words, part=part, choice=choice)
 
 
 def _listed(names: Sequence[str]) -> list[str]:
@@ -233,9 +223,8 @@ def _show(result: dict[str, Any], *, as_json: bool) -> None:
     """Print a verb's result: its text, else one ``name: path`` a line; or all but the text as JSON."""
     text = result.pop("text", None)
     if as_json:
-        _say(json.dumps(result, indent=1, default=str, allow_nan=False))
-    else:
-        _say(text if text is not None else plain_lines(f"{name}: {value}" for name, value in result.items()))
+        text = json.dumps(result, indent=1, default=str, allow_nan=False)
+    _say(text if text is not None else plain_lines(f"{name}: {value}" for name, value in result.items()))
 
 
 class Terminated(KeyboardInterrupt):

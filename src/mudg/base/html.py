@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -12,58 +11,17 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from mudg.base import palette
 
 # tables -------------------------------------------------------------------------------------------
-# Tables of text as Markdown and CSV; the macro ``table`` of ``assets/templates/macros.html.j2`` is their HTML.
 # No torch.
 
-PUBLISHED: Final = "published"
-"""Kind of the lines with numbers of papers."""
 ARROWS: Final = {"higher": "↑", "lower": "↓", "one": "→ 1"}
 SENSES: Final = {"higher": "higher is better", "lower": "lower is better", "one": "nearest to 1 is best"}
 """Which way the numbers of a column are better, as a sign and in words."""
 
 
-@dataclass(frozen=True)
-class TextCell:
-    """A cell: ``best``, the best number of its column."""
-
-    text: str
-    best: bool = False
-
-
-@dataclass(frozen=True)
-class TextLine:
-    """A line of a table: its title and its cells. ``kind`` is its class on pages."""
-
-    title: str
-    cells: tuple[TextCell, ...]
-    kind: str = ""
-
-
-@dataclass(frozen=True)
-class TextTable:
-    """A table: headings, the first above the titles of the lines; ``title`` above it, on pages."""
-
-    heads: tuple[str, ...]
-    lines: tuple[TextLine, ...]
-    title: str = ""
-
-    @classmethod
-    def of_texts(cls, heads: Sequence[str], rows: Iterable[Sequence[str]], title: str = "") -> TextTable:
-        """A table of plain texts; the first of every row is its title."""
-        return cls(tuple(heads), tuple(TextLine(row[0], tuple(map(TextCell, row[1:]))) for row in rows), title)
-
-
-def markdown(table: TextTable) -> list[str]:
-    """Lines of a Markdown table; the best numbers are bold."""
-    shown = lambda cell: f"**{cell.text}**" if cell.best else cell.text
-    rows = [(line.title, *map(shown, line.cells)) for line in table.lines]
-    first, *others = ("| " + " | ".join(cells) + " |" for cells in (table.heads, *rows))
-    return [first, "|---" * len(table.heads) + "|", *others]
-
-
 def markdown_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table of plain texts."""
-    return markdown(TextTable.of_texts(heads, rows))
+    """Lines of a Markdown table of texts."""
+    first, *others = ("| " + " | ".join(cells) + " |" for cells in (heads, *rows))
+    return [first, "|---" * len(heads) + "|", *others]
 
 
 def cells(row: Mapping[str, Any], forms: Mapping[str, str]) -> list[str]:

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import mmap
 import os
 import sys
+import tempfile
 import threading
 import time
 import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from mudg.base.errors import ResourceError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import DTypeLike, NDArray
 
 GIB: Final = 1 << 30
 LEAST_ADDRESS_SPACE: Final = GIB
@@ -192,3 +198,35 @@ def folder_bytes(folder: Path) -> int:
             with contextlib.suppress(OSError):
                 total += os.lstat(os.path.join(top, name)).st_size
     return total
+
+
+# scratch files: what a computation puts aside because it does not fit into memory ---------------------
+
+_MAPPED: weakref.WeakValueDictionary[int, np.memmap] = weakref.WeakValueDictionary()
+
+
+def mapped_array(folder: Path, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
+    """An array of zeros in a file without a name: the system keeps of it in memory what it can spare, and removes it
+    with the array. ResourceError: the disk has no room for all of it. Writing to the array later needs none."""
+    import numpy as np  # late: --help does without
+
+    from mudg.base.store import disk_errors
+
+    size = max(1, int(np.prod(shape)) * np.dtype(dtype).itemsize)
+    with disk_errors("cannot make a scratch file", folder), tempfile.TemporaryFile(dir=folder, buffering=0) as file:
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, size)
+        else:
+            file.truncate(size)
+        made = np.memmap(file, dtype, "r+", shape=shape)
+    _MAPPED[id(made)] = made
+    return made
+
+
+def rest_mapped() -> None:
+    """Take mapped arrays out of the memory of this process; what is read or written again comes back."""
+    for one in list(_MAPPED.values()):
+        pages = getattr(one, "_mmap", None)
+        if pages is not None and hasattr(mmap, "MADV_DONTNEED"):
+            with contextlib.suppress(OSError, ValueError):
+                pages.madvise(mmap.MADV_DONTNEED)

@@ -258,13 +258,14 @@ def run_state(folder: Path) -> dict[str, Any]:
     what, empty = "the output folder holds files of something else", "choose an empty --out"
     refused = UsageError(what, where=str(folder), remedy=empty)
     if not folder.is_dir():
-        if os.path.lexists(folder):
-            remedy = "choose the name of a folder that does not exist yet"
-            got = "a file" if folder.is_file() else "a device, pipe or socket"
-            if folder.is_symlink() and not folder.exists():
-                got = f"a link that leads nowhere: {os.readlink(folder)}"
-            raise UsageError("the output is no folder", where=str(folder), got=got, remedy=remedy)
-        return {}
+        if not os.path.lexists(folder):
+            return {}
+        got, remedy = "a device, pipe or socket", "choose the name of a folder that does not exist yet"
+        if not folder.exists():
+            got = f"a link that leads nowhere: {os.readlink(folder)}"
+        elif folder.is_file():
+            got = "a file"
+        raise UsageError("the output is no folder", where=str(folder), got=got, remedy=remedy)
     if not (folder / _STATE).is_file():
         for entry in folder.iterdir():  # but for the lock of a run that was killed before it wrote anything else
             if not is_temporary(entry.name) and not (entry.name == _LOCK and _owner(entry) is not None):
@@ -589,9 +590,10 @@ class ResultFile:
     ``complete``: the same command has finished before and the file is as it was written."""
 
     def __init__(self, out: Path, verb: str, key: str, forms: Sequence[Path]) -> None:
-        self.out, self.verb, self.key = out, verb, key
-        self.complete = False
-        self._forms = tuple(forms) or (out,)
+        self.out, self.verb, self.key, self.complete = out, verb, key, False
+        self._forms, self._lock = tuple(forms) or (out,), out.with_name(f".{out.name}.lock")
+        self.path = self.staged()
+        """Where the file is made."""
 
     @classmethod
     @contextlib.contextmanager
@@ -617,17 +619,12 @@ class ResultFile:
         """
         key = hashlib.sha256(store.json_text([verb, dict(settings), dict(inputs)], indent=None).encode()).hexdigest()
         result = cls(Path(out), verb, key, forms)
-        with locked(_lock_path(out), out):
+        with locked(result._lock, out):
             try:
                 result._examine(overwrite)
                 yield result
             finally:
                 result._tidy()
-
-    @property
-    def path(self) -> Path:
-        """Where the file is made."""
-        return self.staged()
 
     def staged(self, form: Path | None = None) -> Path:
         """Where the content of a form is made."""
@@ -680,14 +677,10 @@ class ResultFile:
 
     def _tidy(self) -> None:
         """Remove what this and earlier, killed commands left: no other is at work here."""
-        targets = (*self._forms, description_path(self.out), _lock_path(self.out))
+        targets = (*self._forms, description_path(self.out), self._lock)
         names = [re.escape(f".{one.stem}.") + r"[a-z0-9_]{8}\.part" + re.escape(one.suffix) for one in targets]
         names += [rf"\.?{re.escape(self.staged(one).name.removesuffix(one.suffix))}.*" for one in self._forms]
         left = re.compile("|".join(names))
         with contextlib.suppress(OSError):  # an error may have brought us here, and that one is to be told
             for one in [one for one in self.out.parent.iterdir() if left.fullmatch(one.name)]:
                 shutil.rmtree(one) if one.is_dir() and not one.is_symlink() else one.unlink()
-
-
-def _lock_path(out: Path) -> Path:
-    return out.with_name(f".{out.name}.lock")

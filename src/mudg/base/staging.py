@@ -14,8 +14,8 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -47,103 +47,95 @@ def run_staged(
     """Call a verb with its flags, a dataclass; those that are addresses are staged in ``scratch`` (None: the system's
     folder for temporary files). Returns what ``call`` says, with addresses for paths. UsageError: an address where none
     can be, or an output that touches an input. And what transfers and the verb raise."""
-    plan = _Staging.of(verb, args, scratch)
-    if not plan.inputs and not plan.outputs:
+    if scratch is not None and _address(scratch) is not None:
+        raise UsageError("the scratch folder lies on this machine", where="--scratch", got=str(scratch))
+    _refuse_in_settings(getattr(args, "settings", None), "")
+    flags = {item.name: getattr(args, item.name) for item in fields(args) if item.name != "settings"}
+    inputs, outputs = dict[Location, str](), dict[Location, str]()
+    for name, value in flags.items():
+        for given in _addresses(value):
+            if name == "config":
+                what, remedy = "--config is a file of this machine", "fetch it first"
+                raise UsageError(what, where="--config", got=str(given), remedy=remedy)
+            known, part = (outputs, "out") if name in _OUTPUTS else (inputs, "in")
+            known.setdefault(given, f"{part}/{len(known)}/{given.name}")
+    if not inputs and not outputs:
         return call(args)
-    with plan.locked():
-        for given, at in plan.inputs.items():
+    _refuse_touching(inputs, outputs)
+    key = hashlib.sha256("\n".join([verb, *sorted(map(str, {*inputs, *outputs}))]).encode()).hexdigest()[:12]
+    root = Path(tempfile.gettempdir()) if scratch is None else scratch
+    folder = root.absolute() / f"mudg-{verb.replace(' ', '-')}-{key}"
+    places = {given: folder / name for given, name in {**inputs, **outputs}.items()}
+
+    def placed(value: Any) -> Any:
+        """A flag's value with paths of this machine for addresses."""
+        if isinstance(value, tuple):
+            return tuple(map(placed, value))
+        if isinstance(value, Mapping):  # mudg score --views NAME=ADDRESS
+            return {name: placed(one) for name, one in value.items()}
+        given = _address(value)
+        return value if given is None else type(value)(places[given])
+
+    with _alone_in(folder):
+        for given in inputs:
             log.info(f"fetching {given}")
-            given.fetch(at, mirror=True)
-        for given, at in plan.outputs.items():
-            _fetch_earlier(given, at)
-        result = call(plan.args)
-        for given, at in plan.outputs.items():
-            _upload(given, at)
-    shutil.rmtree(plan.folder, ignore_errors=True)
-    return {name: plan.shown(value) for name, value in result.items()}
+            given.fetch(places[given], mirror=True)
+        for given in outputs:
+            _fetch_earlier(given, places[given])
+        result = call(replace(args, **{name: placed(value) for name, value in flags.items()}))
+        for given in outputs:
+            _upload(given, places[given])
+    shutil.rmtree(folder, ignore_errors=True)
+    return {name: _shown(value, places) for name, value in result.items()}
+
+
+def _shown(value: Any, places: Mapping[Location, Path]) -> Any:
+    """What a verb says, with addresses for the scratch folder's paths."""
+    if isinstance(value, Mapping):
+        return {name: _shown(one, places) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_shown(one, places) for one in value]
+    if not isinstance(value, str | Path):
+        return value
+    text = str(value)
+    for given, at in places.items():
+        text = text.replace(str(at), str(given))
+    return text
 
 
 # what is where ------------------------------------------------------------------------------------
 
 
-@dataclass
-class _Staging:
-    """Which address lies where on this machine while the command runs."""
+def _refuse_touching(inputs: Iterable[Location], outputs: Iterable[Location]) -> None:
+    for out in outputs:
+        if out.text.count("/") < 3:
+            raise UsageError("an output is a folder or file in a bucket", where=str(out), expected=f"{out}/name")
+        for given in inputs:
+            if f"{out}/".startswith(f"{given}/") or f"{given}/".startswith(f"{out}/"):
+                where, remedy = f"output: {out}", "choose an output apart from everything that is read"
+                raise UsageError("the output touches an input", where=where, got=f"input: {given}", remedy=remedy)
 
-    args: Any
-    folder: Path
-    inputs: dict[Location, Path] = field(default_factory=dict)
-    outputs: dict[Location, Path] = field(default_factory=dict)
 
-    @classmethod
-    def of(cls, verb: str, args: Any, scratch: Path | None) -> _Staging:
-        flags = {item.name: getattr(args, item.name) for item in fields(args) if item.name != "settings"}
-        found = sorted({str(one) for value in flags.values() for one in _addresses(value)})
-        key = hashlib.sha256("\n".join([verb, *found]).encode()).hexdigest()[:12]
-        if scratch is not None and _address(scratch) is not None:
-            raise UsageError("the scratch folder lies on this machine", where="--scratch", got=str(scratch))
-        root = Path(tempfile.gettempdir()) if scratch is None else scratch
-        plan = cls(args, root.absolute() / f"mudg-{verb.replace(' ', '-')}-{key}")
-        changes = {name: plan._placed(name, value) for name, value in flags.items()}
-        if plan.inputs or plan.outputs:
-            plan.args = replace(args, **changes)
-            plan._check()
-        _refuse_in_settings(getattr(args, "settings", None), "")
-        return plan
-
-    def _placed(self, name: str, value: Any) -> Any:
-        """A flag's value with paths of this machine for addresses."""
-        if isinstance(value, tuple):
-            return tuple(self._placed(name, one) for one in value)
-        if isinstance(value, Mapping):  # mudg score --views NAME=ADDRESS
-            return {key: self._placed(name, one) for key, one in value.items()}
-        location = _address(value) if isinstance(value, str | Path) else None
-        if location is None:
-            return value
-        if name == "config":
-            got = str(location)
-            raise UsageError("--config is a file of this machine", where="--config", got=got, remedy="fetch it first")
-        place = location.local
-        if place is None:
-            known, part = (self.outputs, "out") if name in _OUTPUTS else (self.inputs, "in")
-            place = known.setdefault(location, self.folder / part / str(len(known)) / location.name)
-        return place if isinstance(value, Path) else str(place)
-
-    def _check(self) -> None:
-        for out in self.outputs:
-            if out.text.count("/") < 3:
-                raise UsageError("an output is a folder or file in a bucket", where=str(out), expected=f"{out}/name")
-            for given in self.inputs:
-                if f"{out}/".startswith(f"{given}/") or f"{given}/".startswith(f"{out}/"):
-                    where, remedy = f"output: {out}", "choose an output apart from everything that is read"
-                    raise UsageError("the output touches an input", where=where, got=f"input: {given}", remedy=remedy)
-
-    @contextlib.contextmanager
-    def locked(self) -> Iterator[None]:
-        """The scratch folder, for this process alone. After a failure it stays, for the same command to go on with."""
-        _make_private(self.folder)
-        lock = self.folder / "lock"
-        take_lock(lock)
-        try:
-            yield
-        except BaseException:
-            store.remove(lock)
-            again = "the same command goes on with it. Delete the folder to give it up"
-            log.info(f"{self.folder} keeps what was fetched and made: {again}")
-            raise
-
-    def shown(self, value: Any) -> Any:
-        """What a verb says, with addresses for the scratch folder's paths."""
-        if isinstance(value, Mapping):
-            return {name: self.shown(one) for name, one in value.items()}
-        if isinstance(value, list | tuple):
-            return [self.shown(one) for one in value]
-        if not isinstance(value, str | Path):
-            return value
-        text = str(value)
-        for given, at in (*self.outputs.items(), *self.inputs.items()):
-            text = text.replace(str(at), str(given))
-        return text
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """The scratch folder, for this process and user alone: its name can be guessed, and the system's temporary folder
+    is everybody's. After a failure it stays, for the same command to go on with."""
+    store.make_folder(folder.parent)
+    with store.disk_errors("cannot create a folder", folder, "choose another --scratch"):
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir(mode=0o700)
+        found = folder.lstat()
+        if folder.is_symlink() or not folder.is_dir() or (hasattr(os, "getuid") and found.st_uid != os.getuid()):
+            what, remedy = "the scratch folder belongs to somebody else", "choose another --scratch"
+            raise ResourceError(what, where=str(folder), remedy=remedy)
+    take_lock(folder / "lock")
+    try:
+        yield
+    except BaseException:
+        store.remove(folder / "lock")
+        again = "the same command goes on with it. Delete the folder to give it up"
+        log.info(f"{folder} keeps what was fetched and made: {again}")
+        raise
 
 
 def _addresses(value: Any) -> Iterator[Location]:
@@ -178,18 +170,6 @@ def _refuse_in_settings(settings: Any, where: str) -> None:
         if found and found[1] in PACKAGES:
             what, remedy = "a setting names a path of this machine", "fetch what is there, and give its folder"
             raise UsageError(what, where=f"--{where.replace('_', '-')}", got=str(settings)[:200], remedy=remedy)
-
-
-def _make_private(folder: Path) -> None:
-    """A folder of this user alone: its name can be guessed, and the system's temporary folder is everybody's."""
-    store.make_folder(folder.parent)
-    with store.disk_errors("cannot create a folder", folder, "choose another --scratch"):
-        with contextlib.suppress(FileExistsError):
-            folder.mkdir(mode=0o700)
-        found = folder.lstat()
-        if folder.is_symlink() or not folder.is_dir() or (hasattr(os, "getuid") and found.st_uid != os.getuid()):
-            what, remedy = "the scratch folder belongs to somebody else", "choose another --scratch"
-            raise ResourceError(what, where=str(folder), remedy=remedy)
 
 
 # there and back -----------------------------------------------------------------------------------

@@ -93,25 +93,14 @@ def pose_keys(times_s: Any, poses: Any, owner: str, name: str) -> tuple[NDArray[
     return times, matrices
 
 
-def _fits(shape: Any, expected: tuple[int | None, ...]) -> bool:
-    return len(shape) == len(expected) and all(e in (None, s) for s, e in zip(shape, expected, strict=True))
-
-
-def check_array(value: Any, where: str, shape: tuple[int | None, ...], dtype: type[np.generic]) -> None:
-    """Refuse what is no array of this shape and type; None stands for any size."""
-    got = getattr(value, "shape", None)
-    if got is None or not _fits(got, shape) or not np.issubdtype(value.dtype, dtype):
-        expected = f"{np.dtype(dtype).name} {shape}".replace("None", "N")
+def check_shape(value: Any, where: str, shape: tuple[int | None, ...], dtype: type[np.generic] | None = None) -> None:
+    """Refuse what is no array or tensor of this shape, and, of an array, of this type; None stands for any size."""
+    got = tuple(getattr(value, "shape", ()))
+    fits = len(got) == len(shape) and all(wanted in (None, size) for size, wanted in zip(got, shape))
+    if not fits or (dtype is not None and not np.issubdtype(value.dtype, dtype)):
+        expected = f"{'' if dtype is None else np.dtype(dtype).name} {tuple(shape)}".replace("None", "N").strip()
         found = f"{getattr(value, 'dtype', type(value).__name__)} {got}"
         raise InputError("an array has the wrong shape or type", where=where, expected=expected, got=found)
-
-
-def check_shape(value: Any, where: str, shape: tuple[int | None, ...]) -> None:
-    """Refuse an array or tensor of another shape; None stands for any size."""
-    got = tuple(getattr(value, "shape", ()))
-    if not _fits(got, shape):
-        expected = str(tuple(shape)).replace("None", "N")
-        raise InputError("a tensor has the wrong shape", where=where, expected=expected, got=str(got))
 
 
 def check_tensors(record: Any, **shapes: tuple[int | None, ...]) -> None:
@@ -365,11 +354,11 @@ class SweepPoints(_Brief):
     no_returns: int = 0
 
     def __post_init__(self) -> None:
-        check_array(self.xyz, "sweep points: xyz", (None, 3), np.float32)
-        check_array(self.intensity, "sweep points: intensity", (len(self.xyz),), np.float32)
-        check_array(self.dt_s, "sweep points: dt_s", (len(self.xyz),), np.float32)
+        check_shape(self.xyz, "sweep points: xyz", (None, 3), np.float32)
+        check_shape(self.intensity, "sweep points: intensity", (len(self.xyz),), np.float32)
+        check_shape(self.dt_s, "sweep points: dt_s", (len(self.xyz),), np.float32)
         if self.classes is not None:
-            check_array(self.classes, "sweep points: classes", (len(self.xyz),), np.uint8)
+            check_shape(self.classes, "sweep points: classes", (len(self.xyz),), np.uint8)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -441,10 +430,10 @@ class PointCloud(_Brief):
     semantics: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
-        check_array(self.xyz, "point cloud: xyz", (None, 3), np.float32)
-        check_array(self.rgb, "point cloud: rgb", (len(self.xyz), 3), np.uint8)
+        check_shape(self.xyz, "point cloud: xyz", (None, 3), np.float32)
+        check_shape(self.rgb, "point cloud: rgb", (len(self.xyz), 3), np.uint8)
         if self.semantics is not None:
-            check_array(self.semantics, "point cloud: semantics", (len(self.xyz),), np.uint8)
+            check_shape(self.semantics, "point cloud: semantics", (len(self.xyz),), np.uint8)
 
     def __len__(self) -> int:
         return len(self.xyz)

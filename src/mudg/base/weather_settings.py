@@ -1,5 +1,4 @@
-"""Settings of weather, light and season for edited drives. Torch-free; ``mudg.core.weather`` applies
-them.
+"""Settings of weather and light for edited drives. Torch-free; ``mudg.core.weather`` applies them.
 
 Names and units are those of an edit script. The defaults change nothing.
 """
@@ -83,24 +82,13 @@ class LightSettings(StrictRecord):
     """Change of exposure, stops."""
 
 
-class SeasonSettings(StrictRecord):
-    """Another season: colours of green leaves and grass. Shapes stay."""
-
-    leaves: Literal["autumn", "bare"]
-    """What becomes of leaves: the colours of autumn, or those of twigs."""
-    amount: Annotated[float, Field(ge=0, le=1)] = 1.0
-    """How far: 0 = as recorded."""
-
-
 class Conditions(StrictRecord):
-    """Weather, light and season of an edited drive."""
+    """Weather and light of an edited drive."""
 
     weather: WeatherSettings = Field(default_factory=WeatherSettings)
     """Weather."""
     light: LightSettings = Field(default_factory=LightSettings)
     """Light."""
-    season: SeasonSettings | None = None
-    """Season; none = as recorded."""
 
     @property
     def changes_air_ground_or_light(self) -> bool:

@@ -243,12 +243,10 @@ UNUSED: frozenset[str] = frozenset(
 """Published names that may be there and are not read: what follows from the schedule, unused parts of the towers."""
 
 
-def _pattern(template: str) -> re.Pattern[str]:
-    """A name with ``{i}`` and ``{j}`` for numbers, as a pattern with groups of these names."""
-    return re.compile(re.sub(r"\\{([ij])\\}", r"(?P<\1>\\d+)", re.escape(template)))
-
-
-_TO_PUBLISHED = [(_pattern(clean), published) for published, clean in RULES]
+_TO_PUBLISHED = [
+    (re.compile(re.sub(r"\\{([ij])\\}", r"(?P<\1>\\d+)", re.escape(clean))), published) for published, clean in RULES
+]
+"""Our names as patterns, with groups for the numbers."""
 
 
 def published_names(clean: Iterable[str]) -> dict[str, str]:

@@ -1,18 +1,13 @@
 """The fit of a radiance field (method emernerf): two batches of rays per step, one of pixels and one of LiDAR, each
-with its own gradient step.
-
-    OUT/model.json, field.safetensors    the field (``fit.py``)
-    OUT/preview/*.png                    truth, colour, depth, what moves
-    OUT/log.jsonl, steps/                how it went; checkpoints, while it runs
-"""
+with its own gradient step. OUT holds model.json and field.safetensors; else as ``gaussians/fit.py``."""
 
 from __future__ import annotations
 
 import math
 import shutil
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,14 +17,15 @@ from torch import Tensor
 
 from mudg.base import checkpoint, geometry, log, records, seeds, store
 from mudg.base.devices import memory_of
-from mudg.base.errors import InputError, NumericsError
-from mudg.base.processes import Interruption, one_torch_thread
+from mudg.base.errors import InputError
+from mudg.base.processes import one_torch_thread
 from mudg.base.records import understood
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Observation, Scene, View
 from mudg.baselines import emernerf_field as fields
-from mudg.core.pictures import depth_colors, gray, side_by_side, to_bytes
+from mudg.core.pictures import panels_of, resize_area
 from mudg.gaussians.rendering import COVERED
+from mudg.gaussians.schedule import FiniteCheck, Progress, run_steps
 from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.storage import RADIANCE, description_of, kind_of
 from mudg.gaussians.views import StoredView, load_recorded, training_frames
@@ -112,9 +108,9 @@ def extent_of(scene: Scene, lidar: LidarRays | None) -> fields.Extent:
     )
 
 
-def view_rays(view: View, extent: fields.Extent, camera: int, stride: int = 1) -> tuple[fields.Rays, Tensor]:
-    """A ray for every (``stride``-th) pixel, row by row, and the camera depth of each ray's unit length ``[R]``."""
-    x, y = (torch.from_numpy(values[::stride].astype(np.float32)) for values in geometry.pixel_rays(view.camera))
+def view_rays(view: View, extent: fields.Extent, camera: int) -> tuple[fields.Rays, Tensor]:
+    """A ray for every pixel, row by row, and the camera depth of each ray's unit length ``[R]``."""
+    x, y = (torch.from_numpy(values.astype(np.float32)) for values in geometry.pixel_rays(view.camera))
     shape = len(y), len(x)
     plane = torch.stack([x.expand(shape), y[:, None].expand(shape), torch.ones(shape)], -1).reshape(-1, 3)
     poses = torch.tensor(view.world_from_cam, dtype=torch.float32).expand(len(plane), 4, 4)
@@ -126,18 +122,6 @@ def view_rays(view: View, extent: fields.Extent, camera: int, stride: int = 1) -
 def _rays(plane: Tensor, poses: Tensor, times: Tensor, cameras: Tensor) -> fields.Rays:
     along = (poses[:, :3, :3] * plane[:, None, :]).sum(2)
     return fields.Rays(poses[:, :3, 3], along / along.norm(dim=1, keepdim=True), times, cameras)
-
-
-@dataclass(frozen=True, eq=False)
-class PixelBatch:
-    """Rays of pixels with what they show: colours f32[R, 3], whether they count f32[R], sky bool[R] or None; cells of
-    the error map."""
-
-    rays: fields.Rays
-    rgb: Tensor
-    counts: Tensor
-    sky: Tensor | None
-    cells: Tensor
 
 
 class Pixels:
@@ -161,8 +145,11 @@ class Pixels:
         self._times = torch.tensor([[extent.normalised(view.view.time_s)] for view in views])
         self._cameras = torch.tensor([cameras.index(view.view.camera.name) for view in views])
 
-    def batch(self, count: int, error_share: float, generator: torch.Generator) -> PixelBatch:
-        """``count`` pixels, a share of them drawn where the error was large."""
+    def batch(
+        self, count: int, error_share: float, generator: torch.Generator
+    ) -> tuple[fields.Rays, tuple[Tensor, Tensor, Tensor | None], Tensor]:
+        """``count`` pixels, a share of them drawn where the error was large: rays; colours f32[R, 3], whether they
+        count f32[R] and sky bool[R] or None; and cells of the error map i64[R]."""
         guided = round(count * error_share)
         draws = torch.rand(count, 3, generator=generator, dtype=torch.float64)
         even = (draws[guided:, 0] * float(self._starts[-1])).long()
@@ -179,7 +166,7 @@ class Pixels:
         plane = torch.stack([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, torch.ones_like(fx)], 1)
         rays = _rays(plane, self._poses[view], self._times[view], self._cameras[view])
         sky = None if self.sky is None else self.sky[pixel]
-        return PixelBatch(rays, self._rgb[pixel].float() / 255, self._counts[pixel].float(), sky, cell)
+        return rays, (self._rgb[pixel].float() / 255, self._counts[pixel].float(), sky), cell
 
     def _badly_met(self, draws: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """View, row and column of pixels in cells drawn by their error."""
@@ -203,58 +190,33 @@ RAYS_AT_ONCE = 2048
 PREVIEW_RAYS = 6000
 
 
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """A view of a field, on the CPU: rgb ``[3, H, W]``; depth (of the median, along z, metres), opacity and share of
-    what moves ``[H, W]``."""
-
-    rgb: Tensor
-    depth: Tensor
-    opacity: Tensor
-    moving: Tensor
-
-
 @torch.no_grad()
-def see(field: fields.RadianceField, view: View, budget: fields.Budget, stride: int = 1) -> Seen:
-    """March all pixels of a view, or every ``stride``-th."""
-    name = view.camera.name
-    rays, z_per_m = view_rays(view, field.extent, field.cameras.index(name) if name in field.cameras else 0, stride)
-    begins = range(0, len(rays), RAYS_AT_ONCE)
-    parts = [_part(field, rays.part(begin, begin + RAYS_AT_ONCE), budget) for begin in begins]
-    width = -(-view.camera.width // stride)
-    every = torch.cat(parts).view(-1, width, 6).permute(2, 0, 1)
-    return Seen(every[:3], every[3] * z_per_m.view(-1, width), every[4], every[5])
-
-
-def _part(field: fields.RadianceField, rays: fields.Rays, budget: fields.Budget) -> Tensor:
-    rays = rays.to(field.device)
-    marched = fields.march(field, rays, budget)
-    rest = torch.stack([marched.median_m, marched.opacity, marched.dynamic_weights().sum(1)], 1)
-    return torch.cat([fields.colors(field, rays, marched)[0], rest], 1).cpu()
-
-
 def observe(field: fields.RadianceField, view: View, budget: fields.Budget, source: str = "") -> Observation:
-    """One view as an observation of kind "virtual", without classes; where opacity is below ``COVERED`` there is no
-    depth."""
-    seen = see(field, view, budget)
-    covered = seen.opacity[None] >= COVERED
-    opacity = seen.opacity[None].clamp(0, 1)
-    depth, sure = torch.where(covered, seen.depth[None], torch.nan), torch.where(covered, opacity, 1 - opacity)
-    rgb, mask = seen.rgb.clamp(0, 1), torch.ones_like(covered)
-    return Observation(view, rgb, depth, None, sure, mask, "virtual", source)
+    """One view as an observation of kind "virtual", on the CPU, without classes; depth is that of the median. Where
+    opacity is below ``COVERED`` there is no depth."""
+    camera, parts = view.camera, []
+    rays, z_per_m = view_rays(
+        view, field.extent, field.cameras.index(camera.name) if camera.name in field.cameras else 0
+    )
+    for begin in range(0, len(rays), RAYS_AT_ONCE):
+        part = rays.part(begin, begin + RAYS_AT_ONCE).to(field.device)
+        marched = fields.march(field, part, budget)
+        rest = torch.stack([marched.median_m, marched.opacity], 1)
+        parts.append(torch.cat([fields.colors(field, part, marched)[0], rest], 1).cpu())
+    seen = torch.cat(parts).view(camera.height, camera.width, 5).permute(2, 0, 1)
+    depth, opacity = seen[3:4] * z_per_m.view(1, camera.height, camera.width), seen[4:5]
+    covered, opacity = opacity >= COVERED, opacity.clamp(0, 1)
+    depth, sure = torch.where(covered, depth, torch.nan), torch.where(covered, opacity, 1 - opacity)
+    return Observation(view, seen[:3].clamp(0, 1), depth, None, sure, torch.ones_like(covered), "virtual", source)
 
 
-def write_preview(
-    field: fields.RadianceField, stored: StoredView, budget: fields.Budget, path: Path, whole: bool = False
-) -> None:
-    """A picture of four panels: truth, colour, depth, opacity of what moves. Coarser than the view unless
-    ``whole``."""
-    pixels = stored.view.camera.width * stored.view.camera.height
-    stride = 1 if whole else max(1, round((pixels / PREVIEW_RAYS) ** 0.5))
-    seen = see(field, stored.view, budget, stride)
-    depth = np.where(seen.opacity >= 0.5, seen.depth, np.nan)
-    panels = [stored.rgb[::stride, ::stride], to_bytes(seen.rgb), depth_colors(depth), gray(seen.moving.numpy())]
-    store.write_image(path, side_by_side(panels))
+def write_preview(field: fields.RadianceField, stored: StoredView, budget: fields.Budget, path: Path) -> None:
+    """A picture of three panels, coarser than the view: truth, colour, depth."""
+    camera = stored.view.camera
+    share = min(1.0, (PREVIEW_RAYS / (camera.width * camera.height)) ** 0.5)
+    view = stored.view.resized(*(max(1, round(size * share)) for size in (camera.width, camera.height)))
+    truth = resize_area(stored.rgb, view.camera.width, view.camera.height)
+    store.write_image(path, np.concatenate([truth, *panels_of(observe(field, view, budget))], 1))
 
 
 # on disk ------------------------------------------------------------------------------------------
@@ -310,11 +272,10 @@ share of the run in which it halves."""
 DYNAMIC_RISE = (0.1, 0.5)
 """Shares of the run between which the weight of the dynamic density grows. From the first step on it would empty that
 field."""
-LOG_EVERY = 20
 
 
 @dataclass
-class RadianceState:
+class RadianceState(Progress):
     """Everything that changes while fitting, and what it is fitted to."""
 
     field: fields.RadianceField
@@ -322,9 +283,6 @@ class RadianceState:
     pixels: Pixels
     lidar: LidarRays | None
     shown: StoredView
-    step: int = 0
-    seconds: float = 0.0
-    last: Mapping[str, float] | None = None
 
     def summary(self) -> dict[str, Any]:
         """For run.json."""
@@ -338,9 +296,7 @@ def fit_radiance(config: FitConfig, scene: Path, device: torch.device, folder: R
     with one_torch_thread(), memory_of(device, "fit"):
         state = prepare(config, read_scene(scene), folder, device)
         optimise(state, config, folder)
-    budget = BUDGETS[config.radiance.size]
-    write_preview(state.field, state.shown, budget, folder.path / "preview" / "final.png", whole=True)
-    save_field(state.field, budget, folder.path)
+    save_field(state.field, BUDGETS[config.radiance.size], folder.path)
     shutil.rmtree(folder.path / "steps", ignore_errors=True)
     return state.summary()
 
@@ -373,31 +329,17 @@ def prepare(config: FitConfig, scene: Scene, folder: RunDir, device: torch.devic
     return state
 
 
-# ---- the loop ------------------------------------------------------------------------------------
+# ---- a step --------------------------------------------------------------------------------------
 
 
 def optimise(state: RadianceState, config: FitConfig, folder: RunDir) -> None:
     """Fit up to step ``config.iterations``. Same inputs, same result, also across an interruption."""
-    pace = checkpoint.Pace()
-    with log.task(f"fit {config.method}", config.iterations, state.step) as bar, Interruption() as interruption:
-        while state.step < config.iterations:
-            began, step = time.perf_counter(), state.step + 1
-            terms = take_step(state, config, step)
-            state.step, state.seconds = step, state.seconds + time.perf_counter() - began
-            if step % LOG_EVERY == 0 or step == config.iterations:
-                state.last = _progress(terms)
-                folder.log(step=step, seconds=round(state.seconds, 3), **state.last)
-                bar.update(f"psnr {state.last['psnr']:.1f}")
-            if step % config.preview_every == 0 and step < config.iterations:
-                picture = folder.path / "preview" / f"{step:06d}.png"
-                write_preview(state.field, state.shown, BUDGETS[config.radiance.size], picture)
-            if interruption.requested or (step % config.checkpoint_every == 0 and pace.due()):
-                with pace.saving():
-                    save_checkpoint(state, folder)
-            bar.advance()
-            if interruption.requested:
-                folder.pause(state.summary())
-                interruption.stop_now()
+
+    def take(step: int) -> tuple[dict[str, Any], partial[dict[str, float]]]:
+        return {}, partial(_numbers, take_step(state, config, step))
+
+    draw = lambda path: write_preview(state.field, state.shown, BUDGETS[config.radiance.size], path)
+    run_steps(state, config, folder, take, lambda: save_checkpoint(state, folder), draw)
 
 
 def take_step(state: RadianceState, config: FitConfig, step: int) -> dict[str, Tensor]:
@@ -411,12 +353,12 @@ def take_step(state: RadianceState, config: FitConfig, step: int) -> dict[str, T
             group["lr"] = RATE * rate_share(step, config.iterations)
 
     generator = seeds.torch_generator(config.seed, step, "radiance pixels")
-    batch = state.pixels.batch(pixels, ERROR_SHARE, generator)
-    marched, draws, rays = _marched(field, batch.rays, budget, generator, learns)
-    truth = batch.rgb.to(device), batch.counts.to(device), None if batch.sky is None else batch.sky.to(device)
+    given, (rgb, counts, sky), cells = state.pixels.batch(pixels, ERROR_SHARE, generator)
+    marched, draws, rays = _marched(field, given, budget, generator, learns)
+    truth = rgb.to(device), counts.to(device), None if sky is None else sky.to(device)
     terms, error = fields.pixel_terms(field, rays, marched, draws, truth, dynamic)
-    _learn(state, terms, marched, learns, f"step {step}, pixels")
-    state.pixels.note(batch.cells, error)
+    _learn(state, terms, marched, learns, step, "of pixels")
+    state.pixels.note(cells, error)
     if state.lidar is None:
         return terms
 
@@ -425,7 +367,7 @@ def take_step(state: RadianceState, config: FitConfig, step: int) -> dict[str, T
     marched, draws, _ = _marched(field, given, budget, generator, learns)
     sight_m = sight_width(step, config.iterations)
     measured = fields.lidar_terms(field, marched, draws, range_m.to(device), dynamic, sight_m)
-    _learn(state, measured, marched, learns, f"step {step}, LiDAR")
+    _learn(state, measured, marched, learns, step, "of LiDAR")
     return terms | {name if name not in terms else f"{name}_lidar": value for name, value in measured.items()}
 
 
@@ -439,24 +381,18 @@ def _marched(
 
 
 def _learn(
-    state: RadianceState, terms: Mapping[str, Tensor], marched: fields.Marched, learns: bool, where: str
+    state: RadianceState, terms: Mapping[str, Tensor], marched: fields.Marched, learns: bool, step: int, view: str
 ) -> None:
     """One step of the optimisers down the sum of the terms; NumericsError before that if something is not finite."""
-    total = torch.stack(list(terms.values())).sum()
-    total = total + fields.proposal_loss(marched) if learns else total
+    check, clear = FiniteCheck(step), state.field.zero_grad
     remedy = "the parameters are those of the step before; another --seed draws other rays"
-    if not bool(torch.isfinite(total)):
-        odd = [name for name, value in terms.items() if not bool(torch.isfinite(value))]
-        raise NumericsError("a loss term is not finite", where=where, got=", ".join(odd) or "proposals", remedy=remedy)
-    for optimiser in state.optimisers:
-        optimiser.zero_grad(set_to_none=True)
-    total.backward()
-    named = [(name, value.grad) for name, value in state.field.named_parameters() if value.grad is not None]
-    sums = torch.stack([gradient.sum() for _, gradient in named])
-    if not bool(torch.isfinite(sums).all()):
-        odd = [name for name, gradient in named if not bool(torch.isfinite(gradient).all())]
-        if odd:
-            raise NumericsError("a gradient is not finite", where=where, got=", ".join(odd[:3]), remedy=remedy)
+    every = {**terms, **({"proposals": fields.proposal_loss(marched)} if learns else {})}
+    check.terms(view, every)
+    clear()
+    torch.stack(list(every.values())).sum().backward()
+    named = {name: value.grad for name, value in state.field.named_parameters() if value.grad is not None}
+    check.sums(view, named, remedy, clear)
+    check.refuse()
     for optimiser in state.optimisers[: 2 if learns else 1]:
         optimiser.step()
 
@@ -479,13 +415,10 @@ def sight_width(step: int, iterations: int) -> float:
     return 0.0 if since <= 0 else max(SIGHT_LEAST_M, SIGHT_M * 0.5 ** math.floor(since / SIGHT_HALVES))
 
 
-def _progress(terms: Mapping[str, Tensor]) -> dict[str, float]:
+def _numbers(terms: Mapping[str, Tensor]) -> dict[str, float]:
     values = torch.stack([value.detach() for value in terms.values()]).tolist()
     named = {f"loss_{name}": round(value, 7) for name, value in zip(terms, values)}
     return {"psnr": round(-10 * math.log10(max(named["loss_color"], 1e-10)), 3), **named}
-
-
-# ---- checkpoints -------------------------------------------------------------
 
 
 def save_checkpoint(state: RadianceState, folder: RunDir) -> None:
@@ -498,8 +431,7 @@ def save_checkpoint(state: RadianceState, folder: RunDir) -> None:
         for kind, moment in optimiser.state.get(value, {}).items()
     }
     groups = {"field": field, "moments": moments, "errors": {"errors": state.pixels.errors}}
-    facts = {"seconds": state.seconds, "last": dict(state.last or {})}
-    checkpoint.save(folder.path / "steps", state.step, groups, facts)
+    checkpoint.save(folder.path / "steps", state.step, groups, state.facts())
 
 
 def _restore(state: RadianceState, found: checkpoint.Checkpoint) -> None:
@@ -511,4 +443,4 @@ def _restore(state: RadianceState, found: checkpoint.Checkpoint) -> None:
             if own["step"] is not None and any(value is one for one in optimiser.param_groups[0]["params"]):
                 optimiser.state[value] = {kind: tensor.to(value.device) for kind, tensor in own.items()}
     state.pixels.errors = found.tensors("errors")["errors"]
-    state.step, state.seconds, state.last = found.step, float(found.state["seconds"]), found.state["last"]
+    state.resume(found)

@@ -1,12 +1,6 @@
-"""The fields of EmerNeRF (Yang et al. 2023): what is at a place and a time, and how it moves.
-
-    static    3-D grid -> density and a feature
-    dynamic   4-D grid -> the same, averaged over where the place comes from and goes to (flow aggregation)
-    flow      4-D grid -> motion to the next and from the previous time step, metres
-
-One colour network reads the features of both, the direction and the camera's appearance; a shadow head lets what moves
-darken what stands; the sky is a network of the direction. Two proposal networks say where samples are worth taking.
-"""
+"""The fields of EmerNeRF (Yang et al. 2023): static (3-D grid -> density and a feature), dynamic (4-D, averaged along
+the flow) and flow (4-D -> motion to the next and from the previous time step, metres). One colour network reads the
+features, the direction and the camera's appearance; a shadow head lets what moves darken what stands."""
 
 from __future__ import annotations
 
@@ -26,10 +20,8 @@ from mudg.core.grids import HashGrid, encode
 
 
 def contract(xyz: Tensor, center: Tensor, half: Tensor) -> Tensor:
-    """World places ``[..., 3]`` into the unit cube: a box fills its inner half evenly, everything outside the rest.
-
-    With ``p = (xyz - center) / half`` and n the largest ``|p|``: p within the box, ``(2 - 1/n) p/n`` outside; [-2, 2]
-    becomes [0, 1]. ``center``, ``half``: f32[3], middle and half size of the box in metres."""
+    """World places ``[..., 3]`` into the unit cube. With ``p = (xyz - center) / half`` of a box (f32[3], metres) and n
+    the largest ``|p|``: p within the box, ``(2 - 1/n) p/n`` outside; [-2, 2] becomes [0, 1]."""
     inner = (xyz - center) / half
     norm = inner.abs().amax(-1, keepdim=True).clamp_min(1.0)
     return inner * ((2 - 1 / norm) / norm) / 4 + 0.5
@@ -61,9 +53,8 @@ def rendering_weights(density: Tensor, edges_m: Tensor) -> Tensor:
 
 
 def resampled_edges(edges: Tensor, weights: Tensor, count: int, jitter: Tensor, floor: float = 1e-3) -> Tensor:
-    """Edges ``[R, count + 1]`` of intervals with equal shares of the weights (data; no gradient). ``edges``:
-    ``[R, n + 1]``. ``weights``: ``[R, n]``. ``jitter``: f32[R, 1] in [0, 1]. ``floor``: added to every weight, so that
-    empty rays are sampled evenly."""
+    """Edges ``[R, count + 1]`` of intervals with equal shares of the ``weights`` [R, n] between ``edges`` [R, n + 1]
+    (no gradient). ``jitter``: f32[R, 1] in [0, 1]. ``floor``: added to every weight: empty rays are sampled evenly."""
     mass = weights.detach() + floor
     cdf = torch.cumsum(mass / mass.sum(1, keepdim=True), 1)
     cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf], 1).clamp(max=1.0)
@@ -76,11 +67,9 @@ def resampled_edges(edges: Tensor, weights: Tensor, count: int, jitter: Tensor, 
 
 
 def blurred_mass(edges: Tensor, weights: Tensor, wanted: Tensor, radius: float) -> Tensor:
-    """Mass of a histogram, blurred by a box of half width ``radius``, in the intervals of other edges (zip-NeRF,
-    section 4).
-
-    The blurred histogram is linear between the edges moved by +- radius; its integral is read off at the wanted edges.
-    ``edges``: ``[R, n + 1]``. ``weights``: ``[R, n]``. ``wanted``: ``[R, m + 1]``. Returns f64[R, m]."""
+    """Mass f64[R, m] of a histogram (``edges`` [R, n + 1], ``weights`` [R, n]), blurred by a box of half width
+    ``radius``, between other edges ``wanted`` [R, m + 1] (zip-NeRF, section 4): it is linear between the edges moved by
+    +- radius, and its integral is read off."""
     edges, weights, wanted = edges.double(), weights.double(), wanted.double()
     height = weights / (edges[:, 1:] - edges[:, :-1]).clamp_min(1e-9)
     radius = max(radius, 1e-6)
@@ -99,10 +88,9 @@ def blurred_mass(edges: Tensor, weights: Tensor, wanted: Tensor, radius: float) 
 
 
 def interlevel_loss(edges: Tensor, weights: Tensor, proposed: Tensor, proposal: Tensor, radius: float) -> Tensor:
-    """How far a proposal falls short of the (blurred) histogram that it should cover: sum of
-    ``max(0, target - w)^2 / w``, mean of rays. ``edges``, ``weights``: of the final samples, ``[R, n + 1]`` and
-    ``[R, n]``; data. ``proposed``, ``proposal``: edges (data) and weights of the proposal, ``[R, m + 1]`` and
-    ``[R, m]``. ``radius``: half width of the blur, in normalised distance."""
+    """How far a proposal (edges ``proposed`` [R, m + 1], weights [R, m]) falls short of the histogram of the final
+    samples, blurred by ``radius``: sum of ``max(0, target - w)^2 / w``, mean of rays. Only ``proposal`` gets
+    gradients."""
     target = blurred_mass(edges.detach(), weights.detach(), proposed.detach(), radius).to(proposal.dtype)
     return ((target - proposal).clamp_min(0).square() / (proposal + 1e-5)).sum(1).mean()
 
@@ -244,8 +232,6 @@ class RadianceField(nn.Module):
             forth = self.flow_at(xyz + backward, (time - step).clamp(0, 1))[:, :3]
         return 0.5 * ((forward + back).square() + (backward + forth).square()).mean()
 
-    # -- state -------------------------------------------------------------------------------------
-
     def description(self) -> dict[str, Any]:
         """Everything but the parameters, as JSON values."""
         sizes, extent = asdict(self.sizes), asdict(self.extent)
@@ -314,10 +300,8 @@ class _GridNet(nn.Module):
 
 
 class _ColorNet(nn.Module):
-    """Colour of features seen from a direction: three layers, the input read again by the second.
-
-    What belongs to a ray is multiplied once per ray, not once per sample.
-    """
+    """Colour of features seen from a direction: three layers, the input read again by the second. What belongs to a ray
+    is multiplied once per ray, not once per sample."""
 
     def __init__(self, width: int, context: int, draw: torch.Generator) -> None:
         super().__init__()
@@ -406,9 +390,8 @@ class RayDraws:
 
 @dataclass(frozen=True, eq=False)
 class Marched:
-    """Rays after marching, n samples each. ``along``: normalised edges ``[R, n + 1]``; ``edges_m``: the same as
-    distances; ``middles_m``: distances ``[R, n]``; weights ``[R, n]``. ``xyz``, ``times``: of all samples,
-    ``[R * n, 3]`` and ``[R * n, 1]``. ``values``: of the fields there. ``proposals``: edges and weights of every
+    """Rays after marching, n samples each: edges ``[R, n + 1]``, normalised and as distances; middles and weights ``[R,
+    n]``; places ``[R * n, 3]`` and times ``[R * n, 1]``; what the fields say there; and edges and weights of every
     proposal round."""
 
     along: Tensor
@@ -490,8 +473,7 @@ def colors(field: RadianceField, rays: Rays, marched: Marched) -> tuple[Tensor, 
     return rgb + (1 - marched.opacity)[:, None] * field.sky(context).sigmoid(), shadow
 
 
-# ---- losses --------------------------------------------------------------------------------------
-
+# losses -------------------------------------------------------------------------------------------
 
 SKY_WEIGHT, LIDAR_WEIGHT, SIGHT_WEIGHT, SHADOW_WEIGHT, CYCLE_WEIGHT = 0.001, 1.0, 0.1, 0.01, 0.01
 """As published."""
@@ -534,12 +516,9 @@ def lidar_terms(
 
 
 def line_of_sight(weights: Tensor, edges_m: Tensor, range_m: Tensor, sight_m: float) -> Tensor:
-    """How far weights are from a narrow bell at the measured range, and from 0 before it: sums along rays, mean of
-    rays.
-
-    The weight of an interval is compared with the mass of the bell N(z, sight_m / 3) in it, by the square of the
-    difference; what begins more than ``sight_m`` behind the range is free. ``weights``: ``[R, n]``. ``edges_m``:
-    ``[R, n + 1]``. ``range_m``: ``[R]``."""
+    """How far ``weights`` [R, n] between ``edges_m`` [R, n + 1] are from the masses of the bell N(range, sight_m / 3)
+    at the measured ``range_m`` [R]: squares, summed along rays, mean of rays. What begins more than ``sight_m`` behind
+    the range is free."""
     off = edges_m - range_m[:, None]
     upto = 0.5 * (1 + torch.erf(off * (3 / (sight_m * 2**0.5))))
     missed = (weights - (upto[:, 1:] - upto[:, :-1])).square()
@@ -555,8 +534,5 @@ def _of_motion(field: RadianceField, marched: Marched, draws: RayDraws, dynamic:
 
 def proposal_loss(marched: Marched) -> Tensor:
     """What the proposal networks learn from."""
-    losses = [
-        interlevel_loss(marched.along, marched.weights, edges, weights, radius)
-        for (edges, weights), radius in zip(marched.proposals, PULSE_RADII)
-    ]
-    return torch.stack(losses).sum()
+    pairs = zip(marched.proposals, PULSE_RADII)
+    return torch.stack([interlevel_loss(marched.along, marched.weights, *own, radius) for own, radius in pairs]).sum()

@@ -20,13 +20,12 @@ from torch import Tensor
 
 from mudg.base import log, seeds
 from mudg.base.types import FusedCloud, Scene
-from mudg.baselines.timed import timed_points, world_model
 from mudg.core import losses
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import NodeRows, StaticNode
 from mudg.gaussians.recipes import SCENE_UNIT_M, DrawnView, OwnRecipe
 from mudg.gaussians.settings import FitConfig
-from mudg.gaussians.start import painted_sky
+from mudg.gaussians.start import painted_sky, timed_points, world_model
 from mudg.gaussians.views import StoredView, TrainView
 
 # vibration ----------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from mudg.base import log, seeds
 from mudg.base.types import FusedCloud, Scene, View
-from mudg.baselines.timed import FlatNetwork, timed_points, world_model
+from mudg.baselines.omnire import FlatNetwork
 from mudg.core import losses
 from mudg.core.grids import TIME, PlaneSizes, look_up
 from mudg.core.table import Table
@@ -28,6 +28,7 @@ from mudg.gaussians.nodes import NodeRows, StaticNode
 from mudg.gaussians.recipes import DrawnView, OwnRecipe
 from mudg.gaussians.schedule import FIELD_STEPS
 from mudg.gaussians.settings import FitConfig
+from mudg.gaussians.start import timed_points, world_model
 from mudg.gaussians.views import StoredView, TrainView
 
 # hexplane -----------------------------------------------------------------------------------------

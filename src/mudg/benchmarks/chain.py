@@ -1,15 +1,15 @@
 """How benchmarks of complete methods run: one loop over logs, side by side; the steps of a scene that they share, each
-in a folder that is verified and reused; and pages that hold all methods side by side.
+in a folder that is verified and reused; and pictures of all methods side by side.
 
     OUT/fuse  OUT/fit/<row>  OUT/start/<row>   clouds; every fit; what a variant with an own first fit goes on with
     OUT/render/<row>  OUT/nearest_fill  OUT/exact   views to score (the benchmark says where generated ones lie)
     OUT/repair/<step>  OUT/start/difix-<step>       repaired renders on the way to generated views; their fit
-    OUT/film/<trajectory>.jpg and .mp4              the pictures of pages of shift and paper, which name them"""
+    OUT/film/<trajectory>.jpg and .mp4              all methods side by side, of shift and paper"""
 
 from __future__ import annotations
 
-import base64
 import math
+import operator
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg import native
-from mudg.base import html, log, store
+from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.layout import OBSERVATION_FILES, below
 from mudg.base.processes import run_in_processes
@@ -32,7 +32,7 @@ from mudg.core.pictures import resize_area
 from mudg.core.raster.rasterize import drawing_device
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing.settings import RenderConfig
-from mudg.formats.exporters.video import Encoding, jpeg_bytes, mp4_within, video_encoders
+from mudg.formats.exporters.video import jpeg_bytes, mp4_within, video_encoders
 from mudg.gaussians.settings import FitConfig
 from mudg.scene.clouds import read_fused
 from mudg.scene.observations import ObservationSet, ObservationWriter, list_observation_sets, read_observations
@@ -44,10 +44,11 @@ from mudg.steps.ingest import Fuse
 from mudg.steps.pipeline import WITHOUT_DIFFUSION, fits_of
 from mudg.steps.render import RenderViews
 from mudg.steps.synthesize import Synthesize
-from mudg.viewer.report import FPS, panel_grid, panel_size, shift_title
+from mudg.viewer.report import FPS, panel_grid, panel_size
 
 Facts = Mapping[str, Any]
 """What was measured, by name, as in JSON."""
+PAGES: Final = ("bench.json", "bench.md")
 
 
 def compare(
@@ -55,28 +56,22 @@ def compare(
     jobs: Mapping[str, Callable[[], dict[str, Any]]],
     config: BenchConfig,
     document: Callable[[list[dict[str, Any]]], dict[str, Any]],
-    texts: Mapping[str, Callable[[Facts], str]],
+    markdown: Callable[[Facts], str],
 ) -> Path:
     """Do all jobs (title -> what another process can measure), several at a time with one thread each; write
-    ``bench.json`` and its texts. Results do not depend on how many run at a time; finished steps of an interrupted
-    benchmark are reused. ``document``: what ``bench.json`` holds, from what the jobs measured, in their order.
-    ``texts``: file -> its text, from the document."""
+    ``bench.json`` and ``bench.md``. Results do not depend on how many run at a time; finished steps of an interrupted
+    benchmark are reused. ``document``: what ``bench.json`` holds, from what the jobs measured, in their order."""
     measured, titles = {}, list(jobs)
     with log.task("logs", len(jobs)) as bar, native.one_thread():
         work = [(measure,) for measure in jobs.values()]
-        for index, facts in run_in_processes(_measure, work, min(at_once(config), len(jobs))):
+        for index, facts in run_in_processes(operator.call, work, min(at_once(config), len(jobs))):
             measured[index] = facts
             bar.update(titles[index])
             bar.advance()
     content = document([measured[index] for index in range(len(jobs))])
     store.write_json(out / "bench.json", content)
-    for name, text in texts.items():
-        store.write_text(out / name, text(content))
+    store.write_text(out / "bench.md", markdown(content))
     return out
-
-
-def _measure(measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    return measure()
 
 
 def at_once(config: BenchConfig) -> int:
@@ -97,30 +92,21 @@ def run_step(step: Result) -> Path:
         return step.run()
 
 
-def finished(path: Path, measure: Callable[[], Any]) -> Any:
-    """What a part of a benchmark wrote; it is measured if there is no such file yet, so an interrupted benchmark goes
-    on."""
-    if not path.is_file():
-        store.write_json(path, measure())
-    return store.read_json(path)
-
-
-def refuse_foreign(
-    out: Path, pages: Sequence[str], is_own: Callable[[Any], bool], may_be: Callable[[Path], bool] = Path.is_dir
-) -> None:
-    """UsageError if a folder holds anything that a benchmark does not write. ``out``: it need not exist. ``pages``:
-    names of its files at the top; the first is its result, in JSON. ``is_own``: whether that result is this
-    benchmark's. ``may_be``: whether an entry may belong to it, if it is no page."""
+def refuse_foreign(out: Path, bench: str, table: str = "", may_be: Callable[[Path], bool] = Path.is_dir) -> None:
+    """UsageError if a folder, which need not exist, holds anything that a benchmark (under a table of a paper) does not
+    write. ``may_be``: whether an entry may belong to it that is none of ``PAGES``."""
     if not out.exists():
         return
     entries = [entry for entry in out.iterdir() if not is_temporary(entry.name)] if out.is_dir() else [out]
-    names = [entry.name for entry in entries]
-    foreign = [entry.name for entry in entries if entry.name not in pages and not may_be(entry)]
-    if not foreign and any(name in pages for name in names):
+    foreign = [entry.name for entry in entries if entry.name not in PAGES and not may_be(entry)]
+    pages = [entry.name for entry in entries if entry.name in PAGES]
+    if pages and not foreign:
         try:
-            foreign = [] if is_own(store.read_json(out / pages[0])) else [pages[0]]
-        except (InputError, KeyError, TypeError):
-            foreign = [name for name in names if name in pages]
+            doc = store.read_json(out / PAGES[0])
+            own = doc["bench"] == bench and doc.get("table", {}).get("name", "") == table
+        except (InputError, KeyError, TypeError, AttributeError):
+            own = False
+        foreign = [] if own else pages
     if foreign:
         what = "the output folder holds files that do not belong to this run"
         raise UsageError(what, where=str(out), got=", ".join(sorted(foreign)[:8]), remedy="choose an empty --out")
@@ -257,11 +243,10 @@ class FillViews(Output):
 
 
 PANEL_WIDTH: Final = 320
-ENCODING: Final = Encoding(FPS, first_crf=29, last_crf=41, preset="veryfast")
+QUALITY: Final = (29, 41)
 VIDEO_BYTES: Final = 900 * 1024
 """A video larger than this is made anew in lower quality: eight logs of seven trajectories stay under 60 MB."""
-ROWS: Final = {"rgb": "colour", "error": "colour error", "depth": "depth"}
-"""Rows of a video, and their titles."""
+ROWS: Final = ("rgb", "error", "depth")
 
 
 class Film(Output):
@@ -272,18 +257,15 @@ class Film(Output):
     """Column -> folders of observation folders. Where "truth" is among them, it has every trajectory; else there is no
     row of errors."""
     paths: tuple[Trajectory, ...]
-    videos: bool = True
-    """Off: only the pictures, of the middle view and in full size."""
 
     def key_settings(self) -> dict[str, Any]:
         names = [path.name for path in self.paths]
-        settings = {"columns": list(self.views), "trajectories": names, "panel_width_px": PANEL_WIDTH}
-        return settings if self.videos else {**settings, "videos": False}
+        return {"columns": list(self.views), "trajectories": names, "panel_width_px": PANEL_WIDTH}
 
     def make(self, work: RunDir) -> dict[str, Any]:
         sets_of = lambda folders: {k: v for one in folders for k, v in list_observation_sets(one).items()}
         listed = {name: sets_of(folders) for name, folders in self.views.items()}
-        playable = self.videos and bool(video_encoders())
+        playable = bool(video_encoders())
         for path in self.paths:
             sets = {name: read_observations(sets[path.name]) for name, sets in listed.items() if path.name in sets}
             if "truth" in self.views and "truth" not in sets:
@@ -292,10 +274,10 @@ class Film(Output):
                 continue
             pictures = list(_frames(sets, list(self.views), range(len(path)) if playable else [len(path) // 2]))
             if playable:
-                video = mp4_within(lambda frames=pictures: frames, ENCODING, VIDEO_BYTES)
+                video = mp4_within(lambda frames=pictures: frames, FPS, QUALITY, VIDEO_BYTES)
                 store.atomic_write(work.path / f"{path.name}.mp4", video)
             middle = pictures[len(pictures) // 2]
-            poster = resize_area(middle, middle.shape[1] // 2, middle.shape[0] // 2) if self.videos else middle
+            poster = resize_area(middle, middle.shape[1] // 2, middle.shape[0] // 2)
             store.atomic_write(work.path / f"{path.name}.jpg", jpeg_bytes(poster, quality=75))
         return {"columns": list(self.views), "videos": playable}
 
@@ -309,44 +291,3 @@ def _frames(
     for frame in frames:
         seen = {column: sets[column][frame] if column in sets else None for column in order}
         yield panel_grid(seen, rows, size, seen.get("truth"))
-
-
-def wall(title: str, pictures: Mapping[str, Path], notes: Sequence[str] = ()) -> dict[str, Any]:
-    """Pictures side by side, by title, which a page holds."""
-    inside = lambda path: base64.b64encode(store.read_bytes(path)).decode("ascii")
-    cells = [{"title": name, "src": "data:image/jpeg;base64," + inside(path)} for name, path in pictures.items()]
-    return {"title": title, "notes": notes, "cells": cells}
-
-
-def films(
-    doc: Mapping[str, Any], columns: Sequence[str], *, videos: bool, exact: bool = True, choice: bool = False
-) -> dict[str, Any]:
-    """Values of a page's section with the films of all logs; with a choice among them, the largest shift to the left
-    comes first."""
-    named = [(entry["log"], name) for entry in doc["logs"] for name in entry["films"]]
-    titles = {name: shift_title(_shift_of(name), name) if choice else name for _, name in named}
-    names = sorted(titles, key=_shift_of)
-    choices = [{"name": name, "title": titles[name], "selected": name == names[-1]} for name in names]
-    return {
-        "title": "Rendered views",
-        "columns": columns,
-        "videos": videos,
-        "panel_rows": [title for row, title in ROWS.items() if row != "error" or exact],
-        "films": [{"log": log, "name": name, "title": titles[name]} for log, name in named],
-        "log_choices": [entry["log"] for entry in doc["logs"] if entry["films"]] if choice else [],
-        "shift_choices": choices if choice else [],
-    }
-
-
-def _shift_of(name: str) -> float:
-    _, _, shift = name.partition("_shift")
-    return float(shift) if shift else 0.0
-
-
-def render_page(title: str, command: str, lead: str, sections: Sequence[Mapping[str, Any]], footer: str = "") -> str:
-    """A page. ``command``: what makes it. ``lead``: first sentence. ``sections``: each with ``title``, and any of
-    ``tables`` (``base.html.TextTable``), ``notes`` above and ``below`` them, the values of `films`, and ``walls``.
-    ``footer``: where the pictures lie."""
-    usual = {"tables": (), "notes": (), "below": (), "films": (), "walls": (), "log_choices": (), "shift_choices": ()}
-    whole = [{**usual, **section} for section in sections]
-    return html.render("bench.html.j2", title=title, kicker=command, lead=lead, footer=footer, sections=whole)

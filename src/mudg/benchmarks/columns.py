@@ -6,7 +6,6 @@ they are read from the log.
     targets.json             the views, what each belongs to, and the colour maps of cameras
     maps/000000.safetensors  per view: depth f32[H, W] metres of LiDAR points (0 = none), and as the protocol needs them
                              seen u8, dynamic u8, color u8[H, W, 3] and colored u8, classes u8 (255 = none)
-    pictures/000000.jpg      the truth of the views that the page shows
 
 A column adds up arrays of numbers over the views of a place (a camera, or a distance beside the path); its value is
 read from the sum. A method's value on a log is the mean over its places; or, under a protocol that pools, the value of
@@ -36,9 +35,8 @@ from mudg.benchmarks.places import Protocol
 from mudg.core import calibration, lidar, metrics, trajectory
 from mudg.core.fusion import STATIC
 from mudg.core.lidar import DEPTH_LIMIT_M, OwnedPoints, ShownFrame
-from mudg.core.pictures import class_colors, depth_colors, error_image, resize_nearest, resize_rgb, to_bytes
+from mudg.core.pictures import resize_nearest, resize_rgb
 from mudg.diffusion import model_files
-from mudg.formats.exporters.video import jpeg_bytes
 from mudg.labels.inputs import box_outline
 from mudg.networks.featnets import CodecFeatures, PerceptualDistance
 from mudg.scene.observations import list_observation_sets, read_observations
@@ -52,8 +50,6 @@ LEAST_SEEN: Final = 0.05
 """Cameras of whose pixels the shown cameras saw less than this share are left out."""
 LEAST_POINTS: Final = 10
 """A dynamic object counts in a view that shows at least this many of its LiDAR points."""
-PICTURES: Final = 4
-SPLAT_SHARE: Final = 0.006
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +75,6 @@ class Targets:
     folder: Path
     records: tuple[Mapping[str, Any], ...]
     color_maps: Mapping[str, ColorMap]
-    pictures: tuple[int, ...]
     facts: Mapping[str, Any]
     reason: str
 
@@ -99,7 +94,7 @@ class MakeTargets(Output):
     """Write the truth of a log under a protocol."""
 
     verb_name = "bench real truth"
-    version, files = 2, ("targets.json", "maps/*.safetensors", "pictures/*.jpg")
+    version, files = 3, ("targets.json", "maps/*.safetensors")
     log: Path
     """The whole log."""
     shown: Path
@@ -118,10 +113,9 @@ class MakeTargets(Output):
         frames = [f for f in scene.frames if (f.id in hidden if hidden else f.view.camera.name in self.cameras)]
         by_camera = {name: [f for f in frames if f.view.camera.name == name] for name in scene.cameras}
         records, left_out, color_maps = _written(maker, by_camera, work.path)
-        pictures = _write_pictures(maker, records, work.path)
         reason = "" if records else next(iter(left_out.values()), "no frame to score")
         document = {"views": records, "color_maps": {name: asdict(found) for name, found in color_maps.items()}}
-        document |= {"pictures": pictures, "left_out": left_out, "reason": reason}
+        document |= {"left_out": left_out, "reason": reason}
         store.write_json(work.path / "targets.json", document)
         return {"views": len(records)}
 
@@ -139,7 +133,7 @@ def read_targets(folder: Path) -> Targets:
     facts = {"views": {place: len(own) for place, own in by_place.items()}}
     facts |= {name: found[name] for name in ("left_out", "color_maps")}
     facts |= {"seen_share": {place: round(float(share), 4) for place, share in shares.items()}, "weight": weight}
-    return Targets(folder, tuple(found["views"]), maps, tuple(found["pictures"]), facts, found["reason"])
+    return Targets(folder, tuple(found["views"]), maps, facts, found["reason"])
 
 
 def _view_of(scene: Scene, frame: Frame, shift_m: float) -> View:
@@ -261,52 +255,6 @@ class _Maker:
         """The colour map of a camera, from the points that its training frames share with the shown cameras."""
         pairs = [self._seen(frame)[1:] for frame in frames]
         return calibration.color_map(*(np.concatenate([pair[side] for pair in pairs]) for side in (0, 1)))
-
-
-# ---- pictures ------------------------------------------------------------------------------------
-
-
-def _write_pictures(maker: _Maker, records: Sequence[Mapping[str, Any]], out: Path) -> list[int]:
-    """Write the truth of the middle view of up to ``PICTURES`` places; returns the views' numbers."""
-    chosen: list[int] = []
-    for place in dict.fromkeys(record["place"] for record in records):
-        own = [number for number, record in enumerate(records) if record["place"] == place]
-        chosen.append(own[len(own) // 2])
-    chosen = chosen[:PICTURES]
-    frames = {frame.id: frame for frame in maker.scene.frames}
-    for number in chosen:
-        maps = store.read_safetensors(out / "maps" / f"{number:06d}.safetensors")
-        picture = truth_picture(maker.scene, frames[records[number]["frame"]], maps, maker.protocol)
-        store.atomic_write(out / "pictures" / f"{number:06d}.jpg", jpeg_bytes(picture, quality=80))
-    return chosen
-
-
-def truth_picture(
-    scene: Scene, frame: Frame, maps: Mapping[str, NDArray[Any]], protocol: Protocol
-) -> NDArray[np.uint8]:
-    """What the page shows as truth, two pictures above each other: the photograph, and its part that counts or the
-    LiDAR depth; without a photograph the points, in the colours or classes that they have."""
-    camera = frame.view.camera
-    width = max(1, round(SPLAT_SHARE * camera.width))
-    depth = np.where(maps["depth"] > 0, maps["depth"], np.float32(np.nan))
-    points = splatted(depth_colors(depth), maps["depth"] > 0, width)
-    if "photo" in protocol.maps:
-        photo = read_image(scene, frame)
-        below = np.where(maps["seen"][..., None] > 0, photo, photo // 4) if "seen" in maps else points
-        return np.vstack([photo, below])
-    if "classes" in maps:
-        return splatted(class_colors(maps["classes"]), maps["classes"] != palette.UNLABELLED, width)
-    return np.vstack([splatted(maps["color"], maps["colored"] > 0, width), points])
-
-
-def splatted(rgb: NDArray[np.uint8], known: NDArray[np.bool_], width: int) -> NDArray[np.uint8]:
-    """Pixels of an image u8[H, W, 3] as squares on grey, so that single points are seen."""
-    picture = np.full_like(rgb, 24)
-    for row in range(-width // 2, width // 2 + 1):
-        for column in range(-width // 2, width // 2 + 1):
-            moved = np.roll(known, (row, column), (0, 1))
-            picture[moved] = np.roll(rgb, (row, column), (0, 1))[moved]
-    return picture
 
 
 PERCEPTUAL_VIEWS: Final = 12
@@ -479,23 +427,11 @@ def _within(generated: Tensor, true: Tensor) -> Tensor:
     return (torch.maximum(generated.clamp_min(1e-6) / true, true / generated.clamp_min(1e-6)) < 1.25).double()
 
 
-def _part_columns(part: str) -> dict[str, Column]:
-    squared = lambda made, true: (made - true) ** 2
-    return {
-        f"abs_rel_{part}": Column(f"AbsRel, {part}", 4, _depth(_relative, part), _mean, ratio=True),
-        f"rmse_{part}": Column(f"RMSE m, {part}", 2, _depth(squared, part), _root, ratio=True),
-        f"delta1_{part}": Column(f"delta1, {part}", 4, _depth(_within, part), _mean),
-    }
+def _squared(generated: Tensor, true: Tensor) -> Tensor:
+    return (generated - true) ** 2
 
 
-def _point_columns(part: str) -> dict[str, Column]:
-    difference = _point_color(torch.abs, part)
-    return {
-        f"point_psnr_{part}": Column(f"PSNR at points, {part}", 2, _point_color(torch.square, part), _decibels),
-        f"point_abs_{part}": Column(f"colour error at points, {part}", 4, difference, _mean, ratio=True),
-    }
-
-
+_PARTS: Final = ("seen", "static", "dynamic")
 COLUMNS: Final[dict[str, Column]] = {
     "psnr": Column("PSNR dB", 2, _photo(metrics.psnr), _mean),
     "ssim": Column("SSIM", 3, _photo(metrics.ssim), _mean),
@@ -505,8 +441,17 @@ COLUMNS: Final[dict[str, Column]] = {
     "psnr_seen": Column("PSNR dB, seen", 2, _seen_color, _decibels),
     "perceptual_seen": Column("perceptual, seen", 4, _perceptual("seen"), _mean, ratio=True),
     "abs_rel": Column("AbsRel", 4, _depth(_relative), _mean, ratio=True),
-    **{name: column for part in ("seen", "static", "dynamic") for name, column in _part_columns(part).items()},
-    **{name: column for part in ("static", "dynamic") for name, column in _point_columns(part).items()},
+    **{f"abs_rel_{of}": Column(f"AbsRel, {of}", 4, _depth(_relative, of), _mean, ratio=True) for of in _PARTS},
+    **{f"rmse_{of}": Column(f"RMSE m, {of}", 2, _depth(_squared, of), _root, ratio=True) for of in _PARTS},
+    **{f"delta1_{of}": Column(f"delta1, {of}", 4, _depth(_within, of), _mean) for of in _PARTS},
+    **{
+        f"point_psnr_{of}": Column(f"PSNR at points, {of}", 2, _point_color(torch.square, of), _decibels)
+        for of in _PARTS[1:]
+    },
+    **{
+        f"point_abs_{of}": Column(f"colour error at points, {of}", 4, _point_color(torch.abs, of), _mean, ratio=True)
+        for of in _PARTS[1:]
+    },
     "miou": Column("mIoU", 3, _confusion, _mean_iou),
     "accuracy": Column("accuracy", 3, _confusion, _accuracy),
 }
@@ -523,10 +468,10 @@ def shipped_features(device: torch.device | None = None) -> CodecFeatures:
 
 
 class ScoreTargets(Output):
-    """Score a method's views (folders of observations) of a log; writes its values and its pictures for the page."""
+    """Score a method's views (folders of observations) of a log; writes its values."""
 
     verb_name = "bench real score"
-    version, files = 2, ("metrics.json", "pictures/*.jpg")
+    version, files = 3, ("metrics.json",)
     log: Path
     truth: Path
     views: Path
@@ -555,9 +500,6 @@ class ScoreTargets(Output):
                 distance, view = features if number in sampled else None, finder.at(target.view)
                 sight = sight_of(target, view, scene, protocol, distance)
                 _add(sums.setdefault(target.place, {}), {name: COLUMNS[name].of(sight) for name in protocol.columns})
-                if number in targets.pictures:
-                    picture = jpeg_bytes(_picture_of(sight, protocol), quality=80)
-                    store.atomic_write(work.path / "pictures" / f"{number:06d}.jpg", picture)
                 bar.advance()
         store.write_json(work.path / "metrics.json", values_of(protocol, sums))
         return {"views": len(targets)}
@@ -623,13 +565,3 @@ class ViewFinder:
                     return views[index]
         expected = f"camera {view.camera.name} at {view.time_s:.3f} s"
         raise InputError("a method lacks a view that is scored", where=str(self._folder), expected=expected)
-
-
-def _picture_of(sight: Sight, protocol: Protocol) -> NDArray[np.uint8]:
-    """What the page shows of a method: colour above its error or, without a photograph, above its depth; or classes."""
-    blank = np.full((*sight.rgb.shape[-2:], 3), 24, np.uint8)
-    if "classes" in protocol.maps:
-        return blank if sight.semantics is None else class_colors(sight.semantics.numpy().astype(np.uint8))
-    if sight.photo is not None:
-        return np.vstack([to_bytes(sight.rgb), error_image(sight.rgb, sight.photo)])
-    return np.vstack([to_bytes(sight.rgb), blank if sight.depth is None else depth_colors(sight.depth[0].numpy())])

@@ -27,7 +27,7 @@ from mudg.base.errors import UsageError
 from mudg.base.html import markdown_table
 from mudg.base.run_folder import refuse_overlap
 from mudg.base.types import Camera, View
-from mudg.benchmarks.chain import Facts, compare, finished, refuse_foreign
+from mudg.benchmarks.chain import Facts, compare, refuse_foreign
 from mudg.benchmarks.places import Views, listed_cities, score_settings
 from mudg.benchmarks.rows import (
     BASE,
@@ -36,9 +36,9 @@ from mudg.benchmarks.rows import (
     PaperPlace,
     PaperTable,
     chain_settings,
+    method_rows,
     model_settings,
     refuse_unfit,
-    shift_rows,
 )
 from mudg.benchmarks.settings import BenchConfig
 from mudg.benchmarks.shift import standard_error
@@ -47,8 +47,8 @@ from mudg.city.logs import STANDARD, LogRules
 from mudg.city.world import CityWorld
 from mudg.core import metrics
 from mudg.diffusion import model_files
+from mudg.scene.motion import Road
 from mudg.scene.read import read_scene
-from mudg.scene.road import Road
 from mudg.sim.drive import Cockpit, Drive, Following, RoadUser, beginning
 from mudg.sim.lidar import LidarRequest, MountedLidar, mounted
 from mudg.sim.pilots import DriverView, EdgePilot, RoutePilot
@@ -82,7 +82,6 @@ COLUMNS: Final[Mapping[str, tuple[str, int]]] = {
     "collisions": ("collisions", 2),
     "departures": ("off the road", 2),
 }
-_PAGES: Final = ("bench.json", "bench.md")
 
 
 @dataclass(frozen=True)
@@ -96,6 +95,13 @@ class LoopLog(Views):
         self.chain.fuse()
         course = Course.of(CityWorld(city_logs.log_config(int(self.log.name), self.rules)))
         drives = self.out / "drives"
+
+        def finished(path: Path, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+            """What an interrupted benchmark wrote, else measured now."""
+            if not path.is_file():
+                store.write_json(path, measure())
+            return store.read_json(path)
+
         exact = {
             pilot: finished(drives / f"exact-{pilot.replace(' ', '_')}.json", partial(measure_drive, course, pilot))
             for pilot in PILOTS
@@ -250,13 +256,12 @@ def run(
     ``shift.run``."""
     if config.methods == BenchConfig().methods:
         config = replace(config, methods=(BASE, FULL))
-    rows, out = shift_rows(config, preset), Path(out)
+    rows, out = method_rows(config, preset), Path(out)
     without = [row.name for row in rows if row.fit is None or row.name == MIXED]
     if without:
         raise UsageError("nobody can drive in this row: it is no scene", where="--methods", got=", ".join(without))
     refuse_overlap(out, {"model": model_files.folder_of(config.model)})
-    own = lambda doc: doc.get("bench") == "loop"
-    refuse_foreign(out, _PAGES, own, lambda entry: entry.name.isdigit())
+    refuse_foreign(out, "loop", may_be=lambda entry: entry.name.isdigit())
     refuse_unfit(config, preset, rows, [])
     shifts_m = [d * side for d in (2.0, 3.0, 4.0) for side in (1, -1)]
     table = PaperTable(name="loop", places=[PaperPlace(name="off", title="", shifts_m=shifts_m)], columns=[])
@@ -273,7 +278,7 @@ def run(
     }
     names = [EXACT, *(row.name for row in rows)]
     filled = lambda logs: {"schema": 1, "bench": "loop", "settings": settings, "rows": names, **pooled(names, logs)}
-    return compare(out, jobs, config, filled, {"bench.md": markdown})
+    return compare(out, jobs, config, filled, markdown)
 
 
 def pooled(names: Sequence[str], logs: Sequence[Facts]) -> dict[str, Any]:

@@ -5,12 +5,10 @@ reason why there is none: a method that lacks a number on one log has no mean. F
 logs at a place, as one set as in papers; a mean of the distances of small sets is mostly bias.
 
     OUT/<log>/...   see ``benchmarks/places.py``; views that fits learn from lie in OUT/<log>/virtual
-    OUT/bench.json   every number   OUT/bench.md bench.csv   the table   OUT/page.html   table and pictures"""
+    OUT/bench.json   every number   OUT/bench.md   the table"""
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,10 +22,9 @@ from numpy.typing import NDArray
 from mudg.base import config as configuration
 from mudg.base import store
 from mudg.base.errors import InputError
-from mudg.base.html import ARROWS, PUBLISHED, TextCell, TextLine, TextTable, best_of, markdown_table
-from mudg.base.html import markdown as rendered
+from mudg.base.html import ARROWS, best_of, markdown_table
 from mudg.base.run_folder import refuse_overlap
-from mudg.benchmarks.chain import Facts, compare, films, refuse_foreign, render_page, seconds_of
+from mudg.benchmarks.chain import Facts, compare, refuse_foreign, seconds_of
 from mudg.benchmarks.places import (
     TRUTH,
     ListedCity,
@@ -60,7 +57,6 @@ from mudg.scoring.sets import FEATURES_FOLDER, FEWEST, distances, video_entry
 from mudg.scoring.tables import NO_TRUTH, NOT_COMPUTED, SET_METRICS
 from mudg.steps.settings import PresetName
 
-PAGES: Final = ("bench.json", "bench.md", "bench.csv", "page.html")
 ANCHORS: Final = {TRUTH: "the truth itself", FILL: "fused points, holes filled"}
 """Rows that every table has, with their titles; the first is no method and enters no ranking."""
 BY_DEFINITION: Final = frozenset({"psnr", "ssim", "psnr_movers", "lpips", "perceptual", "abs_rel", "miou"})
@@ -86,7 +82,6 @@ class PaperLog(Views):
     def measure(self) -> dict[str, Any]:
         """Facts of the log, per row and place the values with their numbers of views, and seconds."""
         views, truth, out = self.of_rows(), self.truth, self.out.parent
-        shown = views if truth is None else {TRUTH: truth, **views}
         scored = {name: self.scores(name, folders) for name, folders in views.items()}
         if truth is not None:
             scored[TRUTH] = self.scores(TRUTH, (truth,))
@@ -107,15 +102,15 @@ class PaperLog(Views):
                 place: {entry: {"made": [], "reference": of["reference"]} for entry, of in files.items()}
                 for place, files in features[FILL].items()
             }
-        films, scene = self.film(shown), self.loaded
+        self.film(views)
+        scene = self.loaded
         sizes = dict.fromkeys(f"{camera.width}x{camera.height}" for camera in scene.cameras.values())
         names = {"log": self.log.name, "dataset": scene.source.dataset, "cameras": list(scene.cameras)}
         counts = {"frames": len(scene.frames_of(first_camera(scene, ()))), "size": ", ".join(sizes)}
         counts |= {"held_out": len(scene.frames_in("test")), "tracks": len(scene.tracks)}
         about = {"note": self.log.note, "exact": truth is not None}
         scores = {"values": values, "features": features, "made": _made_of(fill)}
-        pictures = {"films": films, "columns": list(shown)}
-        return {**names, **counts, **about, **scores, **pictures, "seconds": seconds_of(self.out)}
+        return {**names, **counts, **about, **scores, "seconds": seconds_of(self.out)}
 
 
 def run(
@@ -135,7 +130,7 @@ def run(
     weights = {name: at for name, at in files.items() if at and (name.endswith("weights") or Path(at).exists())}
     refuse_overlap(out, {"model": mdm_files.folder_of(config.model), **read, **weights})
     digests = {name: store.digest(Path(path)) for name, path in weights.items()}  # before any work: one may be missing
-    refuse_foreign(out, PAGES, lambda doc: doc["bench"] == "paper" and doc["table"]["name"] == table.name)
+    refuse_foreign(out, "paper", table.name)
     generates = [row.changes for row in rows if METHODS[row.method].made_by == "synthesize"]
     refuse_unfit(config, preset, rows, [replace(generator_of(config), **changes) for changes in generates])
     measured = score_settings(config, table)
@@ -147,14 +142,12 @@ def run(
         "list": str(sources[0]) if isinstance(logs[0], ListedCity) else "",
         "missing_scenes": missing_scenes(table, logs),
         **model_settings(config),
-        "videos": config.videos,
         "score": configuration.result_settings(measured),
         "digests": digests,
         **chain_settings(config, preset),
     }
     values = [{"name": r.name, "title": r.title, "method": r.method, "changes": dict(r.changes)} for r in rows]
-    texts = {"bench.md": markdown, "bench.csv": as_csv, "page.html": page}
-    return compare(out, jobs, config, lambda logs: document(table, logs, values, settings, pooled(logs, out)), texts)
+    return compare(out, jobs, config, lambda logs: document(table, logs, values, settings, pooled(logs, out)), markdown)
 
 
 def further_columns(exact: bool) -> tuple[PaperColumn, ...]:
@@ -289,7 +282,7 @@ def document(
     pooled: Mapping[str, Mapping[str, Values]] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Everything ``bench.json`` holds. ``logs``: per log its facts, ``exact``, ``values[row][place][key]`` as from
-    `at_place`, ``made``, ``films``, ``columns``, seconds. ``rows``: name, title, method and changes of what was
+    `at_place`, ``made``, seconds. ``rows``: name, title, method and changes of what was
     computed. ``pooled``: row -> place -> metric -> mean and standard error of the sets of all logs together, where
     there are such. InputError: methods have different numbers of views."""
     exact = all(entry["exact"] for entry in logs)
@@ -411,47 +404,39 @@ def _empty_columns(doc: Facts) -> dict[str, dict[str, None]]:
     return of
 
 
-def main_table(doc: Facts) -> TextTable:
-    """The table: published rows, ours, and the numbers of views."""
+def main_table(doc: Facts) -> list[str]:
+    """Lines of the table: published rows, ours, and the numbers of views."""
     wanted, columns = [tuple(cell) for cell in doc["table"]["cells"]], _columns(doc)
     titles = {place["name"]: place["title"] for place in doc["table"]["places"]}
-    heads = ["", *(f"{_headed(columns[key])}, {titles[place]}" for place, key in wanted)]
-    lines = []
+    rows = []
     for row in doc["published"]:
         values = {(place, key): value for place, key, value in row["values"]}
         if values.keys() & set(wanted):
             texts = [_digits(values[cell], columns[cell[1]]) if cell in values else "" for cell in wanted]
-            title = f"{row['title']} ({PUBLISHED}: {row['source']})"
-            lines.append(TextLine(title, tuple(map(TextCell, texts)), PUBLISHED))
-    return TextTable(tuple(heads), (*lines, *_ours(doc, wanted)))
-
-
-def further_tables(doc: Facts) -> list[TextTable]:
-    """The further columns, one table per place."""
-    columns, places = doc["further"], doc["table"]["places"] if doc["further"] else ()
-    lines = {place["name"]: _ours(doc, [(place["name"], column["key"]) for column in columns]) for place in places}
-    return [TextTable(("", *map(_headed, columns)), tuple(lines[p["name"]]), p["title"]) for p in places]
+            rows.append([f"{row['title']} (published: {row['source']})", *texts])
+    return markdown_table(
+        ["", *(f"{_headed(columns[key])}, {titles[place]}" for place, key in wanted)], [*rows, *_ours(doc, wanted)]
+    )
 
 
 def _headed(column: Facts) -> str:
     return f"{column['title']} {ARROWS[column['better']]}"
 
 
-def _ours(doc: Facts, wanted: Sequence[tuple[str, str]]) -> Iterator[TextLine]:
+def _ours(doc: Facts, wanted: Sequence[tuple[str, str]]) -> Iterator[list[str]]:
     shared = {cell: _shared_reason(doc, *cell) for cell in wanted}
     for row in doc["rows"]:
-        cells = (TextCell(NONE) if shared[cell] else _printed(doc, row["name"], *cell) for cell in wanted)
-        yield TextLine(row["title"], tuple(cells), "ours" if row["method"] else "anchor")
-    yield TextLine("n", tuple(TextCell(_count(doc, *cell)) for cell in wanted), "n")
+        yield [row["title"], *(NONE if shared[cell] else _printed(doc, row["name"], *cell) for cell in wanted)]
+    yield ["n", *(_count(doc, *cell) for cell in wanted)]
 
 
-def _printed(doc: Facts, row: str, place: str, key: str) -> TextCell:
+def _printed(doc: Facts, row: str, place: str, key: str) -> str:
     result, column = doc["cells"][row][place][key], _columns(doc)[key]
     if "mean" not in result:
-        return TextCell(result["reason"])
+        return result["reason"]
     error = result["standard_error"]
-    behind = "" if error is None else f" ({_digits(error, column)})"
-    return TextCell(_digits(result["mean"], column) + behind, row in doc["best"][place][key])
+    text = _digits(result["mean"], column) + ("" if error is None else f" ({_digits(error, column)})")
+    return f"**{text}**" if row in doc["best"][place][key] else text
 
 
 def _digits(value: float, column: Facts) -> str:
@@ -478,47 +463,10 @@ def _log_cells(entry: Facts) -> list[str]:
 
 
 def markdown(doc: Facts) -> str:
-    """The table for people."""
-    lines = [f"# {heading(doc)}", "", *(f"* {note}" for note in notes_of(doc)), "", *rendered(main_table(doc)), ""]
-    for table in further_tables(doc):
-        lines += [f"## {doc['further_title']}: {table.title}", "", *rendered(table), ""]
+    """The table for people; below it the further columns, one table per place."""
+    lines = [f"# {heading(doc)}", "", *(f"* {note}" for note in notes_of(doc)), "", *main_table(doc), ""]
+    for place in doc["table"]["places"] if doc["further"] else ():
+        own = [(place["name"], column["key"]) for column in doc["further"]]
+        table = markdown_table(["", *map(_headed, doc["further"])], _ours(doc, own))
+        lines += [f"## {doc['further_title']}: {place['title']}", "", *table, ""]
     return "\n".join([*lines, "## Logs", "", *markdown_table(LOG_HEADS, map(_log_cells, doc["logs"])), ""])
-
-
-def as_csv(doc: Facts) -> str:
-    """One line per number: ``kind,row,source,place,metric,value,standard_error,logs,n,n_reference,reason,best``."""
-    rows: list[list[Any]] = []
-    for row in doc["published"]:
-        first = [PUBLISHED, row["title"], row["source"]]
-        rows += [[*first, place, key, value, *[""] * 6] for place, key, value in row["values"]]
-    for row in doc["rows"]:
-        first = ["ours" if row["method"] else "anchor", row["name"], ""]
-        for place, of in doc["cells"][row["name"]].items():
-            for key, result in of.items():
-                values = [result.get(name) for name in ("mean", "standard_error")]
-                numbers = ["" if value is None else f"{value:.6g}" for value in values]
-                counts = [sum(result[name]) if name in result else "" for name in ("n", "n_reference")]
-                best = int(row["name"] in doc["best"][place][key])
-                last = [result.get("logs", ""), *counts, result.get("reason", ""), best]
-                rows.append([*first, place, key, *numbers, *last])
-    heads, out = "kind row source place metric value standard_error logs n n_reference reason best", io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows([heads.split(), *rows])
-    return out.getvalue()
-
-
-def page(doc: Facts) -> str:
-    """The whole page from what ``bench.json`` holds."""
-    lead, *notes = notes_of(doc)
-    further = [{"title": doc["further_title"], "tables": further_tables(doc)}] if doc["further"] else []
-    return render_page(
-        heading(doc),
-        f"mudg bench paper --table {doc['table']['name']}",
-        lead,
-        [
-            {"title": "Table", "tables": [main_table(doc)], "below": notes},
-            *further,
-            films(doc, doc["logs"][0]["columns"], videos=doc["settings"]["videos"], exact=doc["exact"]),
-            {"title": "Logs", "tables": [TextTable.of_texts(LOG_HEADS, map(_log_cells, doc["logs"]))]},
-        ],
-        "The pictures lie beside this page.",
-    )

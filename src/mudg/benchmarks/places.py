@@ -471,13 +471,12 @@ class Views:
             documents[scored] = store.read_json(scored / "metrics.json")
         return documents
 
-    def film(self, shown: Mapping[str, Path | Sequence[Path]]) -> list[str]:
-        """Make a picture (or video) of every trajectory; returns their names. With another method the old ones are out
-        of date, whatever was asked."""
-        views = {name: (of,) if isinstance(of, Path) else tuple(of) for name, of in shown.items() if of is not None}
-        film = Film(views=views, paths=self.paths, videos=self.config.videos, out=self.out / "film", overwrite=True)
-        run_step(film)
-        return [path.name for path in self.paths]
+    def film(self, shown: Mapping[str, tuple[Path, ...]]) -> None:
+        """Make a video of every trajectory, if asked to; the truth, where it is known, stands first. With another
+        method the old ones are out of date, whatever was asked."""
+        if self.config.videos:
+            views = {**({} if self.truth is None else {TRUTH: (self.truth,)}), **shown}
+            run_step(Film(views=views, paths=self.paths, out=self.out / "film", overwrite=True))
 
 
 def score_settings(config: BenchConfig, table: PaperTable) -> ScoreConfig:

@@ -10,7 +10,7 @@ hidden was removed (``scene/part.py``), so they cannot use it. Whatever is finis
     OUT/<log>/<split>/fuse fit/<method> virtual           what methods make of it; generated views
     OUT/<log>/<split>/nearest_fill generated render/<method>   the views to score
     OUT/<log>/truth/<protocol>  OUT/<log>/score/<protocol>/<method>
-    OUT/bench.json  OUT/bench.md  OUT/page.html
+    OUT/bench.json  OUT/bench.md
 """
 
 from __future__ import annotations
@@ -18,16 +18,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
-from mudg.base import config as configuration
 from mudg.base import store
-from mudg.base.html import TextTable, markdown_table
-from mudg.base.html import markdown as rendered
+from mudg.base.html import markdown_table
 from mudg.base.layout import SCENE_FILES
 from mudg.base.run_folder import RunDir, refuse_overlap
 from mudg.base.types import Scene
-from mudg.benchmarks.chain import Chain, Facts, compare, refuse_foreign, render_page, run_step, wall
+from mudg.benchmarks.chain import Chain, Facts, compare, refuse_foreign, run_step
 from mudg.benchmarks.columns import COLUMNS, MakeTargets, ScoreTargets, mean_values, read_targets
 from mudg.benchmarks.places import (
     SPLITS,
@@ -45,11 +43,12 @@ from mudg.benchmarks.rows import (
     BASE,
     DIFFUSION,
     FILL,
+    SCENES,
     Row,
     chain_settings,
     generator_of,
+    method_rows,
     model_settings,
-    real_rows,
     refuse_unfit,
 )
 from mudg.benchmarks.settings import BenchConfig
@@ -61,8 +60,6 @@ from mudg.scene.read import read_scene
 from mudg.scene.write import write_part
 from mudg.steps.engine import Output
 from mudg.steps.settings import PresetName
-
-PAGES: Final = ("bench.json", "bench.md", "page.html")
 
 
 class PartOfScene(Output):
@@ -89,15 +86,16 @@ class PartOfScene(Output):
 def run(
     config: BenchConfig, sources: Sequence[Path], out: Path, *, preset: PresetName = "default", overwrite: bool = False
 ) -> Path:
-    """Compare methods on real logs; returns ``out`` with ``bench.json``, ``bench.md`` and ``page.html``; what lies
-    there of the same settings is reused, and logs, protocols and methods may be added later. ``sources``: folders of
-    dataset logs, or scenes made by ``mudg ingest``. ``preset``: what ``config`` started from. ``overwrite``: replace
-    what other settings left in ``out``. UsageError: no log, an unknown method or protocol, a setting
-    that no row uses, two logs of one name, or ``out`` holds something else. Whatever a verb raises."""
-    rows, protocols, logs, out = real_rows(config, preset), protocols_of(config.protocols), names_of(sources), Path(out)
+    """Compare methods on real logs; returns ``out`` with ``bench.json`` and ``bench.md``; what lies there of the same
+    settings is reused, and logs, protocols and methods may be added later. ``sources``: folders of dataset logs, or
+    scenes made by ``mudg ingest``. ``preset``: what ``config`` started from. ``overwrite``: replace what other settings
+    left in ``out``. UsageError: no log, an unknown method or protocol, a setting that no row uses, two logs of one
+    name, or ``out`` holds something else. Whatever a verb raises."""
+    rows, protocols = method_rows(config, preset, SCENES), protocols_of(config.protocols)
+    logs, out = names_of(sources), Path(out)
     read = {f"log {name}": path for name, path in logs.items()}
     refuse_overlap(out, {"model": mdm_files.folder_of(config.model), **read})
-    refuse_foreign(out, PAGES, lambda document: document["bench"] == "real")
+    refuse_foreign(out, "real")
     generates = any(row.name == DIFFUSION for row in rows)
     refuse_unfit(config, preset, rows, [generator_of(config)] * generates)
     scenes = {name: imported(config, path, out / name / "scene", overwrite) for name, path in logs.items()}
@@ -116,9 +114,7 @@ def run(
         **chain_settings(config, preset),
     }
 
-    changed = lambda row: configuration.result_settings(row.fit) if row.varied else None
-    fit_of = lambda row: "" if row.fit is None else row.method
-    methods = [{"name": r.name, "title": r.title, "fit": fit_of(r), "changes": changed(r)} for r in rows]
+    methods = [{"name": r.name, "title": r.title, "fit": "" if r.fit is None else r.method} for r in rows]
 
     def filled(measured: list[dict[str, Any]]) -> dict[str, Any]:
         pairs = list(zip(jobs, measured, strict=True))
@@ -127,7 +123,7 @@ def run(
         return document(entries, methods, protocols, settings)
 
     work = {f"{job.out.name} {job.split.name}": job.measure for job in jobs}
-    return compare(out, work, config, filled, {"bench.md": markdown, "page.html": lambda doc: page_of(doc, out)})
+    return compare(out, work, config, filled, markdown)
 
 
 # ---- one log under one way of hiding ----
@@ -170,7 +166,7 @@ class SplitJob:
             step = {"log": self.source, "shown": chain.scene, "protocol": protocol, "held": tuple(held.frames)}
             truth = chain.run(MakeTargets(**step, cameras=cameras, out=self.out / "truth" / protocol.name))
             targets = read_targets(truth)
-            result[protocol.name] = {"facts": targets.facts, "pictures": list(targets.pictures), "values": {}}
+            result[protocol.name] = {"facts": targets.facts, "values": {}}
             if len(targets):
                 truths[protocol.name] = truth
             else:
@@ -271,8 +267,8 @@ def document(
 # ---- text ----
 
 
-def table_of(doc: Facts, protocol: str, values: Mapping[str, Facts]) -> TextTable:
-    """A method's values, each in brackets with its comparison with the fit without diffusion."""
+def table_of(doc: Facts, protocol: str, values: Mapping[str, Facts]) -> list[str]:
+    """Lines of a table of methods' values, each in brackets with its comparison with the fit without diffusion."""
     columns = doc["protocols"][protocol]["row"]["columns"]
     rows, base = [], values.get(BASE)
     for method, of in values.items():
@@ -280,11 +276,11 @@ def table_of(doc: Facts, protocol: str, values: Mapping[str, Facts]) -> TextTabl
         more = {name: COLUMNS[name].compared_text(of[name], against.get(name)) for name in columns}
         texts = [COLUMNS[name].text(of[name]) + (f" ({more[name]})" if more[name] else "") for name in columns]
         rows.append([method, *texts])
-    return TextTable.of_texts(["method", *(COLUMNS[name].title for name in columns)], rows)
+    return markdown_table(["method", *(COLUMNS[name].title for name in columns)], rows)
 
 
 def notes_of(doc: Facts, protocol: str) -> list[str]:
-    """Sentences about a protocol: what was held out of each log, what was left out, and the colour maps of cameras."""
+    """Sentences about a protocol: what was held out of each log, how much of it was seen, and what was left out."""
     result, lines = doc["protocols"][protocol], []
     for log in doc["logs"]:
         name, split = log["log"], result["row"]["split"]
@@ -296,103 +292,41 @@ def notes_of(doc: Facts, protocol: str) -> list[str]:
         if "blocks" in held:
             blocks = ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in held["blocks"])
             words.append(f"held out of {held['moments']} frames: {blocks}")
-        if "shown_cameras" in held:
-            words.append("shown: " + ", ".join(held["shown_cameras"]))
         for place, share in facts["seen_share"].items():
-            weight = facts["weight"].get(place, 0)
-            words.append(f"{share:.0%} of {place} was seen, {weight:.0%} of all seen pixels")
-        for place, of in facts["color_maps"].items():
-            gain, offset = " ".join(f"{g:.2f}" for g in of["gain"]), " ".join(f"{o:+.3f}" for o in of["offset"])
-            words.append(f"colour map of {place}: gain {gain}, offset {offset}")
+            words.append(f"{share:.0%} of {place} was seen, {facts['weight'].get(place, 0):.0%} of all seen pixels")
         words += [f"{place} is left out ({reason})" for place, reason in facts["left_out"].items()]
         lines.append(f"{name}: {'; '.join(words)}.")
     return lines
 
 
-def heading_of(doc: Facts, protocol: str) -> str:
-    """Title of a protocol."""
-    return f"{protocol}: {doc['protocols'][protocol]['row']['title']}"
-
-
-def summary_of(doc: Facts) -> str:
-    """One line about the whole."""
-    settings, count = doc["settings"], len(doc["logs"])
-    logs, iterations = f"{count} log{'s' if count != 1 else ''}", f"{settings['iterations']} iterations per fit"
-    return f"{logs}, {iterations}, {virtual_fits_of(settings)}; seed {settings['seed']}."
-
-
 def markdown(doc: Facts) -> str:
     """The tables for people; those of single places stand only where a log has several."""
+    settings, logs = doc["settings"], []
+    for log in doc["logs"]:
+        cameras = log["cameras"]
+        sizes = dict.fromkeys("{}x{}".format(*of["size_px"]) for of in cameras.values())
+        frames = dict.fromkeys(str(of["frames"]) for of in cameras.values())
+        counts = str(log["sweeps"]), str(log["tracks"])
+        logs.append([log["log"], log["dataset"], *map(", ".join, (cameras, frames, sizes)), *counts])
     lines = [
         "# Real logs",
         "",
-        f"{summary_of(doc)} {BRACKETS} Perceptual: features of the shipped codec, not LPIPS.",
+        f"{settings['iterations']} iterations per fit, {virtual_fits_of(settings)}; seed {settings['seed']}. In"
+        f" brackets: difference to {BASE}, or the ratio (x) where lower is better. Perceptual: features of the shipped"
+        " codec, not LPIPS.",
         "",
-        *markdown_table(LOG_HEADS, map(log_cells, doc["logs"])),
+        *markdown_table(["log", "dataset", "cameras", "frames", "size", "sweeps", "tracked boxes"], logs),
         "",
     ]
     for name, result in doc["protocols"].items():
         counted = {log: entry["values"] for log, entry in result["logs"].items() if "left_out" not in entry}
-        lines += [f"## {heading_of(doc, name)}", "", *(f"* {note}" for note in notes_of(doc, name)), ""]
+        notes = [f"* {note}" for note in notes_of(doc, name)]
+        lines += [f"## {name}: {result['row']['title']}", "", *notes, ""]
         if counted:
-            lines += [*rendered(table_of(doc, name, result["pooled"])), ""]
+            lines += [*table_of(doc, name, result["pooled"]), ""]
         for log, values in counted.items():
             places = dict.fromkeys(place for of in values.values() for place in of["places"])
             for place in places if len(places) > 1 else ():
                 table = table_of(doc, name, {method: of["places"][place] for method, of in values.items()})
-                lines += [f"### {name}, {log}, {place}", "", *rendered(table), ""]
+                lines += [f"### {name}, {log}, {place}", "", *table, ""]
     return "\n".join(lines)
-
-
-BRACKETS: Final = f"In brackets: difference to {BASE}, or the ratio (x) where lower is better."
-LOG_HEADS: Final = ("log", "dataset", "cameras", "frames", "size", "sweeps", "tracked boxes")
-
-
-def log_cells(log: Facts) -> list[str]:
-    """A log's row under ``LOG_HEADS``."""
-    cameras = log["cameras"]
-    sizes = dict.fromkeys(f"{of['size_px'][0]}x{of['size_px'][1]}" for of in cameras.values())
-    frames = dict.fromkeys(str(of["frames"]) for of in cameras.values())
-    names = [", ".join(words) for words in (cameras, frames, sizes)]
-    return [log["log"], log["dataset"], *names, str(log["sweeps"]), str(log["tracks"])]
-
-
-def page_of(doc: Facts, out: Path) -> str:
-    """The whole page, which holds its pictures (those in the benchmark's folder ``out``): the truth beside every method
-    for some views of each protocol."""
-    logs = TextTable.of_texts(LOG_HEADS, map(log_cells, doc["logs"]))
-    sections = [{"title": "Logs", "tables": [logs]}, *(_section(doc, name, out) for name in doc["protocols"])]
-    return render_page("Real logs", "mudg bench real", summary_of(doc), sections)
-
-
-def _section(doc: Facts, name: str, out: Path) -> dict[str, Any]:
-    result, walls = doc["protocols"][name], []
-    counted = {log: entry for log, entry in result["logs"].items() if "left_out" not in entry}
-    for log, entry in counted.items():
-        folders = {"truth": out / log / "truth" / name, **{m: out / log / "score" / name / m for m in entry["values"]}}
-        views = store.read_json(folders["truth"] / "targets.json")["views"]
-        for number in entry["pictures"]:
-            view = views[number]
-            shift = f", {view['shift_m']:+g} m" if view["shift_m"] else ""
-            pictures = {title: folder / "pictures" / f"{number:06d}.jpg" for title, folder in folders.items()}
-            walls.append(wall(f"{log}: {view['frame']}{shift}", pictures))
-    below = next((text for key, text in BELOW.items() if key in result["row"]["maps"]), BELOW[""])
-    return {
-        "title": heading_of(doc, name),
-        "notes": notes_of(doc, name),
-        "walls": walls,
-        "tables": [table_of(doc, name, result["pooled"])] if counted else [],
-        "below": [BRACKETS] * bool(counted) + [below] * bool(walls),
-    }
-
-
-BELOW: Final = {
-    "seen": "Below: of the truth the part that the shown cameras saw; of the methods the colour error.",
-    "photo": "Below: of the truth the depth of LiDAR points; of the methods the colour error.",
-    "classes": "Truth: the classes of LiDAR points.",
-    "": (
-        "Truth: LiDAR points in their recorded colours, below in the colours of their depth; of the methods colour and"
-        " depth."
-    ),
-}
-"""Map of a protocol -> what the lower pictures show."""

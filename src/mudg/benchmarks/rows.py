@@ -3,19 +3,16 @@ which methods, with what settings of their fits."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal
-
-from pydantic import model_validator
 
 from mudg.base import config as configuration
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.plain_yaml import parse_yaml
-from mudg.base.records import StrictRecord, checked_by, parse_record
+from mudg.base.records import StrictRecord, parse_record
 from mudg.benchmarks.settings import BenchConfig, bench_preset
 from mudg.diffusion import model_files, views
 from mudg.diffusion.settings import SynthesizeConfig
@@ -72,7 +69,7 @@ class PaperColumn(StrictRecord):
 
     def values(self) -> dict[str, Any]:
         """For JSON."""
-        return {"key": self.key, "title": self.title, "better": self.better, "digits": self.digits, "factor": 1.0}
+        return self.model_dump(exclude={"needs", "counts"})
 
 
 class PaperRow(StrictRecord):
@@ -118,31 +115,11 @@ class PaperTable(StrictRecord):
         """All places and columns, in the order of the table."""
         return tuple((p, c) for p in self.places for c in self.columns if c.key in self.only.get(p.name, (c.key,)))
 
-    @model_validator(mode="after")
-    @checked_by
-    def _check(self) -> PaperTable:
-        cells = [(place.name, column.key) for place, column in self.cells()]
-        _refuse(set(self.only) - {place.name for place in self.places}, "only: no such place")
-        _refuse({cell for cell in cells if cells.count(cell) > 1}, "a place has a column twice")
-        for row in self.published:
-            wrong = {(place, key) for place, key, _ in row.values} - set(cells)
-            _refuse(wrong, f"published {row.title!r}: not in the table")
-        _refuse({row.method for row in self.rows} - set(METHODS), "rows: no such method")
-        if self.virtual_shifts_m and any(any(place.shifts_m) or place.paths for place in self.places):
-            what = "generated views lie at the places off the path"
-            raise InputError(what, where="virtual_shifts_m", remedy="leave it out")
-        return self
-
     def values(self) -> dict[str, Any]:
         """For JSON, without published rows."""
-        pick = lambda *names: {name: getattr(self, name) for name in names}
-        return {
-            **pick("name", "title", "data", "scenes", "notes"),
-            "places": [place.model_dump() for place in self.places],
-            "cells": [[place.name, column.key] for place, column in self.cells()],
-            "columns": [column.values() for column in self.columns],
-            **pick("held_out_every", "front_only", "all_cameras"),
-        }
+        kept = {"name", "title", "data", "scenes", "notes", "places", "held_out_every", "front_only", "all_cameras"}
+        cells = [[place.name, column.key] for place, column in self.cells()]
+        return {**self.model_dump(include=kept), "cells": cells, "columns": [one.values() for one in self.columns]}
 
 
 class Papers(StrictRecord):
@@ -152,11 +129,6 @@ class Papers(StrictRecord):
     further: dict[Literal["exact", "measured"], list[str]]
     scene_lists: dict[str, list[SceneRange]]
     tables: dict[str, PaperTable]
-
-
-def _refuse(unknown: set[Any], what: str) -> None:
-    if unknown:
-        raise InputError(what, got=", ".join(sorted(map(str, unknown))))
 
 
 def read_papers(text: str, where: str) -> Papers:
@@ -179,10 +151,7 @@ def read_papers(text: str, where: str) -> Papers:
         got = f"{type(error).__name__}: {error}"
         raise InputError("these are no tables of papers", where=where, got=got) from error
     records = {**{k: v for k, v in raw.items() if k != "places"}, "columns": columns, "tables": tables}
-    papers = parse_record(Papers, records, f"{where}: ")
-    _refuse({table.scenes for table in papers.tables.values()} - {"", *papers.scene_lists}, "scenes: no such list")
-    _refuse({key for keys in papers.further.values() for key in keys} - set(columns), "further: no such column")
-    return papers
+    return parse_record(Papers, records, f"{where}: ")
 
 
 def _printed(source: str, cells: str, rows: str) -> list[dict[str, Any]]:
@@ -210,23 +179,21 @@ MIXED: Final = "mudg_f"
 REPAIRED: Final = "difix"
 PLACES: Final = ("cameras", "shifts_m", "paths", "condition", "processes")
 """Settings of generated views that are the benchmark's matter, not the user's."""
-_METHODS: Final = (FILL, "gs3d", BASE, LONGER, *PUBLISHED, DIFFUSION, FULL)
-_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
+SCENES: Final = (FILL, "gs3d", BASE, LONGER, *PUBLISHED, DIFFUSION, FULL)
+"""Methods that every benchmark of complete methods knows, in the order of the tables."""
 
 
 @dataclass(frozen=True)
 class Row:
     """A row that is computed. ``method``: of `METHODS`; empty = fused points, holes filled. ``fit``: settings of its
     fit (those of the first fit where it is ``LONGER``); None = no fit. ``changes``: other settings of its fit or of
-    synthesize; ``model: ""`` = there is no model, so the row has no numbers. ``varied``: its settings stand in the
-    table."""
+    synthesize; ``model: ""`` = there is no model, so the row has no numbers."""
 
     name: str
     title: str
     method: str = ""
     fit: FitConfig | None = None
     changes: Mapping[str, Any] = field(default_factory=dict)
-    varied: bool = False
 
     @property
     def left_out(self) -> bool:
@@ -325,20 +292,11 @@ def refuse_unfit(
 # ---- rows ----
 
 
-def shift_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row, ...]:
-    """The methods and variants of ``mudg bench shift``, in the order of the tables. UsageError: an unknown method, one
-    that does not know a setting beyond the preset, or a malformed or repeated variant."""
-    return _without_twins([*_method_rows(config, preset, (*_METHODS, MIXED)), *_variants(config)])
-
-
-def real_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row, ...]:
-    """The methods and variants of ``mudg bench real``. Raises as `shift_rows`."""
-    variants = (replace(row, title=title_of(row.name)) for row in _variants(config))
-    return _without_twins([*_method_rows(config, preset, _METHODS), *variants])
-
-
-def _method_rows(config: BenchConfig, preset: PresetName, known: Sequence[str]) -> list[Row]:
-    """Rows of the methods that are asked for, in the order of ``known``."""
+def method_rows(
+    config: BenchConfig, preset: PresetName = "default", known: Sequence[str] = (*SCENES, MIXED)
+) -> tuple[Row, ...]:
+    """Rows of the methods that are asked for, in the order of ``known``. UsageError: an unknown method, or one that
+    does not know a setting beyond the preset."""
     _refuse_unknown(config.methods, known)
     usual, rows = usual_fit(config), list[Row]()
     for name in (name for name in known if name in config.methods):
@@ -347,7 +305,7 @@ def _method_rows(config: BenchConfig, preset: PresetName, known: Sequence[str]) 
             continue
         method, title = {LONGER: BASE, MIXED: FULL}.get(name, name), LONGER_TITLE if name == LONGER else title_of(name)
         rows.append(Row(name, title, method, method_fit(usual, method, preset)))
-    return rows
+    return tuple(rows)
 
 
 def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "default") -> tuple[Row, ...]:
@@ -381,33 +339,7 @@ def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "def
     return tuple(complete)
 
 
-def _variants(config: BenchConfig) -> Iterator[Row]:
-    """Rows of ``mudg_s`` from ``NAME=FIELD:VALUE,FIELD:VALUE``; values as in YAML, a dot between a group and its field.
-    UsageError if malformed or no field of ``FitConfig``."""
-    for text in config.variant:
-        name, separator, rest = text.partition("=")
-        fields: dict[str, Any] = {}
-        for part in rest.split(","):
-            setting, colon, value = part.partition(":")
-            if not (separator and colon and setting and _NAME.fullmatch(name)):
-                expected = "NAME=FIELD:VALUE,FIELD:VALUE"
-                raise UsageError("malformed variant", where="--variant", expected=expected, got=text)
-            try:
-                fields[setting.strip()] = parse_yaml(value, setting)
-            except InputError as error:
-                raise UsageError("malformed value", where=f"--variant {name}: {setting}", got=value) from error
-        changed = configuration.load(FitConfig, usual_fit(config), overrides=configuration.nested(fields))
-        yield Row(name, f"{name}: {rest}", FULL, changed, varied=True)
-
-
 def _refuse_unknown(names: Iterable[str], known: Sequence[str], some: bool = True) -> None:
     unknown = sorted(set(names) - set(known))
     if unknown or (some and not names):
         raise UsageError("unknown method", where="--methods", expected=", ".join(known), got=", ".join(unknown))
-
-
-def _without_twins(rows: Sequence[Row]) -> tuple[Row, ...]:
-    names = [row.name for row in rows]
-    if len(set(names)) < len(names):
-        raise UsageError("two rows have the same name", where="--variant", got=", ".join(names))
-    return tuple(rows)

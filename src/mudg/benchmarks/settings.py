@@ -17,28 +17,16 @@ _Others = Literal["recam", "spvc", "panda", "dist"]
 
 
 @settings
-class BenchOwn:
-    """The settings of ``mudg bench`` without those of the steps that it takes."""
+class BenchConfig:
+    """Measure complete methods: off the recorded path of generated cities against exact ground truth, in drives through
+    them, on real logs, or in a table of a paper."""
 
     model: str = "embedded"
     """Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn
     or convert."""
-    cities: Literal["reported", "development"] = "reported"
-    """mdm, edit: list of cities. Choose settings on development; report results on reported, on which nothing
-    was chosen."""
-    count: int = setting(default=6, ge=1, le=6)
-    """mdm, edit: number of cities taken from the list, 1 to 6. mdm: each gives four clips: shifted by 2, 3 and 4
-    m, and on the recorded path."""
-    steps: tuple[int, ...] = (1, 2, 8)
-    """mdm: numbers of denoising steps to compare; each is measured on its own."""
-    eta: float | None = setting(default=None, ge=0, le=1)
-    """mdm: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given: 1).
-    shift, real and paper have `--synthesize.eta`, and likewise steps."""
     precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
     """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32
-    elsewhere. float16: published-type models on CUDA devices (shift, real, paper)."""
-    threads: int = setting(default=1, ge=1)
-    """mdm, edit: number of torch threads."""
+    elsewhere. float16: published-type models on CUDA devices."""
     seed: int = 0
     """Seed of all random numbers; the same seed gives the same result."""
     list: Literal["development", "reported"] = "development"
@@ -48,20 +36,17 @@ class BenchOwn:
     """shift, loop; paper with a list of cities: number of logs taken from the list, 1 to 8 (the development list has
     4)."""
     methods: tuple[str, ...] = ("nearest_fill", "gs3d", "street_gaussians", "mudg_r", "mudg_s")
-    """shift, real, loop: methods to compare: those of the default (loop: street_gaussians and mudg_s); pvg, s3gaussian,
+    """Methods to compare: those of the default (loop: street_gaussians and mudg_s); pvg, s3gaussian,
     bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on until it has as many steps as mudg_s,
     without generated views. shift: also mudg_f, renders of mudg_s that the diffusion model repairs. paper: any of these
     of shift but mudg_f; with the default, all of them."""
     iterations: int = setting(default=1000, ge=1)
-    """shift, real, loop, paper: optimisation steps of every fit without virtual views."""
+    """Optimisation steps of every fit without virtual views."""
     guided_share: float = setting(default=1.5, gt=0)
-    """shift, real, loop, paper: steps of fits under virtual views, as a multiple of the others'."""
-    variant: tuple[str, ...] = ()
-    """shift, real: add rows for mudg_s with other settings of fit, each as NAME=FIELD:VALUE,FIELD:VALUE, where FIELD is
-    a setting such as virtual.color_weight. Both of its fits have them."""
+    """Steps of fits under virtual views, as a multiple of the others'."""
     processes: int = setting(default=0, ge=0)
-    """shift, real, loop, paper: number of logs (real: also ways of hiding frames) processed at the same time, with one
-    thread each (0 = one per core). Results do not depend on it."""
+    """Number of logs (real: also ways of hiding frames) processed at the same time, with one thread each (0 = one per
+    core). Results do not depend on it."""
     videos: bool = True
     """shift, paper: also write videos of all methods side by side."""
     table: Literal[_Mudg, "recondreamer", "drivedreamer4d", "streetcrafter", "freesim", _Others] = "mudg1"
@@ -77,31 +62,22 @@ class BenchOwn:
     frames: str = ""
     """real, paper: frames of logs that are imported, FIRST:END without END itself, as for ingest (empty = all; paper:
     as the table says). paper with a list of cities: 0:END (empty = 0:24)."""
-    edit_iterations: int = setting(default=300, ge=1)
-    """edit: optimisation steps of every fit."""
     device: DeviceName = "auto"
     """Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N."""
-
-
-@settings
-class BenchConfig(BenchOwn):
-    """Measure the diffusion model, edits, or complete methods off the recorded path, all on generated cities against
-    exact ground truth; complete methods on real logs; or fill a table of a paper."""
-
     fuse: FuseConfig = setting(default_factory=FuseConfig)
-    """shift, real, paper: how the clouds of every log are made."""
+    """How the clouds of every log are made."""
     synthesize: SynthesizeConfig = setting(default_factory=SynthesizeConfig)
-    """shift, real, paper: how views are generated. Model, number format, seed and device are the benchmark's own flags;
+    """How views are generated. Model, number format, seed and device are the benchmark's own flags;
     where views are generated is the benchmark's matter (real: `--synthesize.shifts-m` for the views that fits learn
     from)."""
     fit: FitConfig = setting(default_factory=FitConfig)
-    """shift, real, paper: how scenes are fitted. Method, steps, seed and device are the benchmark's own flags."""
+    """How scenes are fitted. Method, steps, seed and device are the benchmark's own flags."""
     score: ScoreConfig = setting(default_factory=ScoreConfig)
     """paper: how every row is scored; files of weights are given here."""
 
 
 def bench_preset(name: PresetName = "default") -> BenchConfig:
-    """The settings of ``mudg bench shift``, ``real`` and ``paper`` before any file or flag: those of a preset that say
+    """The settings of ``mudg bench`` before any file or flag: those of a preset that say
     how clouds, views and fits are made. Which logs, and their size, is the benchmark's matter. UsageError: no such
     preset."""
     run = run_preset(name)

@@ -1,11 +1,11 @@
 """``mudg bench shift``: whole methods beside the recorded path, on lists of generated logs, against exact truth.
 
 Every log is ingested, fused and synthesized once; every method is fitted, rendered and scored on its own, by the
-ordinary verbs, so that whatever is finished is reused and another variant costs only itself. Fits under virtual views
+ordinary verbs, so that whatever is finished is reused and another method costs only itself. Fits under virtual views
 go on with the one on recorded views, as in ``mudg run``.
 
     OUT/<log>/...   see ``benchmarks/places.py``; generated views lie in OUT/<log>/synthesize
-    OUT/bench.json   every number        OUT/bench.md   the tables        OUT/page.html   tables and videos
+    OUT/bench.json   every number        OUT/bench.md   the tables
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from mudg.base import config as configuration
-from mudg.base.html import TextTable, markdown_table
+from mudg.base.html import markdown_table
 from mudg.base.run_folder import refuse_overlap
-from mudg.benchmarks.chain import Facts, compare, films, refuse_foreign, render_page, seconds_of
+from mudg.benchmarks.chain import Facts, compare, refuse_foreign, seconds_of
 from mudg.benchmarks.places import Views, listed_cities, score_settings
 from mudg.benchmarks.rows import (
     BASE,
@@ -32,9 +32,9 @@ from mudg.benchmarks.rows import (
     PaperTable,
     chain_settings,
     generator_of,
+    method_rows,
     model_settings,
     refuse_unfit,
-    shift_rows,
 )
 from mudg.benchmarks.settings import BenchConfig
 from mudg.city import logs as city_logs
@@ -68,10 +68,8 @@ COMPARISONS: Final = (
     (DIFFUSION, FILL, SHIFTED, "psnr perceptual abs_rel miou"),
 )
 """A method, that against which it is held, a place, and metrics."""
-VARIANT: Final = "psnr perceptual abs_rel miou"
 SHOWN: Final = (FILL, "gs3d", BASE, DIFFUSION, FULL)
 """Methods in the videos."""
-_PAGES: Final = ("bench.json", "bench.md", "page.html")
 
 
 @dataclass(frozen=True)
@@ -84,13 +82,9 @@ class ShiftLog(Views):
         for name, folders in views.items():
             (metrics,) = self.scores(name, folders).values()
             values[name] = {f"{entry['distance_m']:g}": entry["values"] for entry in metrics["by_distance"]}
-        films = []
-        if self.config.videos:
-            films = self.film({"truth": self.truth, **{name: of[0] for name, of in views.items() if name in SHOWN}})
-        facts = city_logs.facts(self.log.seed, self.log.rules)
-        path = {"log": self.log.seed, "turn_deg": round(facts.turn_deg, 2), "length_m": round(facts.length_m, 1)}
-        movers = {"movers": facts.moving, "mover_share": round(facts.moving_share, 4), "words": facts.description}
-        return {**path, **movers, "films": films, "values": values, "seconds": seconds_of(self.out)}
+        self.film({name: folders for name, folders in views.items() if name in SHOWN})
+        facts = {"log": self.log.seed, **city_logs.facts(self.log.seed, self.log.rules)}
+        return {**facts, "values": values, "seconds": seconds_of(self.out)}
 
 
 def run(
@@ -103,14 +97,13 @@ def run(
     distances_m: Sequence[float] = (2.0, 3.0, 4.0),
 ) -> Path:
     """Compare methods on the logs of a list; returns ``out`` with ``bench.json``, ``bench.md`` and ``page.html``; what
-    lies there of the same settings is reused, and methods and variants may be added later. ``preset``: what ``config``
+    lies there of the same settings is reused, and methods may be added later. ``preset``: what ``config``
     started from. ``overwrite``: replace what other settings left in ``out``. ``rules``: frames, size and cameras of the
-    logs. ``distances_m``: lateral distances, each to both sides. UsageError: an unknown method, a malformed variant, a
-    setting that no row uses, or ``out`` holds logs of other settings. Whatever a verb raises."""
-    rows, out = shift_rows(config, preset), Path(out)
+    logs. ``distances_m``: lateral distances, each to both sides. UsageError: an unknown method, a setting
+    that no row uses, or ``out`` holds logs of other settings. Whatever a verb raises."""
+    rows, out = method_rows(config, preset), Path(out)
     refuse_overlap(out, {"model": mdm_files.folder_of(config.model)})
-    own = lambda doc: doc["schema"] == 1 and "bench" not in doc and "methods" in doc
-    refuse_foreign(out, _PAGES, own, lambda entry: entry.name.isdigit())
+    refuse_foreign(out, "shift", may_be=lambda entry: entry.name.isdigit())
     shifts = {RECORDED: [0.0], **{f"{d:g}": [d, -d] for d in distances_m}}
     places = [PaperPlace(name=name, title="", shifts_m=shifts_m) for name, shifts_m in shifts.items()]
     table = PaperTable(name="shift", places=places, columns=[])
@@ -130,7 +123,7 @@ def run(
     fits = [None if row.fit is None else configuration.result_settings(row.fit) for row in rows]
     values = [{"name": row.name, "title": row.title, "fit": of} for row, of in zip(rows, fits, strict=True)]
     filled = lambda logs: document(logs, values, list(distances_m), settings)
-    return compare(out, jobs, config, filled, {"bench.md": markdown, "page.html": page})
+    return compare(out, jobs, config, filled, markdown)
 
 
 # ---- numbers ----
@@ -149,14 +142,10 @@ def document(
     of = lambda entry, name, p, m: entry["values"][name].get(p, {}).get(m, "not produced")
     at = lambda name, p: {m: _pooled([of(entry, name, p, m) for entry in full]) for m in COLUMNS}
     pooled = {name: {p: at(name, p) for p in every} for name in names}
-    fitted = [row["name"] for row in rows if row["fit"] is not None and row["name"] not in ("gs3d", BASE, FULL)]
-    held = lambda a, b, place, metrics: against(full, a, b, place, metrics) if {a, b} <= {*names} else []
-    of_variant = lambda name: [c for p in (SHIFTED, RECORDED) for c in held(name, FULL, p, VARIANT)]
-    head = {"schema": 1, "settings": dict(settings), "distances_m": list(distances_m)}
+    comparisons = [one for a, b, *of in COMPARISONS if {a, b} <= {*names} for one in against(full, a, b, *of)]
+    head = {"schema": 1, "bench": "shift", "settings": dict(settings), "distances_m": list(distances_m)}
     head |= {"methods": [dict(r) for r in rows], "metrics": list(COLUMNS)}
-    comparisons = [comparison for comparison_of in COMPARISONS for comparison in held(*comparison_of)]
-    variants = [{"name": name, "against_mudg_s": of_variant(name)} for name in fitted if FULL in names]
-    return {**head, "logs": full, "pooled": pooled, "comparisons": comparisons, "variants": variants}
+    return {**head, "logs": full, "pooled": pooled, "comparisons": comparisons}
 
 
 def with_mean(of: Mapping[str, Facts], shifted: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -224,121 +213,60 @@ def virtual_fits_of(settings: Facts) -> str:
     return f"{settings['guided_share']:g} times as many under virtual views"
 
 
-def _summary(settings: Facts) -> str:
-    return f"{settings['iterations']} iterations per fit, {virtual_fits_of(settings)}"
-
-
 def markdown(doc: Facts) -> str:
     """The tables for people."""
-    settings = doc["settings"]
-    width, height = settings["size_px"]
-    size = f"{width}x{height}, {len(settings['cameras'])} cameras"
+    settings, logs, names = doc["settings"], doc["logs"], [row["name"] for row in doc["methods"]]
+    size = "{}x{}".format(*settings["size_px"]) + f", {len(settings['cameras'])} cameras"
+    facts = [
+        [str(e["log"]), f"{e['turn_deg']:.1f}", f"{e['length_m']:.0f}", str(e["movers"]), f"{e['mover_share']:.1%}"]
+        + [e["words"]]
+        for e in logs
+    ]
     lines = [
-        f"# Off the recorded path: {_logs_text(doc)} of the {settings['list']} list",
+        f"# Off the recorded path: {len(logs)} log{'s' if len(logs) != 1 else ''} of the {settings['list']} list",
         "",
         f"{settings['frames']} frames at 10 Hz, {size}, every {settings['held_out_every']}th frame held out;"
-        f" {_summary(settings)}; seed {settings['seed']}. Means over both sides and all logs, +- the standard error"
-        " over logs. Flicker: 1 = as steady as the truth. Perceptual: features of the shipped codec, not LPIPS.",
+        f" {settings['iterations']} iterations per fit, {virtual_fits_of(settings)}; seed {settings['seed']}. Means"
+        " over both sides and all logs, +- the standard error over logs. Flicker: 1 = as steady as the truth."
+        " Perceptual: features of the shipped codec, not LPIPS.",
         "",
-        *markdown_table(FACTS, map(_facts, doc["logs"])),
+        *markdown_table(
+            ["log", "turn, degrees", "length, m", "dynamic vehicles in view", "their share of the image", "city"], facts
+        ),
         "",
     ]
-    headings = [heading for heading, _ in COLUMNS.values()]
-    names = [row["name"] for row in doc["methods"]]
-    for place in _places(doc):
+    headings, shifted = [heading for heading, _ in COLUMNS.values()], [f"{d:g}" for d in sorted(doc["distances_m"])]
+    titles = {RECORDED: "Recorded path, held-out frames", **{d: f"{d} m to either side" for d in shifted}}
+    for place, title in {**titles, SHIFTED: f"Mean over {', '.join(shifted)} m"}.items():
         rows = [[name, *_cells(doc["pooled"][name][place])] for name in names]
-        lines += [f"## {_place_title(doc, place)}", "", *markdown_table(["method", *headings], rows), ""]
-    lines += ["## Comparisons", "", *_comparison_table(doc["comparisons"]), ""]
-    for variant in doc["variants"]:
-        lines += [f"## {variant['name']} against mudg_s", "", *_comparison_table(variant["against_mudg_s"]), ""]
-    logs = doc["logs"]
+        lines += [f"## {title}", "", *markdown_table(["method", *headings], rows), ""]
+    heads = ["", "value", "standard error", "as", "logs", "each log"]
+    lines += ["## Comparisons", "", *markdown_table(heads, map(_compared, doc["comparisons"])), ""]
     rows = [[str(entry["log"]), name, *_cells(entry["values"][name][SHIFTED])] for entry in logs for name in names]
-    steps = dict.fromkeys(step for entry in logs for step in entry["seconds"])
-    seconds = [[step, *(f"{entry['seconds'].get(step, math.nan):.0f}" for entry in logs)] for step in steps]
-    lines += ["## Each log, mean off the recorded path", "", *markdown_table(["log", "method", *headings], rows), ""]
-    heads = ["step", *(str(entry["log"]) for entry in logs)]
-    return "\n".join([*lines, "## Seconds per log", "", *markdown_table(heads, seconds), ""])
+    each = markdown_table(["log", "method", *headings], rows)
+    return "\n".join([*lines, "## Each log, mean off the recorded path", "", *each, ""])
 
 
-def page(doc: Facts) -> str:
-    """The whole page from what ``bench.json`` holds."""
-    settings, names = doc["settings"], [row["name"] for row in doc["methods"]]
-    *places, mean = _places(doc)
-    heads = ["method", *(heading for heading, _ in COLUMNS.values())]
-    compared = [[c["title"], *_compared(c), c["kind"], str(c["logs"])] for c in doc["comparisons"]]
-    rows = lambda place: [[name, *_cells(doc["pooled"][name][place], with_error=True)] for name in names]
-    scores = [TextTable.of_texts(heads, rows(place), _place_title(doc, place)) for place in (mean, *places)]
-    videos = films(doc, ["truth", *(name for name in names if name in SHOWN)], videos=True, choice=True)
-    table = TextTable.of_texts(["", "value", "standard error", "as", "logs"], compared)
-    return render_page(
-        f"Off the recorded path: {_logs_text(doc)}, {settings['list']} list",
-        "mudg bench shift",
-        f"Generated logs of {settings['frames']} frames with exact ground truth at every view; {_summary(settings)}."
-        " Means over logs and both sides of the path.",
-        [
-            *([videos] if videos["films"] else []),
-            {"title": "Comparisons", "tables": [table]},
-            {"title": "Scores", "tables": scores},
-            {"title": "Logs", "tables": [TextTable.of_texts(FACTS, map(_facts, doc["logs"]))]},
-        ],
-        "The videos lie beside this page.",
-    )
-
-
-def _places(doc: Facts) -> list[str]:
-    """The recorded path, the distances from it, and their mean."""
-    return [RECORDED, *(f"{d:g}" for d in sorted(doc["distances_m"])), SHIFTED]
-
-
-def _logs_text(doc: Facts) -> str:
-    count = len(doc["logs"])
-    return f"{count} log{'s' if count != 1 else ''}"
-
-
-def _place_title(doc: Facts, place: str) -> str:
-    if place == RECORDED:
-        return "Recorded path, held-out frames"
-    if place == SHIFTED:
-        return "Mean over " + ", ".join(f"{d:g}" for d in sorted(doc["distances_m"])) + " m"
-    return f"{place} m to either side"
-
-
-def _cells(values: Facts, with_error: bool = False) -> list[str]:
-    """Values by metric as text, pooled (with the standard error where that is wanted and known) or of one log; or the
-    reason for none."""
+def _cells(values: Facts) -> list[str]:
+    """Values by metric as text, of one log or pooled, with the standard error where it is known; or the reason for
+    none."""
     cells = []
     for metric, (_, digits) in COLUMNS.items():
         value = values[metric]
         if isinstance(value, Mapping):
             error = value["standard_error"]
-            more = f" +- {error:.{digits}f}" if with_error and error is not None else ""
-            cells.append(f"{value['mean']:.{digits}f}{more}")
+            cells.append(f"{value['mean']:.{digits}f}" + ("" if error is None else f" +- {error:.{digits}f}"))
         else:
             cells.append(value if isinstance(value, str) else f"{value:.{digits}f}")
     return cells
 
 
-FACTS: Final = ("log", "turn, degrees", "length, m", "dynamic vehicles in view", "their share of the image", "city")
-
-
-def _facts(entry: Facts) -> list[str]:
-    """Cells of a log's row under ``FACTS``."""
-    numbers = [f"{entry['turn_deg']:.1f}", f"{entry['length_m']:.0f}", str(entry["movers"])]
-    return [str(entry["log"]), *numbers, f"{entry['mover_share']:.1%}", entry["words"]]
-
-
-def _compared(comparison: Facts) -> tuple[str, str]:
-    """A comparison's value and standard error as text."""
-    is_difference, error = comparison["kind"] == "difference", comparison["standard_error"]
-    digits, sign = (COLUMNS[comparison["metric"]][1], "+") if is_difference else (3, "")
-    if comparison["value"] is None:
-        return "no number", ""
-    return f"{comparison['value']:{sign}.{digits}f}", "-" if error is None else f"{error:.{digits}f}"
-
-
-def _comparison_table(rows: Sequence[Facts]) -> list[str]:
-    cells = []
-    for row in rows:
-        each = " ".join("-" if v is None else f"{v:.3g}" for v in row["per_log"])
-        cells.append([row["title"], *_compared(row), row["kind"], str(row["logs"]), each])
-    return markdown_table(["", "value", "standard error", "as", "logs", "each log"], cells)
+def _compared(row: Facts) -> list[str]:
+    """A comparison's line."""
+    is_difference, error, value = row["kind"] == "difference", row["standard_error"], row["value"]
+    digits, sign = (COLUMNS[row["metric"]][1], "+") if is_difference else (3, "")
+    texts = ["no number", ""]
+    if value is not None:
+        texts = [f"{value:{sign}.{digits}f}", "-" if error is None else f"{error:.{digits}f}"]
+    each = " ".join("-" if one is None else f"{one:.3g}" for one in row["per_log"])
+    return [row["title"], *texts, row["kind"], str(row["logs"]), each]

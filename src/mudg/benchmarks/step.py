@@ -16,12 +16,10 @@ if TYPE_CHECKING:
 
 
 class Bench(Output):
-    """Run a benchmark: mdm, edit, shift or loop against exact truth, real on real logs, paper for tables of papers."""
+    """Run a benchmark: shift or loop against exact truth, real on real logs, paper for tables of papers."""
 
     examples = (
-        "mudg bench mdm --out runs/bench",
-        "mudg bench edit --out runs/edits",
-        "mudg bench shift --list development --logs 1 --variant strong=virtual.probability:0.4 --out runs/shift",
+        "mudg bench shift --list development --logs 1 --fit.virtual.probability 0.4 --out runs/shift",
         "mudg bench loop --list reported --out runs/loop",
         "mudg bench real logs/pandaset_002 --frames 32:56 --resolution 960 --protocols gap camera --out runs/real",
         "mudg bench paper city:reported --table mudg1 --out runs/mudg1",
@@ -29,21 +27,19 @@ class Bench(Output):
     )
     short = ("model", "seed", "device")
     parts = {
-        "mdm": "Measure the diffusion model against exact truth.",
-        "edit": "Measure edits of fitted scenes.",
         "shift": "Measure complete methods off the recorded path, against exact truth.",
         "real": "Measure complete methods on real logs.",
         "loop": "Drive in fitted scenes, against the exact city.",
         "paper": "Fill a table of a paper.",
     }
     name: Annotated[str, Flag("BENCHMARK", "first")]
-    """Benchmark to run: mdm (diffusion model), edit (edits of fitted scenes), shift (complete methods off the recorded
-    path), loop (drives in fitted scenes), real (complete methods on real logs) or paper (a table of a paper)."""
+    """Benchmark to run: shift (complete methods off the recorded path), loop (drives in fitted scenes), real (complete
+    methods on real logs) or paper (a table of a paper)."""
     sources: Annotated[tuple[Path, ...], Flag("[LOG ...]", "rest")] = ()
     """real, paper: folders of dataset logs, or scenes made by ingest. paper also takes city:reported or
     city:development, a list of generated cities."""
     preset: PresetName = "default"
-    """shift, real, loop, paper: settings of clouds, generated views and fits to start from, as for mudg run
+    """Settings of clouds, generated views and fits to start from, as for mudg run
     (docs/presets.md). paper: the published set-up, with a published-type model."""
     settings: BenchConfig
 
@@ -61,7 +57,7 @@ class Bench(Output):
         if name == "name":
             return False
         if "." in name:
-            return part == "paper" or (not name.startswith("score.") and part in ("shift", "real", "loop"))
+            return part == "paper" or not name.startswith("score.")
         tags = [re.findall(r"[a-z0-9]+", tag) for tag in re.findall(r"(?:^|\. )([a-z0-9,; ]+): ", text)]
         named = {word for tag in tags for word in tag if word in cls.parts}
         return not named or part in named

@@ -251,12 +251,10 @@ def _crosswalks(rng: np.random.Generator, kerbs: tuple[float, float], crossing: 
     return np.array(walks, np.float64).reshape(-1, 3)
 
 
-# paint ---------------------------------------------------------------------------------------------
-# Where paint lies on the streets of the generated city, exactly: at any point of the ground, and as lines for scores
-# that want a map.
+# paint --------------------------------------------------------------------------------------------
 #
-# The rules are those of ``native/city_ground.cpp``, without its blur over the footprint of a pixel and without wear.
-
+# Where paint lies on the streets, exactly: at any point of the ground, and as lines for scores that want a map. The
+# rules are those of ``native/city_ground.cpp``, without its blur over the footprint of a pixel and without wear.
 
 _BAR_PERIOD_M: Final = 1.1
 _BAR_MIDDLE_M: Final = 0.3
@@ -272,7 +270,11 @@ def painted(plan: StreetPlan, street: Array, xy: Array) -> NDArray[np.bool_]:
     points (``CityHandle.street``). ``xy``: the points f64[N, 2] in the world."""
     s, u = street[:, 0], street[:, 1]
     crossing = plan.crossing
-    a, b = (np.zeros(len(xy)), np.zeros(len(xy))) if crossing is None else _cross_coordinates(crossing, xy)
+    a = b = np.zeros(len(xy))
+    if crossing is not None:
+        c, n = np.cos(crossing.yaw), np.sin(crossing.yaw)
+        dx, dy = xy[:, 0] - crossing.x, xy[:, 1] - crossing.y
+        a, b = c * dx + n * dy, -n * dx + c * dy
     in_cross = np.zeros(len(xy), bool) if crossing is None else (u > plan.left) | (u < plan.right)
     cut = in_cross if crossing is None else in_cross | (np.abs(b) < crossing.half_width + 0.6)
     paint = np.zeros(len(xy), bool)
@@ -326,12 +328,6 @@ def _dashed(along: Array, period: float, dash: float) -> NDArray[np.bool_]:
     return np.abs((along / period) % 1.0 * period - 0.5 * dash) < 0.5 * dash
 
 
-def _cross_coordinates(crossing: Crossing, xy: Array) -> tuple[Array, Array]:
-    c, n = np.cos(crossing.yaw), np.sin(crossing.yaw)
-    dx, dy = xy[:, 0] - crossing.x, xy[:, 1] - crossing.y
-    return c * dx + n * dy, -n * dx + c * dy
-
-
 # ---- as a map has it -----------------------------------------------------------------------------
 
 
@@ -360,13 +356,9 @@ def _street_line(line: Centreline, s: Array, u: Array) -> Array:
     return np.stack([x, y, np.zeros(len(s))], 1)
 
 
-# objects -------------------------------------------------------------------------------------------
-# Collects the static objects along the streets and keeps the corridor of the shifted cameras free.
-
-
 # records ------------------------------------------------------------------------------------------
-# Records: one row of numbers per object of the city. The native library makes shapes and materials from them.
-
+#
+# One row of numbers per object of the city. The native library makes shapes and materials from them.
 
 COLUMNS: Final = 28
 
@@ -376,15 +368,9 @@ SHELTER, HILL, BUSH = range(12, 15)
 BOLLARD, MOTORBIKE, PLANTER, PART = range(16, 20)
 CAR, VAN, TRUCK, BUS, PEDESTRIAN, CYCLIST, TANKER = range(50, 57)
 
-LABELS: Final = {
-    CAR: "car",
-    VAN: "car",
-    TRUCK: "truck",
-    BUS: "bus",
-    PEDESTRIAN: "pedestrian",
-    CYCLIST: "cyclist",
-    TANKER: "truck",
-}
+LABELS: Final = dict(
+    zip((CAR, VAN, TRUCK, BUS, PEDESTRIAN, CYCLIST, TANKER), "car car truck bus pedestrian cyclist truck".split())
+)
 
 Color = tuple[float, float, float]
 Size = tuple[float, float, float]
@@ -426,7 +412,6 @@ class Draws:
 
 
 # furnisher ----------------------------------------------------------------------------------------
-
 
 KERB_M = 0.13
 

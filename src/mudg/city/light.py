@@ -128,9 +128,7 @@ def light_numbers(config: CityConfig) -> tuple[str, NDArray[np.float64]]:
     return name, np.array([*colors, cloudiness, haze, night, exposure, *camera, 0.0035], np.float64)
 
 
-# weather ------------------------------------------------------------------------------------------
-# Wet ground, snow and street lamps of a generated city: the numbers its ray caster needs, by the same rules as
-# ``mudg.core.weather``.
+# weather: wet ground, snow and street lamps, by the same rules as ``mudg.core.weather`` ------------
 
 
 def weather_numbers(config: CityConfig) -> NDArray[np.float64] | None:

@@ -1,9 +1,6 @@
-"""Whole generated logs for scoring scenes off the recorded path, in two lists; no model was ever trained on them.
-
-A list is not picked by eye: the seeds are walked upwards, and what has moving vehicles (`facts`) is kept. In 2.3 s the
-generator's streets turn little (half of 220 cities by less than 1.1 degrees, one in twenty by 4.7, the most by 9.6), so
-that "curved" means 5 degrees here, and half of each list is curved.
-"""
+"""A generated city as a scene directory; and whole logs for scoring scenes off the recorded path, in two lists. No
+model was ever trained on them, and they are not picked by eye: seeds are walked upwards, and what has moving vehicles
+(`facts`) is kept, half of it curved."""
 
 from __future__ import annotations
 
@@ -14,11 +11,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mudg.base import log
 from mudg.base.errors import UsageError
-from mudg.base.types import Scene, View
+from mudg.base.types import Scene
 from mudg.city.config import CityConfig
 from mudg.city.layout import plan_streets
 from mudg.city.traffic import ego_keys
@@ -26,31 +22,15 @@ from mudg.city.world import CityWorld
 from mudg.core.fusion import FusionRules, judge_track
 from mudg.scene.write import SceneWriter
 
-# records a generated city as a scene directory ----------------------------------------------------
-
-
 SENSOR = "lidar"
 
 
 def write_city(config: CityConfig, out_dir: Path | str, *, test_every: int = 4) -> Scene:
     """Generate the log of ``config`` and write it, as lossless PNG, with its exact labels (depth, semantics, sky,
-    dynamic, instance).
-
-    All cores work: the rays of a frame on the native threads, encoding and writing on the writer's. The scene is moved
-    into place when it is complete; an interrupted call leaves nothing, and the same call makes the same bytes again.
-
-    Args:
-        config: the city and its log.
-        out_dir: destination; must not hold a scene yet.
-        test_every: hold out every n-th frame of all cameras (n, 2n, ...; never the first); 0 = none.
-
-    Returns:
-        The scene, read back.
-
-    Raises:
-        ResourceError: no native library, or the folder cannot be written. InputError: there is a scene here already.
-        UsageError: ``test_every`` is negative.
-    """
+    dynamic, instance); returns the scene, read back. An interrupted call leaves nothing, and the same call makes the
+    same bytes again. ``test_every``: hold out every n-th frame of all cameras (never the first); 0 = none.
+    ResourceError: no native library, or the folder cannot be written. InputError: there is a scene here already.
+    UsageError: ``test_every`` is negative."""
     if test_every < 0:
         raise UsageError("test_every cannot be negative", got=str(test_every))
     world = CityWorld(config)
@@ -74,8 +54,11 @@ def write_world(world: CityWorld, out_dir: Path | str, test_every: int = 4) -> S
             for index in range(config.n_frames):
                 held_out = test_every > 0 and index > 0 and index % test_every == 0
                 for name in config.cameras:
-                    frame_id = f"{name}/{index:06d}"
-                    _write_frame(writer, world, frame_id, views[name][index], moving)
+                    frame_id, view = f"{name}/{index:06d}", views[name][index]
+                    truth = world.render(view, sensor_noise=config.sensor_noise)
+                    labels = {"depth": truth.depth, "semantics": truth.semantics, "sky": truth.sky}
+                    labels |= {"dynamic": moving[truth.instance], "instance": truth.instance}
+                    writer.add_frame(frame_id, view, truth.rgb_u8, labels)
                     split[frame_id] = "test" if held_out else "train"
                     progress.advance()
                 sweep = world.lidar_sweep(index)
@@ -83,13 +66,6 @@ def write_world(world: CityWorld, out_dir: Path | str, test_every: int = 4) -> S
                 progress.advance()
         writer.set_split(split)
         return writer.finish()
-
-
-def _write_frame(writer: SceneWriter, world: CityWorld, frame_id: str, view: View, moving: NDArray[np.bool_]) -> None:
-    truth = world.render(view, sensor_noise=world.config.sensor_noise)
-    labels = {"depth": truth.depth, "semantics": truth.semantics, "sky": truth.sky}
-    labels |= {"dynamic": moving[truth.instance], "instance": truth.instance}
-    writer.add_frame(frame_id, view, truth.rgb_u8, labels)
 
 
 # logs ---------------------------------------------------------------------------------------------
@@ -104,19 +80,6 @@ class LogRules:
     width: int = 384
     height: int = 256
     cameras: tuple[str, ...] = ("front", "front_left", "front_right")
-
-
-@dataclass(frozen=True)
-class LogFacts:
-    """What a log holds: turn in degrees (range of headings), length in metres, moving vehicles in view of the front
-    camera, the share of the image they cover together on average, and the generator's line about the city."""
-
-    seed: int
-    turn_deg: float
-    length_m: float
-    moving: int
-    moving_share: float
-    description: str
 
 
 STANDARD: Final = LogRules()
@@ -146,16 +109,19 @@ def moving_instances(world: CityWorld, labels: Container[str] | None = None) -> 
     return tuple(world.instance_of(track.id) for track in moving)
 
 
-def facts(seed: int, rules: LogRules = STANDARD) -> LogFacts:
-    """What the log of a seed holds, from small images of every fourth frame."""
+def facts(seed: int, rules: LogRules = STANDARD) -> dict[str, float | str]:
+    """What the log of a seed holds, from small images of every fourth frame: its turn in degrees (range of headings)
+    and length in metres, moving vehicles in view of the front camera, the share of the image that they cover together
+    on average, and the generator's line about the city."""
     world = CityWorld(log_config(seed, rules))
     views = [view.resized(96, 64) for view in world.frame_views("front")[::4]]
     seen = np.stack([world.render(view, supersample=1).instance for view in views])
     moving = moving_instances(world, VEHICLES)
     shares = np.array([[float((image == i).mean()) for image in seen] for i in moving]).reshape(-1, len(views))
     count = int(((shares >= SMALLEST_SHARE).mean(1) >= FRAMES_SHARE).sum())
-    share = float(shares.sum(0).mean())
-    return LogFacts(seed, turn_deg(world.config), world.plan.drive_length, count, share, world.describe())
+    path = {"turn_deg": round(turn_deg(world.config), 2), "length_m": round(world.plan.drive_length, 1)}
+    movers = {"movers": count, "mover_share": round(float(shares.sum(0).mean()), 4)}
+    return {**path, **movers, "words": world.describe()}
 
 
 def turn_deg(config: CityConfig) -> float:

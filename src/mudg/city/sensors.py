@@ -1,14 +1,6 @@
-"""What real cameras, LiDARs and calibrations add to a recorded log: applied on top of the generator's exact truth.
-
-Everything is a pure function of its arguments; random parts take a key from `base.seeds`. Two kinds of effects are kept
-apart:
-
-* The **look** of a camera: exposure, white balance, vignetting and contrast, which differ from camera to camera and
-  partly drift over time. Recorded images have it, and so has the truth that goes with them (`with_look`): a view beside
-  the recorded path is to look as that camera would show it.
-* **Faults** of a recording: noise, blur, bloom, compression, rolling shutter, errors of poses, calibration, clocks and
-  boxes. Only what is recorded has them (`recorded`, `thinned`, `pose_errors`, `noisy_tracks`); the truth does not.
-"""
+"""The vehicle's sensors, and what real ones add to a recorded log. The look of a camera (exposure, white balance,
+vignetting, contrast) is in recorded images and in their truth (`with_look`); faults (noise, blur, compression, errors
+of poses, clocks and boxes) only in what is recorded. Random parts take a key from `base.seeds`."""
 
 from __future__ import annotations
 
@@ -28,8 +20,7 @@ from mudg.base.types import Camera, SweepPoints, Track
 from mudg.city.config import CityConfig
 from mudg.core.weather.light import srgb_decode, srgb_encode
 
-# sensors of the recording vehicle: three cameras and a spinning LiDAR on the roof -----------------
-
+# three cameras and a spinning LiDAR on the roof ---------------------------------------------------
 
 SIDE_YAW_DEG = 50.0
 
@@ -75,14 +66,9 @@ def ego_from_lidar() -> NDArray[np.float64]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LidarScan:
-    """How one sweep is taken, other than by the configuration's own LiDAR.
-
-    Args:
-        ego_from_lidar: mounting pose f64[4, 4].
-        elevations_rad: of every beam.
-        delay_s: the sweep is taken this much later than the frame's time; its points are given as if it were not.
-        name: tells the random numbers of several LiDARs apart.
-    """
+    """How one sweep is taken, other than by the configuration's own LiDAR: mounting pose f64[4, 4], elevation of every
+    beam. ``delay_s``: it is taken this much later than the frame's time; its points are given as if it were not.
+    ``name``: tells the random numbers of several LiDARs apart."""
 
     ego_from_lidar: NDArray[np.float64]
     elevations_rad: NDArray[np.float64]
@@ -109,8 +95,7 @@ def lidar_azimuths(config: CityConfig) -> NDArray[np.float64]:
     return np.pi - (np.arange(columns) + 0.5) * (2 * np.pi / columns)
 
 
-# sensors ------------------------------------------------------------------------------------------
-
+# looks and faults ---------------------------------------------------------------------------------
 
 Array = NDArray[np.float64]
 Rgb = NDArray[np.float32]
@@ -120,16 +105,9 @@ Triple = tuple[float, float, float]
 @dataclass(frozen=True)
 class CameraLook:
     """Exposure, white balance, vignetting (on linear light) and contrast of one camera. The default changes nothing.
-
-    Args:
-        gain: factor of all channels.
-        white: factors of red, green and blue.
-        drift_stops: amplitude of a slow change of exposure, in powers of two.
-        drift_white: amplitude of a slow change of the red/blue balance, a share.
-        drift_period_s, drift_phase_rad: period and phase of both changes.
-        vignette: share of the light lost in the corners of the image.
-        contrast: slope of display values about the middle; more than 1 makes shadows black and bright skies white.
-    """
+    ``gain``, ``white``: factors of all channels, and of red, green and blue. ``drift_stops``, ``drift_white``:
+    amplitudes of slow changes of exposure, in powers of two, and of the red/blue balance, a share. ``vignette``: share
+    of the light lost in the corners. ``contrast``: slope of display values about the middle."""
 
     gain: float = 1.0
     white: Triple = (1.0, 1.0, 1.0)
@@ -151,18 +129,11 @@ class CameraLook:
 @dataclass(frozen=True)
 class CameraFaults:
     """What a recorded image has beyond its look. Sizes are pixels of that image; the default changes nothing.
-
-    Args:
-        noise: standard deviation of the noise in the dark, display values; brighter pixels have a little more.
-        grain_px: how far the noise of neighbouring pixels hangs together (sigma).
-        defocus_px: blur of the lens (sigma).
-        motion_px, motion_rad: length and direction of the blur from motion.
-        bloom: share of the light of very bright areas that spreads around them.
-        bloom_px: how far it spreads (sigma).
-        veil: share of the image's mean light that lies over everything (flare).
-        jpeg_quality: 1 to 95; 0 = not compressed.
-        readout_s: time from the first to the last row (rolling shutter; the middle row is taken at the image's time).
-    """
+    ``noise``: standard deviation in the dark, display values; ``grain_px``: how far it hangs together (sigma).
+    ``defocus_px``: blur of the lens (sigma). ``motion_px``, ``motion_rad``: length and direction of that from motion.
+    ``bloom``, ``bloom_px``: share of the light of very bright areas that spreads, and how far (sigma). ``veil``: share
+    of the mean light that lies over everything. ``jpeg_quality``: 1 to 95; 0 = not compressed. ``readout_s``: time from
+    the first to the last row; the middle row is taken at the image's time."""
 
     noise: float = 0.0
     grain_px: float = 0.0
@@ -189,16 +160,11 @@ class LidarMount:
 
 @dataclass(frozen=True)
 class LidarFaults:
-    """Errors of a LiDAR against the cameras, and what it does not return. The default changes nothing.
-
-    Args:
-        turn_deg: constant rotation between the assumed and the true mounting, about x, y and z of the sensor.
-        shift_m: the same for its place.
-        delay_s: the sweep was taken this much later than its time says.
-        cut_deg: only azimuths within this angle of straight ahead are returned (180 = all).
-        hole_share: share of the azimuths lost in each sweep, in one piece.
-        dropout: share of the points lost at random.
-    """
+    """Errors of a LiDAR against the cameras, and what it does not return. The default changes nothing. ``turn_deg``,
+    ``shift_m``: between the assumed and the true mounting, in x, y and z of the sensor. ``delay_s``: the sweep was
+    taken this much later than its time says. ``cut_deg``: only azimuths within this angle of straight ahead are
+    returned. ``hole_share``: share of the azimuths lost in each sweep, in one piece. ``dropout``: of the points, at
+    random."""
 
     turn_deg: Triple = (0.0, 0.0, 0.0)
     shift_m: Triple = (0.0, 0.0, 0.0)
@@ -226,12 +192,7 @@ class PoseFaults:
 @dataclass(frozen=True)
 class BoxFaults:
     """Errors of annotated boxes, standard deviations: one offset per box, half as much again from frame to frame.
-
-    Args:
-        position_m: along and across the box; a third of it vertically.
-        yaw_deg: heading.
-        size_share: length, width and height, each a share of itself.
-    """
+    ``position_m``: along and across the box; a third of it vertically. ``size_share``: of length, width and height."""
 
     position_m: float = 0.0
     yaw_deg: float = 0.0

@@ -65,16 +65,12 @@ def ego_keys(config: CityConfig, plan: StreetPlan) -> tuple[Array, Array]:
     poses = np.empty((len(times), 4, 4))
     for i, t in enumerate(times):
         z, pitch, roll = bump * np.sin(rate * t) * np.clip(abs(t) * 2, 0, 1)
-        attitude = pitch_rotation(pitch) @ _rotation_x(roll)
+        c, n = math.cos(roll), math.sin(roll)
+        attitude = pitch_rotation(pitch) @ np.array([[1, 0, 0], [0, c, -n], [0, n, c]])
         poses[i] = geometry.yaw_matrix(float(heading[i]), (x[i], y[i], z))
         poses[i, :3, :3] = poses[i, :3, :3] @ attitude
     poses[margin] = np.eye(4)
     return times, poses
-
-
-def _rotation_x(a: float) -> Array:
-    c, s = math.cos(a), math.sin(a)
-    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
 
 
 class TrafficPlanner(Draws):
@@ -263,12 +259,6 @@ def _follow(points: Array, start: float, speed: float, times: Array) -> Array:
     return np.column_stack([xy, np.zeros(len(times)), np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))])
 
 
-def _bend(p0: Array, p1: Array, p2: Array) -> Array:
-    """Quadratic curve from p0 to p2, 24 points, with both tangents through p1."""
-    f = np.linspace(0, 1, 24)[:, None]
-    return (1 - f) ** 2 * p0 + 2 * f * (1 - f) * p1 + f**2 * p2
-
-
 def _turning(t: TrafficPlanner) -> None:
     """A car that turns from the crossing street into the main street, under way in the middle of the log."""
     plan, crossing = t.plan, t.plan.crossing
@@ -287,7 +277,9 @@ def _turning(t: TrafficPlanner) -> None:
         s_out = crossing.s + sign * np.arange(7.0, 90.0, 1.0)
         x, y, _ = plan.line.to_world(s_out, u)
         out = np.stack([x, y], 1)
-        path = np.concatenate([start, _bend(inbound, corner, out[0]), out[1:]])
+        f = np.linspace(0, 1, 24)[:, None]  # a quadratic curve with both tangents through the corner
+        bend = (1 - f) ** 2 * inbound + 2 * f * (1 - f) * corner + f**2 * out[0]
+        path = np.concatenate([start, bend, out[1:]])
         to_bend = float(np.hypot(*(inbound - start[0])))
         speed = t.uniform(4.0, 6.0)
         at_middle = to_bend + t.uniform(0, 10)

@@ -1,7 +1,5 @@
-"""A generated city with exact truth at any view and time of its log.
-
-Needs the native library: without it, building a world raises ResourceError naming the remedy (there is no slow twin).
-"""
+"""A generated city with exact truth at any view and time of its log. Without the native library, building a world
+raises ResourceError naming the remedy (there is no slow twin)."""
 
 from __future__ import annotations
 
@@ -27,13 +25,11 @@ from mudg.city import layout as rec
 from mudg.city import sensors
 from mudg.city.config import CityConfig
 from mudg.city.furnish import furnish
-from mudg.city.layout import StreetPlan, plan_streets
+from mudg.city.layout import Array, StreetPlan, plan_streets
 from mudg.city.light import draw_photos, lamp_places, light_numbers, weather_numbers
 from mudg.city.traffic import PosedObject, ego_keys, key_times, plan_traffic
 
 # native --------------------------------------------------------------------------------------------
-# Thin ctypes layer over the city's ray caster in the native library.
-
 
 _P, _I, _L, _U = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64, ctypes.c_uint32
 _F64, _F32, _U8, _I32 = (np.ctypeslib.ndpointer(kind, flags="C") for kind in ("f8", "f4", "u1", "i4"))
@@ -61,21 +57,14 @@ def library() -> ctypes.CDLL:
     return lib
 
 
-def _f64(array: Any) -> NDArray[np.float64]:
+def _f64(array: Any) -> Array:
     return np.ascontiguousarray(array, np.float64)
 
 
 class CityHandle:
     """Owns one native world."""
 
-    def __init__(
-        self,
-        records: NDArray[np.float64],
-        plan: StreetPlan,
-        road: NDArray[np.float64],
-        light: NDArray[np.float64],
-        seed: int,
-    ) -> None:
+    def __init__(self, records: Array, plan: StreetPlan, road: Array, light: Array, seed: int) -> None:
         self._lib = library()
         line = _f64(np.stack([plan.line.s, plan.line.x, plan.line.y, plan.line.heading], 1))
         records, marks, walks, road, light = map(_f64, (records, plan.marks, plan.crosswalks, road, light))
@@ -96,7 +85,7 @@ class CityHandle:
         if self._lib.mudg_city_set_texture(self._handle, slot, pixels, pixels.shape[1], pixels.shape[0], metres):
             raise ResourceError("not enough memory for a texture of the city")
 
-    def set_weather(self, numbers: NDArray[np.float64], lamps: NDArray[np.float64]) -> None:
+    def set_weather(self, numbers: Array, lamps: Array) -> None:
         """Wet ground, snow and lamps f64[N, 3]; before anything is rendered. Numbers as in native/city_weather.cpp."""
         values, places = _f64(numbers), _f64(lamps).reshape(-1, 3)
         if self._lib.mudg_city_set_weather(self._handle, values, places, len(places)):
@@ -109,12 +98,12 @@ class CityHandle:
 
     def render(
         self,
-        poses: NDArray[np.float64],
-        phases: NDArray[np.float64],
+        poses: Array,
+        phases: Array,
         intrinsics: tuple[float, float, float, float],
         width: int,
         height: int,
-        world_from_cam: NDArray[np.float64],
+        world_from_cam: Array,
         supersample: int,
         noise_key: int,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]:
@@ -130,12 +119,12 @@ class CityHandle:
 
     def sweep(
         self,
-        poses: NDArray[np.float64],
-        phases: NDArray[np.float64],
-        elevations: NDArray[np.float64],
-        azimuths: NDArray[np.float64],
-        world_from_lidar: NDArray[np.float64],
-        fractions: NDArray[np.float64],
+        poses: Array,
+        phases: Array,
+        elevations: Array,
+        azimuths: Array,
+        world_from_lidar: Array,
+        fractions: Array,
         settings: tuple[float, float, float, float],
         key: int,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]:
@@ -152,7 +141,7 @@ class CityHandle:
             raise ResourceError("not enough memory to scan the city")
         return points
 
-    def street(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    def street(self, xy: Array) -> Array:
         """Per world point [N, 2]: street coordinates s, u and signed distance to the kerb (negative on the road)."""
         xy = _f64(xy).reshape(-1, 2)
         out = np.empty((len(xy), 3), np.float64)
@@ -162,7 +151,6 @@ class CityHandle:
 
 # world ---------------------------------------------------------------------------------------------
 
-
 DATASET = "mudg procedural city"
 GENERATOR_VERSION = 1
 FAR_BELOW_M = 1000.0
@@ -171,15 +159,9 @@ FAR_BELOW_M = 1000.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CityTruth:
-    """Exact truth at a view. Depth, semantics and instance belong to the ray through the pixel's centre; rgb is
-    averaged over the pixel.
-
-    Args:
-        rgb: f32[H, W, 3], display values in [0, 1].
-        depth: f32[H, W], camera z in metres, +inf in the sky.
-        semantics: u8[H, W], Cityscapes train ids.
-        instance: i32[H, W], id of a vehicle or person (see ``CityWorld.tracks``), 0 = none.
-    """
+    """Exact truth at a view. ``rgb``: f32[H, W, 3], display values in [0, 1], averaged over the pixel. Of the ray
+    through the pixel's centre: ``depth`` f32[H, W], camera z in metres, +inf in the sky; ``semantics`` u8[H, W],
+    Cityscapes train ids; ``instance`` i32[H, W], id of a vehicle or person (see ``CityWorld.tracks``), 0 = none."""
 
     rgb: NDArray[np.float32]
     depth: NDArray[np.float32]
@@ -204,18 +186,15 @@ class CitySweep:
     ``semantics`` u8[N] and ``instance`` i32[N] belong to the points."""
 
     time_s: float
-    world_from_lidar: NDArray[np.float64]
+    world_from_lidar: Array
     points: SweepPoints
     semantics: NDArray[np.uint8]
     instance: NDArray[np.int32]
 
 
 class CityWorld:
-    """The world of one configuration. Immutable; ``render`` may be called from several threads.
-
-    Raises:
-        ResourceError: the native library is missing.
-    """
+    """The world of one configuration. Immutable; ``render`` may be called from several threads. ResourceError: the
+    native library is missing."""
 
     def __init__(self, config: CityConfig) -> None:
         self.config = config
@@ -226,7 +205,7 @@ class CityWorld:
         self.key_times_s = key_times(config)
         """Times f64[K] of the keys of all objects."""
         self._furniture = furnish(config, self.plan)
-        self.lamps: NDArray[np.float64] = lamp_places(self._furniture + [m.row for m in self.objects])
+        self.lamps: Array = lamp_places(self._furniture + [m.row for m in self.objects])
         no_keys = np.zeros((len(self.key_times_s), 0, 4))
         self._keys = np.stack([m.keys for m in self.objects], 1) if self.objects else no_keys
         self._gaits = np.array([m.gait_rad_per_s for m in self.objects], np.float64)
@@ -252,11 +231,8 @@ class CityWorld:
 
     @classmethod
     def from_source(cls, source: Source) -> CityWorld:
-        """Rebuild the world a scene was recorded in, bit for bit, from the recipe in its ``source``.
-
-        Raises:
-            InputError: the source holds no recipe of this generator.
-        """
+        """Rebuild the world a scene was recorded in, bit for bit, from the recipe in its ``source``. InputError: the
+        source holds no recipe of this generator."""
         recipe = source.recipe
         if recipe is None or "city" not in recipe:
             what = "the scene was not generated, so there is no exact truth"
@@ -274,7 +250,7 @@ class CityWorld:
             what, remedy = error.what, "generate it again"
             raise InputError(what, where=error.where, expected=error.expected, got=error.got, remedy=remedy) from error
 
-    def rearranged(self, keys: Mapping[str, NDArray[np.float64] | None]) -> CityWorld:
+    def rearranged(self, keys: Mapping[str, Array | None]) -> CityWorld:
         """The same world, light and shadows included, with some vehicles or people elsewhere or gone. ``keys``: track
         id -> x, y, z of the point on the ground below the box's centre, yaw f64[K, 4] at ``key_times_s``; None: not
         there."""
@@ -296,14 +272,8 @@ class CityWorld:
         return known.index(track_id)
 
     def recast(self, track_id: str, look: PosedObject) -> CityWorld:
-        """The same world, light and shadows included, with another object on the path of a vehicle or person.
-
-        Args:
-            look: whose shape, size and paint it gets, for example an object of another world.
-
-        Raises:
-            UsageError: the city has no such object.
-        """
+        """The same world, light and shadows included, with another object on the path of a vehicle or person; ``look``:
+        whose shape, size and paint it gets. UsageError: the city has no such object."""
         index = self._index_of(track_id)
         mine = self.objects[index]
         objects = list(self.objects)
@@ -318,8 +288,6 @@ class CityWorld:
         """What a scene of this world records about its origin."""
         recipe: Mapping[str, Any] = {"city": to_dict(self.config), "generator_version": GENERATOR_VERSION}
         return Source(DATASET, "CC0-1.0", recipe, (f"generated city, light: {self.light_name}",))
-
-    # --- facts ------------------------------------------------------------------------------------
 
     def describe(self) -> str:
         """One line about what was drawn."""
@@ -376,7 +344,7 @@ class CityWorld:
             views.append(View(self._cameras[camera], self.frame_pose(time_s) @ self._mounts[camera], time_s))
         return tuple(views)
 
-    def frame_pose(self, time_s: float) -> NDArray[np.float64]:
+    def frame_pose(self, time_s: float) -> Array:
         """world_from_ego f64[4, 4] of the recording vehicle; UsageError outside the log."""
         pose = self._ego_path.pose_at(time_s)
         if pose is None:
@@ -384,7 +352,7 @@ class CityWorld:
             raise UsageError(what, expected=f"{self._ego_times[0]:.3f}..{self._ego_times[-1]:.3f} s", got=f"{time_s} s")
         return pose
 
-    def _object_keys_at(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _object_keys_at(self, times_s: Array) -> Array:
         """x, y, z, yaw f64[T, objects, 4] between the keys, as Track.pose_at interpolates."""
         times, keys = self.key_times_s, self._keys
         first, last = self.span_s
@@ -398,7 +366,7 @@ class CityWorld:
         u = (at - before)[:, None, None]
         return keys[before] + u * (keys[before + 1] - keys[before])
 
-    def _phases(self, time_s: float) -> NDArray[np.float64]:
+    def _phases(self, time_s: float) -> Array:
         return self._gait_starts + self._gaits * time_s
 
     def markings(self, view: View, truth: CityTruth) -> NDArray[np.bool_]:
@@ -411,27 +379,18 @@ class CityWorld:
             mask[rows, columns] = rec.painted(self.plan, self._handle.street(xyz[:, :2]), xyz[:, :2])
         return mask
 
-    def beyond_kerb_m(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    def beyond_kerb_m(self, xy: Array) -> Array:
         """Distance f64[N] of places f64[N, 2] from the kerb, metres; negative on the road."""
         return self._handle.street(xy)[:, 2]
 
-    def lane_lines(self) -> list[NDArray[np.float64]]:
+    def lane_lines(self) -> list[Array]:
         """Road lines, road edges and crosswalks as a map has them: lines f64[N, 3] in the world, metres."""
         return rec.lane_lines(self.plan)
 
-    # --- truth ------------------------------------------------------------------------------------
-
     def render(self, view: View, *, supersample: int | None = None, sensor_noise: bool = False) -> CityTruth:
-        """Truth at any view whose time lies in ``span_s``.
-
-        Args:
-            view: any pinhole camera (distortion and rolling shutter are refused) at any pose.
-            supersample: rays per pixel and axis; None = the configuration's.
-            sensor_noise: add the camera noise of a recorded image; the same view gives the same noise.
-
-        Raises:
-            UsageError: time outside the log, or a camera model that is not simulated.
-        """
+        """Truth at any view whose time lies in ``span_s``. ``supersample``: rays per pixel and axis; None: the
+        configuration's. ``sensor_noise``: add the camera noise of a recorded image; the same view gives the same noise.
+        UsageError: time outside the log, or a camera with distortion or a rolling shutter."""
         camera = view.camera
         if camera.readout_s != 0 or any(camera.distortion):
             raise UsageError("the city renders undistorted global-shutter cameras", where=f"camera {camera.name!r}")
@@ -460,10 +419,7 @@ class CityWorld:
 
     def render_rolling(self, view: View, readout_s: float, strips: int = 8) -> CityTruth:
         """The image of a rolling shutter: vehicle and objects move while the rows are read, the middle row at the
-        view's time.
-
-        Rows are taken in strips of one time each. Times beyond the log's span keep the pose of its end.
-        """
+        view's time, in strips of one time each. Times beyond the log's span keep the pose of its end."""
         camera, parts = view.camera, []
         mount = geometry.invert(self.frame_pose(view.time_s)) @ view.world_from_cam
         edges = np.linspace(0, camera.height, min(strips, camera.height) + 1).round().astype(int)
@@ -478,16 +434,10 @@ class CityWorld:
         rgb, depth, semantics, instance = zip(*parts, strict=True)
         return CityTruth(*(np.concatenate(column) for column in (rgb, depth, semantics, instance)))
 
-    def ranges(
-        self, places: NDArray[np.float64], directions: NDArray[np.float64], times_s: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Exact range f64[N] in metres and intensity f64[N] of single beams; NaN: nothing returns (glass and weak
-        surfaces lose beams as in a sweep). Without noise.
-
-        Args:
-            places, directions: f64[N, 3] in the world, directions of length 1. times_s: f64[N]; limbs of people keep
-                their pose of the middle.
-        """
+    def ranges(self, places: Array, directions: Array, times_s: Array) -> tuple[Array, Array]:
+        """Exact range f64[N] in metres and intensity f64[N] of single beams without noise; NaN: nothing returns (glass
+        and weak surfaces lose beams as in a sweep). ``places``, ``directions``: f64[N, 3] in the world, of length 1.
+        ``times_s``: f64[N]; limbs of people keep their pose of the middle."""
         first, last = (float(np.clip(end, *self.span_s)) for end in (times_s.min(), times_s.max()))
         middle = (first + last) / 2
         share = ((times_s - first) / (last - first)).clip(0, 1) if last > first else np.zeros(len(times_s))
@@ -495,7 +445,12 @@ class CityWorld:
         turns = np.asarray(0.1 * (np.arange(len(times_s)) % 6), np.float64)
         cos, sin, zero = np.cos(turns), np.sin(turns), np.zeros(len(turns))
         back = np.stack([cos, sin, zero, -sin, cos, zero, zero, zero, zero + 1], 1).reshape(-1, 3, 3)
-        poses = np.concatenate([_axes_along(directions) @ back, places[:, :, None]], 2)
+        # rotations whose x axis is the direction
+        helper = np.where(np.abs(directions[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+        left = np.cross(helper, directions)
+        left /= np.linalg.norm(left, axis=1, keepdims=True)
+        axes = np.stack([directions, left, np.cross(directions, left)], 2)
+        poses = np.concatenate([axes @ back, places[:, :, None]], 2)
         objects = (self._object_keys_at(np.array([first, middle, last])), self._phases(middle))
         settings = (self.config.lidar_range_m, 0.0, 0.0, 0.55)
         key = seeds.key(self.config.seed, round(middle * 1e6), "exact beams")
@@ -542,17 +497,7 @@ class CityWorld:
         return CitySweep(time_s, world_from_lidar, points, semantics[hit], instance[hit])
 
 
-def _axes_along(directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotations f64[N, 3, 3] whose x axis is each of some unit vectors f64[N, 3]."""
-    helper = np.where(np.abs(directions[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
-    left = np.cross(helper, directions)
-    left /= np.linalg.norm(left, axis=1, keepdims=True)
-    return np.stack([directions, left, np.cross(directions, left)], 2)
-
-
-def _interpolated_poses(
-    times: NDArray[np.float64], poses: NDArray[np.float64], at: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _interpolated_poses(times: Array, poses: Array, at: Array) -> Array:
     """``geometry.pose_at`` for many times f64[N, 4, 4]: slerp and straight line between neighbouring keys."""
     before = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
     out = np.empty((len(at), 4, 4))
@@ -583,7 +528,7 @@ def _seed31(config: CityConfig, purpose: str) -> int:
     return seeds.key(config.seed, 0, purpose) & 0x7FFFFFFF
 
 
-def _road_numbers(config: CityConfig, plan: StreetPlan) -> NDArray[np.float64]:
+def _road_numbers(config: CityConfig, plan: StreetPlan) -> Array:
     """Numbers of the road in the order of ``RoadNumber`` in native/city.cpp."""
     rng = seeds.numpy_rng(config.seed, 0, "city ground")
     cross = [0.0] * 10

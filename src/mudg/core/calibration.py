@@ -1,13 +1,5 @@
-"""Does the LiDAR fit the camera? Depth edges of sweeps against brightness edges of images, at the given and at turned
-poses.
-
-Where a near surface ends before a far one, the image nearly always has an edge too. With the right calibration the near
-side of such jumps falls on image edges more often than with the camera turned by a degree; so the mean edge strength
-under the jumps, as a function of a small extra turn, has its peak at no turn. Nothing is fitted and no truth is needed.
-
-Source of the idea: J. Levinson and S. Thrun, Automatic online calibration of cameras and lasers, RSS 2013. Their
-scan-line neighbours are replaced by the nearest directions in a row, so that clouds need no ring numbers.
-"""
+"""Cameras of a log against each other and against LiDAR: maps between their colours, and a test of their
+calibration."""
 
 from __future__ import annotations
 
@@ -25,12 +17,10 @@ from mudg.base.camera_colors import SAME_COLORS, CameraColors, ColorMap
 from mudg.base.geometry import transform_points
 from mudg.base.types import View
 
-# color match --------------------------------------------------------------------------------------
-# Finding the maps between the colours of a log's cameras, from points that two of them saw.
-#
+# colours ------------------------------------------------------------------------------------------
 # Cameras of a rig overlap little at one moment, but the front camera sees what the side cameras pass a little later. So
-# every point is looked up in images of several moments. Photographs differ for other reasons too (reflections, shadows
-# of the vehicle, poses), so a map is used only where it explains a good part of the difference.
+# every point is looked up in images of several moments. Photographs differ for other reasons too, so a map is used only
+# where it explains a good part of the difference.
 
 
 TRIM_DEVIATIONS: Final = 2.5
@@ -57,8 +47,7 @@ def color_map(given: NDArray[np.uint8], wanted: NDArray[np.uint8]) -> ColorMap:
     if len(x) < FEWEST_PAIRS:
         return ColorMap(pairs=len(x))
     gains, offsets = [], []
-    for channel in range(3):
-        a, b = x[:, channel], y[:, channel]
+    for a, b in zip(x.T, y.T):
         gain, offset = 1.0, float(np.median(b) - np.median(a))
         for _ in range(5):
             error = np.abs(b - gain * a - offset)
@@ -111,11 +100,7 @@ def match_cameras(cameras: Iterable[str], seen: Iterable[Seen]) -> CameraColors:
         known, new = (a, b) if a in reached else (b, a)
         of = dict(zip((a, b), pairs[a, b]))
         reached[new] = _useful(color_map(of[new], of[known]), of[new], of[known]).then(reached[known])
-    maps = {
-        name: found
-        for name, found in reached.items()
-        if found.gain != (1.0, 1.0, 1.0) or found.offset != (0.0, 0.0, 0.0)
-    }
+    maps = {name: one for name, one in reached.items() if (one.gain, one.offset) != ((1.0,) * 3, (0.0,) * 3)}
     return CameraColors(names[0], maps) if maps else SAME_COLORS
 
 
@@ -131,7 +116,13 @@ def _useful(found: ColorMap, given: NDArray[np.uint8], wanted: NDArray[np.uint8]
     return found if after <= (1 - LEAST_GAIN) * before and change >= LEAST_CHANGE else same
 
 
-# edge alignment -----------------------------------------------------------------------------------
+# edges --------------------------------------------------------------------------------------------
+# Where a near surface ends before a far one, the image nearly always has an edge too. With the right calibration the
+# near side of such jumps of depth falls on image edges more often than with the camera turned by a degree; so the mean
+# edge strength under the jumps, as a function of a small extra turn, has its peak at no turn. Nothing is fitted.
+#
+# After J. Levinson and S. Thrun, Automatic online calibration of cameras and lasers, RSS 2013. Their scan-line
+# neighbours are replaced by the nearest directions in a row, so that clouds need no ring numbers.
 
 
 Floats = NDArray[np.float64]
@@ -214,19 +205,21 @@ def edge_map(rgb: NDArray[np.uint8], blur_px: float) -> Floats:
 
 
 def edge_alignment(shots: Iterable[tuple[View, NDArray[np.uint8], Floats, NDArray[np.floating]]]) -> EdgeAlignment:
-    """Compare the given pose of a camera with slightly turned ones.
-
-    Args:
-        shots: for some images of one camera: view, image u8[H, W, 3], world_from_lidar f64[4, 4] of the sweep of that
-            moment, and its points [N, 3] in the LiDAR frame.
-    """
+    """Compare the given pose of a camera with slightly turned ones. ``shots``: for some images of one camera: view,
+    image u8[H, W, 3], world_from_lidar f64[4, 4] of the sweep of that moment, and its points [N, 3] in the LiDAR
+    frame."""
     parts: list[Floats] = []
     jumps = 0
     for view, rgb, world_from_lidar, xyz_lidar in shots:
         camera = view.camera
         edges = edge_map(rgb, max(0.5, np.deg2rad(_BLUR_DEG) * camera.fx))
         cam_from_lidar = view.cam_from_world @ world_from_lidar
-        around = np.asarray(xyz_lidar, np.float64)[_in_sight(transform_points(cam_from_lidar, xyz_lidar), view)]
+        # points in the image or a little beside it: a neighbour of one in the image may lie outside
+        x, y, z = transform_points(cam_from_lidar, xyz_lidar).T
+        u, v = geometry.pinhole(camera.intrinsics, x, y, np.maximum(z, 1e-6))
+        slack = _SLACK * max(camera.width, camera.height)
+        beside = (u > -slack) & (u < camera.width + slack) & (v > -slack) & (v < camera.height + slack)
+        around = np.asarray(xyz_lidar, np.float64)[(z > 1.0) & beside]
         xyz = transform_points(cam_from_lidar, around[depth_jumps(around)])
         sums, count = _turned_sums(edges, xyz, view)
         parts.append(sums)
@@ -234,27 +227,13 @@ def edge_alignment(shots: Iterable[tuple[View, NDArray[np.uint8], Floats, NDArra
     return _judge(np.concatenate(parts, 1) if jumps else np.zeros((len(TURNS_DEG) ** 2, 0)), jumps)
 
 
-def _in_sight(xyz_cam: NDArray[np.floating], view: View) -> NDArray[np.bool_]:
-    """Points in the image or a little beside it: a neighbour of one in the image may lie outside."""
-    camera = view.camera
-    slack = _SLACK * max(camera.width, camera.height)
-    z = np.maximum(xyz_cam[:, 2], 1e-6)
-    u, v = geometry.pinhole(camera.intrinsics, xyz_cam[:, 0], xyz_cam[:, 1], z)
-    beside = (u > -slack) & (u < camera.width + slack) & (v > -slack) & (v < camera.height + slack)
-    return (xyz_cam[:, 2] > 1.0) & beside
-
-
 def _turned_sums(edges: Floats, xyz_cam: Floats, view: View) -> tuple[Floats, int]:
     """Sums of edge strength under the points f64[turns, clusters] and the number of points; only those that stay in the
     image at all turns count."""
     camera = view.camera
-    places = []
-    for about_y in TURNS_DEG:
-        for about_x in TURNS_DEG:
-            turned = xyz_cam @ _turn(about_y, about_x).T
-            z = turned[:, 2].clip(1e-6)
-            places.append(geometry.pinhole(camera.intrinsics, turned[:, 0], turned[:, 1], z))
-    u, v = np.array([p[0] for p in places]), np.array([p[1] for p in places])
+    turned = [(_turn(about_y, about_x) @ xyz_cam.T) for about_y in TURNS_DEG for about_x in TURNS_DEG]
+    places = [geometry.pinhole(camera.intrinsics, x, y, z.clip(1e-6)) for x, y, z in turned]
+    u, v = (np.array(side) for side in zip(*places))
     inside = ((u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)).all(0)
     u, v = u[:, inside].astype(int), v[:, inside].astype(int)
     azimuth = np.rad2deg(np.arctan2(xyz_cam[inside, 0], xyz_cam[inside, 2]))

@@ -1,20 +1,5 @@
-"""Dense depth from sparse measurements and one image, without learned weights.
-
-The unknown is the logarithm of depth at every pixel, so that all errors count relative to the distance. A sparse linear
-system pulls it to the measurements and asks neighbouring pixels to differ as a plane would:
-
-1. ``core.visible`` projects points into the view and drops those that a nearer surface hides.
-2. Every measurement gets a plane in inverse depth (planes of the world are planes there) from its neighbours of like
-  depth.
-3. Every pixel takes over the plane of its nearest measurement. It gives the start, and the difference to expect between
-  two pixels.
-4. Differences across image edges count little. After a first solve, differences that are far off what was expected
-   count less still (iteratively reweighted least squares), so that steps in depth settle on edges of the image.
-5. Sky lies at a fixed distance and takes no part.
-
-Far from measurements, above the highest beam for example, planes fade to constant depth: facades and trunks stand
-upright, and an upright surface has one depth along an image column.
-"""
+"""Dense depth without learned weights: generated depth brought to measurements, and sparse measurements completed under
+the guidance of an image."""
 
 from __future__ import annotations
 
@@ -33,8 +18,6 @@ from mudg.base.geometry import pixel_rays
 from mudg.base.types import View, check_shape
 
 # align --------------------------------------------------------------------------------------------
-# Bringing generated depth to the scale of what was measured: one scale and one shift per frame, robustly.
-#
 # ``fit_depth`` starts from metres that are nearly right; ``fit_affine`` from any numbers that grow with depth, or with
 # its inverse.
 
@@ -66,26 +49,19 @@ class DepthFit:
 
 
 def fit_depth(depth: Tensor, measured: Tensor, valid: Tensor, rounds: int = 12) -> DepthFit:
-    """Scale and shift of one frame by iteratively reweighted least squares.
+    """Scale and shift of one frame by iteratively reweighted least squares. InputError: shapes differ.
 
-    depth, measured  [1,H,W] metres; valid bool[1,H,W]: where `measured` holds. Residuals are relative to the measured
-                     depth
-    and weighted with Tukey's function at 4.7 times their robust spread, starting from the median ratio, so that wrongly
-    painted surfaces do not pull.
-
-    Raises:
-        InputError: shapes differ.
+    depth, measured: [1,H,W] metres; valid: bool[1,H,W], where `measured` holds. Residuals are relative to the measured
+    depth and weighted with Tukey's function at 4.7 times their robust spread, starting from the median ratio, so that
+    wrongly painted surfaces do not pull.
     """
     check_shape(measured, "fit_depth: measured depth", tuple(depth.shape))
     check_shape(valid, "fit_depth: mask", tuple(depth.shape))
     known = valid & torch.isfinite(depth) & torch.isfinite(measured) & (measured > 0)
     x, y = _exactly(depth[known]), _exactly(measured[known])
-    if len(x) == 0:
-        return DepthFit(1.0, 0.0, float("nan"), float("nan"), False)
-    off = (x / y - 1).abs().median()
+    off = (x / y - 1).abs().median() if len(x) else x.new_tensor(float("nan"))
     if len(x) < MIN_POINTS:
-        before = float(off)
-        return DepthFit(1.0, 0.0, before, before, False)
+        return DepthFit(1.0, 0.0, float(off), float(off), False)
     rows = torch.stack([x / y, 1 / y], 1)
     found = torch.stack([(y / x.clamp(min=0.1)).median(), x.new_zeros(())])  # a start that outliers do not move
     found = _reweighted(rows, found, rounds)
@@ -142,10 +118,7 @@ def fit_affine(values: Tensor, measured: Tensor, space: Space, rounds: int = 12)
     Errors count relative to the measured depth. The start is the line through two of the points that has the least
     median error (Rousseeuw, "Least median of squares regression", 1984; pairs half the range of values apart, chosen
     without chance), so up to nearly half of the points may be wrong; then least squares reweighted with Tukey's
-    function, as in `fit_depth`.
-
-    Raises:
-        InputError: shapes differ, or there is no such space.
+    function, as in `fit_depth`. InputError: shapes differ, or there is no such space.
     """
     check_shape(values, "fit_affine: values", (None,))
     check_shape(measured, "fit_affine: measured depth", tuple(values.shape))
@@ -196,6 +169,16 @@ def align_depth(depth: Tensor, measured: Tensor, valid: Tensor) -> tuple[Tensor,
 
 
 # complete -----------------------------------------------------------------------------------------
+# The unknown is the logarithm of depth at every pixel, so that all errors count relative to the distance. A sparse
+# linear system pulls it to the measurements and asks neighbouring pixels to differ as a plane would:
+#
+# 1. Every measurement gets a plane in inverse depth (planes of the world are planes there) from neighbours of like
+#    depth.
+# 2. Every pixel takes over the plane of its nearest measurement. It gives the start, and the difference to expect
+#    between two pixels. Far from measurements planes fade to constant depth: facades and trunks stand upright.
+# 3. Differences across image edges count little. After a first solve, differences that are far off what was expected
+#    count less still (iteratively reweighted least squares), so that steps in depth settle on edges of the image.
+# 4. Sky lies at a fixed distance and takes no part.
 
 
 SKY_M: Final = 100.0
@@ -212,6 +195,7 @@ _STEP_SCALE, _OUTLIER_SCALE = 0.02, 0.03
 """Deviations in the logarithm from which a pair, and a measurement, count half."""
 _ROUNDS, _ITERATIONS = 3, 60
 """Solves, each but the first reweighted, and conjugate-gradient steps of each."""
+_TOLERANCE: Final = 1e-4
 _NEIGHBOURS: Final = 10
 """Measurements that a plane is fitted to."""
 _PLANE_FADE_PX: Final = 12.0
@@ -259,25 +243,19 @@ def ray_elevation(view: View) -> NDArray[np.float32]:
     return np.arcsin(rise / np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2)).astype(np.float32)
 
 
-# --- completion -----------------------------------------------------------------------------------
-
-
 def complete_depth(
     rgb: NDArray[np.uint8],
     measured: NDArray[np.float32],
     sky: NDArray[np.bool_] | None = None,
     beyond: NDArray[np.bool_] | None = None,
 ) -> DenseDepth:
-    """Fill a sparse depth map, guided by its image; see the module text.
+    """Fill a sparse depth map, guided by its image. InputError: shapes differ, or a measurement is not positive.
 
     Args:
         rgb: u8[H, W, 3].
         measured: f32[H, W] metres, NaN where nothing was measured.
         sky: bool[H, W]; None = no sky.
         beyond: bool[H, W], where the scanner looked and nothing came back, see ``beyond_reach``; None = nowhere.
-
-    Raises:
-        InputError: shapes differ, or a measurement is not positive.
     """
     shape = measured.shape
     sky = np.zeros(shape, bool) if sky is None else sky
@@ -303,7 +281,11 @@ def complete_depth(
     goal = np.full(shape, np.log(SKY_M), np.float32)
     goal[known] = np.log(measured[known])
     pull = np.where(known, np.float32(_DATA_WEIGHT), np.where(beyond, np.float32(_BEYOND_WEIGHT), np.float32(0)))
-    solved = _solve(start, (right, down), _color_weights(rgb), pull, goal, sky)
+    weights = []  # of the pairs to the right [H, W-1] and below [H-1, W]
+    for axis in (1, 0):
+        step = np.sqrt((np.diff(rgb.astype(np.float32), axis=axis) ** 2).sum(2))
+        weights.append(np.maximum(np.exp(-step / _COLOR_SCALE), _EDGE_FLOOR).astype(np.float32))
+    solved = _solve(start, ((right, weights[0]), (down, weights[1])), pull, goal, sky)
     solved = np.clip(solved, np.log(NEAR_M), np.log(FAR_M))
     depth[~sky] = np.exp(solved)[~sky]
     confidence[~sky] = _confidence(solved, goal[owner[0], owner[1]], away_px, sky)[~sky]
@@ -359,31 +341,18 @@ def _expected(
     return start, right, down
 
 
-def _color_weights(rgb: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Weights of the pairs to the right [H, W-1] and below [H-1, W]."""
-    colors = rgb.astype(np.float32)
-    weights = []
-    for axis in (1, 0):
-        step = np.sqrt((np.diff(colors, axis=axis) ** 2).sum(2))
-        weights.append(np.maximum(np.exp(-step / _COLOR_SCALE), _EDGE_FLOOR).astype(np.float32))
-    return weights[0], weights[1]
-
-
 def _solve(
     start: NDArray[np.float32],
-    expected: tuple[NDArray[np.float32], NDArray[np.float32]],
-    weights: tuple[NDArray[np.float32], NDArray[np.float32]],
+    neighbours: tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...],
     pull: NDArray[np.float32],
     goal: NDArray[np.float32],
     sky: NDArray[np.bool_],
 ) -> NDArray[np.float32]:
-    """Logarithm of depth f32[H, W]: reweighted least squares over all pixels but the sky."""
+    """Logarithm of depth f32[H, W]: reweighted least squares over all pixels but the sky. ``neighbours``: differences
+    to expect, and weights, of the pairs to the right and below."""
     number = np.cumsum(~sky.ravel()).reshape(sky.shape) - 1
     pairs = []
-    for here, there, g, w in (
-        (np.s_[:, :-1], np.s_[:, 1:], expected[0], weights[0]),
-        (np.s_[:-1], np.s_[1:], expected[1], weights[1]),
-    ):
+    for here, there, (g, w) in zip((np.s_[:, :-1], np.s_[:-1]), (np.s_[:, 1:], np.s_[1:]), neighbours):
         both = ~sky[here] & ~sky[there]
         pairs.append((number[here][both], number[there][both], g[both], w[both]))
     first, second, g, w0 = (np.concatenate(part) for part in zip(*pairs, strict=True))
@@ -395,44 +364,33 @@ def _solve(
             scale = max(_OUTLIER_SCALE, 4 * float(np.median(off[data0 > 0])))  # not all can be outliers
             data = data0 / (1 + (off / scale) ** 2)
             w = w0 / (1 + ((x[second] - x[first] - g) / _STEP_SCALE) ** 2)
-        diagonal = (
-            data
-            + np.bincount(first, w, size).astype(np.float32)
-            + np.bincount(second, w, size).astype(np.float32)
-            + 1e-6
-        )
+        at_pairs = [np.bincount(end, w, size).astype(np.float32) for end in (first, second)]
+        diagonal = data + at_pairs[0] + at_pairs[1] + 1e-6
         slope = w * g
         right_side = data * goal + np.bincount(second, slope, size) - np.bincount(first, slope, size) + 1e-6 * x
         upper = sparse.csr_matrix((-w, (first, second)), shape=(size, size), dtype=np.float32)
         matrix = (upper + upper.T + sparse.diags(diagonal, dtype=np.float32)).tocsr()
-        x = conjugate_gradients(
-            matrix, right_side.astype(np.float32), x, (1 / diagonal).astype(np.float32), _ITERATIONS
-        )
+        x = _conjugate_gradients(matrix, right_side.astype(np.float32), x, (1 / diagonal).astype(np.float32))
     out = np.zeros(sky.shape, np.float32)
     out[~sky] = x
     return out
 
 
-def conjugate_gradients(
+def _conjugate_gradients(
     matrix: sparse.csr_matrix,
     right_side: NDArray[np.float32],
     start: NDArray[np.float32],
     inverse_diagonal: NDArray[np.float32],
-    iterations: int,
-    tolerance: float = 1e-4,
 ) -> NDArray[np.float32]:
-    """Solve a symmetric positive definite system by conjugate gradients with Jacobi's preconditioner, from a start.
-
-    Stops after ``iterations``, or when the preconditioned residual has fallen to ``tolerance`` of its start; what is
-    then missing is small beside what the start already knew.
-    """
+    """Solve a symmetric positive definite system with Jacobi's preconditioner, from a start, in ``_ITERATIONS`` steps
+    or until the preconditioned residual has fallen to ``_TOLERANCE`` of its start."""
     x = start.copy()
     residual = right_side - matrix @ x
     z = inverse_diagonal * residual
     direction = z.copy()
     energy = float(residual @ z)
-    limit = energy * tolerance**2
-    for _ in range(iterations):
+    limit = energy * _TOLERANCE**2
+    for _ in range(_ITERATIONS):
         if energy <= limit or energy <= 0:
             break
         moved = matrix @ direction

@@ -1,13 +1,5 @@
-"""Changes of how road users move: pure functions on the keys of a path, for tracks, the vehicle and nodes of a fitted
-scene alike.
-
-A ``Motion`` is the path of one of them: poses at key times, straight lines and slerp between them. Each key also says
-which moment of the recording it shows (``source_s``), so that what moves within a box (a walking person) can follow
-when a path is retimed.
-
-Lane change: ``y(s) = d (10 s^3 - 15 s^4 + 6 s^5)``, ``s = (t - t0) / T``: no lateral speed and acceleration at its
-ends. Its largest lateral acceleration, at ``s = 1/2 +- sqrt(3)/6``, is ``10 / sqrt(3) d / T^2``.
-"""
+"""Changes of how road users move, as pure functions on the keys of a path, for tracks, the vehicle and nodes of a
+fitted scene alike; boxes against each other; and the ground below."""
 
 from __future__ import annotations
 
@@ -23,7 +15,6 @@ from mudg.base import geometry
 from mudg.base.errors import InputError
 
 # boxes --------------------------------------------------------------------------------------------
-# Boxes of road users against each other and against cameras: do they collide, and which sides were ever seen?
 
 
 def overlap_m(poses_a: Array, size_a: ArrayLike, poses_b: Array, size_b: ArrayLike) -> Array:
@@ -70,8 +61,7 @@ def angle_to_nearest(asked: Array, seen: Array) -> Array:
     return np.minimum(apart % (2 * np.pi), 2 * np.pi - apart % (2 * np.pi)).min(1)
 
 
-# ground -------------------------------------------------------------------------------------------
-# A height map of the ground, from points that lie on it: what a vehicle stands on that is put somewhere else.
+# ground: a height map of what a vehicle stands on that is put somewhere else --------------------------
 
 
 CELL_M: Final = 0.5
@@ -98,14 +88,8 @@ class HeightMap:
 
     @classmethod
     def from_points(cls, xyz: NDArray[np.floating], cell_m: float = CELL_M) -> HeightMap:
-        """Median height per cell, gaps filled from the nearest cell, smoothed.
-
-        Args:
-            xyz: [N, 3] world points of the ground, metres.
-
-        Raises:
-            InputError: no points, or points that are too far apart for a map.
-        """
+        """Median height per cell, gaps filled from the nearest cell, smoothed. ``xyz``: [N, 3] world points of the
+        ground, metres. InputError: no points, or points that are too far apart for a map."""
         points = np.asarray(xyz, np.float64)
         points = points[np.isfinite(points).all(1)]
         if not len(points):
@@ -115,9 +99,8 @@ class HeightMap:
         first = cells.min(0) - int(np.ceil(REACH_M / cell_m))
         shape = cells.max(0) - first + 1 + int(np.ceil(REACH_M / cell_m))
         if shape.prod() > MOST_CELLS:
-            raise InputError(
-                "the ground spans too large an area", got=f"{shape[0] * cell_m:.0f} x {shape[1] * cell_m:.0f} m"
-            )
+            got = f"{shape[0] * cell_m:.0f} x {shape[1] * cell_m:.0f} m"
+            raise InputError("the ground spans too large an area", got=got)
         flat = (cells[:, 0] - first[0]) * shape[1] + cells[:, 1] - first[1]
         order = np.lexsort((points[:, 2], flat))
         ids, begins, counts = np.unique(flat[order], return_index=True, return_counts=True)
@@ -128,7 +111,8 @@ class HeightMap:
 
     def height(self, xy: Array) -> Array:
         """World z f64[N] under places f64[N, 2]; NaN where it is not known."""
-        return ndimage.map_coordinates(self.heights, self._at(xy).T, order=1, mode="constant", cval=np.nan)
+        at = (np.asarray(xy, np.float64) - self.origin) / self.cell_m
+        return ndimage.map_coordinates(self.heights, at.T, order=1, mode="constant", cval=np.nan)
 
     def normal(self, xy: Array) -> Array:
         """Unit normals f64[N, 3] of the ground at places f64[N, 2], upwards; vertical where it is not known."""
@@ -136,9 +120,6 @@ class HeightMap:
         slopes = np.nan_to_num(np.stack(rises, 1) / (2 * TILT_M))
         normals = np.column_stack([-slopes, np.ones(len(slopes))])
         return normals / np.linalg.norm(normals, axis=1, keepdims=True)
-
-    def _at(self, xy: Array) -> Array:
-        return (np.asarray(xy, np.float64) - self.origin) / self.cell_m
 
 
 def _smoothed(heights: Array, cell_m: float) -> Array:
@@ -153,7 +134,7 @@ def _smoothed(heights: Array, cell_m: float) -> Array:
     return np.where(far, np.nan, blurred)
 
 
-# edit ---------------------------------------------------------------------------------------------
+# paths --------------------------------------------------------------------------------------------
 
 
 Array = NDArray[np.float64]
@@ -167,12 +148,13 @@ QUINTIC_PEAK: Final = 10 / 3**0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """A path.
+    """A path: straight lines and slerp between poses at key times.
 
     Args:
         times_s: f64[K], strictly increasing.
         poses: world_from_object f64[K, 4, 4], metres.
-        source_s: f64[K], the moment of the recording that each key shows.
+        source_s: f64[K], the moment of the recording that each key shows, so that what moves within a box (a walking
+            person) can follow when a path is retimed.
     """
 
     times_s: Array
@@ -262,11 +244,9 @@ def moved(motion: Motion, by: Displacement, ground: HeightMap | None = None) -> 
 def lane_changed(
     motion: Motion, left_m: float, start_s: float, duration_s: float, ground: HeightMap | None = None
 ) -> Motion:
-    """A path that changes lanes: quintic offset to the left of the recorded path, heading along the new one.
-
-    Raises:
-        InputError: it begins outside the path, or the road user stands then.
-    """
+    """A path that changes lanes, heading along the new one: offset ``d (10 s^3 - 15 s^4 + 6 s^5)`` to the left of the
+    recorded path, ``s = (t - start_s) / duration_s``, with no lateral speed and acceleration at its ends. InputError:
+    it begins outside the path, or the road user stands then."""
     first, last = float(motion.times_s[0]), float(motion.times_s[-1])
     if not first <= start_s < last:
         what = "the lane change begins outside the path"
@@ -318,12 +298,10 @@ def along_points(points: Array, height_m: float, ground: HeightMap | None, floor
         height_m: of the object's origin above the ground. floor_m: height of the ground where ``ground`` does not know
             it.
     """
-    times = points[:, 0] if len(points) > 1 else points[[0, 0], 0] + [0.0, 1e-3]
-    xy, yaw = points[:, 1:3], points[:, 3]
+    times, xy, yaw = points[:, 0], points[:, 1:3], points[:, 3]
     if len(points) > 1:
-        keys = _merged(
-            times, np.linspace(times[0], times[-1], max(2, int(np.ceil((times[-1] - times[0]) / (2 * STEP_S))) + 1))
-        )
+        steps = max(2, int(np.ceil((times[-1] - times[0]) / (2 * STEP_S))) + 1)
+        keys = _merged(times, np.linspace(times[0], times[-1], steps))
         path = PchipInterpolator(times, xy)
         velocity = path.derivative()(keys)
         along = np.unwrap(np.arctan2(velocity[:, 1], velocity[:, 0]))
@@ -331,7 +309,7 @@ def along_points(points: Array, height_m: float, ground: HeightMap | None, floor
         yaw = along if not given.all() else np.interp(keys, times, np.unwrap(yaw))
         xy = path(keys)
     else:
-        keys, xy, yaw = times, xy[[0, 0]], np.nan_to_num(yaw)[[0, 0]]
+        keys, xy, yaw = times[0] + np.array([0.0, 1e-3]), xy[[0, 0]], np.nan_to_num(yaw)[[0, 0]]
     floor = np.full(len(keys), floor_m) if ground is None else np.nan_to_num(ground.height(xy), nan=floor_m)
     poses = np.stack(
         [geometry.yaw_matrix(float(a), (x, y, z + height_m)) for a, (x, y), z in zip(yaw, xy, floor, strict=True)]
@@ -347,42 +325,31 @@ def along_points(points: Array, height_m: float, ground: HeightMap | None, floor
 
 def stopped(motion: Motion, at_s: float, brake_m_s2: float) -> Motion:
     """A path that brakes evenly from ``at_s`` on until it stands; it never goes farther than the recorded one has by
-    then.
-
-    Raises:
-        InputError: ``at_s`` lies outside the path.
-    """
+    then. InputError: ``at_s`` lies outside the path."""
     first, last = float(motion.times_s[0]), float(motion.times_s[-1])
     if not first <= at_s <= last:
-        raise InputError(
-            "it stops outside its path", where="at_s", expected=f"{first:.2f}..{last:.2f} s", got=f"{at_s} s"
-        )
-    keyed = motion.with_keys_between(at_s, last)
+        expected = f"{first:.2f}..{last:.2f} s"
+        raise InputError("it stops outside its path", where="at_s", expected=expected, got=f"{at_s} s")
+    keyed, speed = motion.with_keys_between(at_s, last), motion.speed_at(at_s)
     after = keyed.times_s >= at_s
     way = keyed.travelled_m()
-    begun = np.interp(at_s, keyed.times_s, way)
-    passed = np.minimum(keyed.times_s[after] - at_s, motion.speed_at(at_s) / brake_m_s2)
-    braked = begun + motion.speed_at(at_s) * passed - brake_m_s2 / 2 * passed**2
+    passed = np.minimum(keyed.times_s[after] - at_s, speed / brake_m_s2)
+    braked = np.interp(at_s, keyed.times_s, way) + speed * passed - brake_m_s2 / 2 * passed**2
     reached = np.minimum(braked, way[after])
     rising = np.concatenate([[True], np.diff(way[after]) > 1e-9])
     recording = keyed.times_s.copy()
     recording[after] = np.interp(reached, way[after][rising], keyed.times_s[after][rising])
-    if motion.speed_at(at_s) < 0.1:
+    if speed < 0.1:
         recording[after] = at_s
     return _retimed(motion, keyed.times_s, recording)
 
 
 def sped(motion: Motion, factor: float, from_s: float | None = None) -> Motion:
     """A path driven at another speed from a moment on. Where it gets ahead of the recording, it goes on straight as at
-    its end.
-
-    Args:
-        factor: > 0; 0.5 is half as fast.
-    """
-    begin = (
-        float(motion.times_s[0]) if from_s is None else float(np.clip(from_s, motion.times_s[0], motion.times_s[-1]))
-    )
-    keyed = motion.with_keys_between(begin, float(motion.times_s[-1]))
+    its end. ``factor``: > 0; 0.5 is half as fast."""
+    first, last = float(motion.times_s[0]), float(motion.times_s[-1])
+    begin = first if from_s is None else min(max(from_s, first), last)
+    keyed = motion.with_keys_between(begin, last)
     recording = np.where(keyed.times_s < begin, keyed.times_s, begin + factor * (keyed.times_s - begin))
     return _retimed(motion, keyed.times_s, recording)
 

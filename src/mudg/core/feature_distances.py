@@ -1,20 +1,11 @@
-"""Distances between two sets of feature vectors: how far the distribution of generated images is from that of real
-ones.
-
-All take two arrays ``generated`` ``[n, d]`` and ``real`` ``[m, d]`` (rows are images, any real dtype), compute in
-float64 on the CPU and return a plain number. Smaller is better everywhere. InputError: sets of other widths, too few
-rows, or values that are not finite. What the features are decides the name of the number: with those of
-``networks/inception.py`` ``frechet_distance`` is FID and ``kernel_distance`` is KID.
-
-All of them depend on the number of rows. The Frechet distance of two small samples of the *same* law is far from 0:
-with FID's features and 96 rows about nine tenths of the total variance. Compare only numbers of equal n, and show what
-two samples of the truth give beside them. ``kernel_distance`` alone is unbiased.
-"""
+"""Distances between two sets of feature vectors ``generated`` [n, d] and ``real`` [m, d], in float64 on the CPU;
+smaller is better. All depend on the number of rows, the unbiased ``kernel_distance`` alone excepted: compare only equal
+n. InputError: sets of other widths, too few rows, or values that are not finite."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -25,8 +16,6 @@ from mudg.base.errors import InputError
 Features = NDArray[np.float64]
 
 KID_DEGREE: Final = 3
-CMMD_SIGMA: Final = 10.0
-CMMD_FACTOR: Final = 1000.0
 
 
 def frechet_distance(generated: ArrayLike, real: ArrayLike) -> float:
@@ -108,37 +97,8 @@ def _unbiased(own_a: Features, own_b: Features, across: Features, a: Features, b
     return within(own_a, a) + within(own_b, b) - 2.0 * float(a @ across @ b / (a.sum() * b.sum()))
 
 
-def cmmd_distance(generated: ArrayLike, real: ArrayLike) -> float:
-    """CMMD: squared maximum mean discrepancy of directions under a Gaussian kernel of sigma 10, times 1000.
-
-    Rows are brought to length 1 first (InputError: one of length 0). Biased: means over full kernel matrices, with
-    their diagonals. [0, 1000 * 2 * (1 - exp(-4 / 200))], that is at most 39.6; 0 for equal sets. Published values are
-    of image embeddings of CLIP ViT-L/14 at 336 pixels.
-    """
-    units = []
-    for name, features in zip(("generated", "real"), _pair(generated, real, 1), strict=True):
-        lengths = np.linalg.norm(features, axis=1, keepdims=True)
-        if not lengths.all():
-            raise InputError(
-                "an embedding of length 0 has no direction", where=f"{name}, row {int(np.argmin(lengths))}"
-            )
-        units.append(features / lengths)
-
-    def kernel(x: Features, y: Features) -> Features:
-        squared = (x**2).sum(1)[:, None] + (y**2).sum(1) - 2.0 * (x @ y.T)
-        return np.exp(-np.maximum(squared, 0.0) / (2.0 * CMMD_SIGMA**2))
-
-    return CMMD_FACTOR * _biased(kernel, units[0], units[1])
-
-
-def _biased(kernel: Callable[[Features, Features], Features], a: Features, b: Features) -> float:
-    """Squared maximum mean discrepancy with full kernel matrices, their diagonals included; not below 0."""
-    own_a, own_b, across = (float(kernel(x, y).mean()) for x, y in ((a, a), (b, b), (a, b)))
-    return max(0.0, own_a + own_b - 2.0 * across)
-
-
 def _pair(generated: ArrayLike, real: ArrayLike, fewest: int) -> tuple[Features, Features]:
-    a, b = (_checked(features, name, fewest) for features, name in ((generated, "generated"), (real, "real")))
+    a, b = _checked(generated, "generated", fewest), _checked(real, "real", fewest)
     if a.shape[1] != b.shape[1]:
         what = "two sets of features differ in width"
         raise InputError(what, expected=f"{b.shape[1]} values a row, as the real set", got=str(a.shape[1]))

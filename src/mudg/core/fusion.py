@@ -1,27 +1,5 @@
-"""Fusing LiDAR sweeps and images into one static coloured cloud and one cloud per moving object.
-
-Pure functions on arrays: no files, no global state. ``fuse_sweeps`` takes any iterable of sweeps with the images taken
-beside them, one sweep in memory at a time, and is what both the ``fuse`` stage and the training-data generator call.
-
-The rules, stated once:
-
-* **Dynamic objects.** A tracked box moves if its centre gets far from where it started, or travels a path (both
-  measured with a dead band, so that annotation jitter does not count; going out and coming back does), or if a long box
-  turns. Everything else, parked cars included, belongs to the static world.
-* **Separation.** At a sweep's time the points inside a moving box (slightly grown, and only above a margin over its
-  floor, so that the road stays road) belong to the object and are kept in its frame. In overlapping boxes the smaller
-  wins.
-* **Colour.** A point takes the pixel (nearest, no interpolation) of an image taken at about the sweep's time, the
-  object's motion between sweep and image taken into account. If several cameras see it, the one whose optical axis
-  points closest to it wins. Points that no camera sees have no colour and are left out. Cameras whose exposure or white
-  balance differs are brought to the colours of one of them first (``core/calibration.py``).
-* **Occlusion.** A point does not see a camera if, at its pixel, something of the same sweep that stands (objects
-  included, the ground not) is clearly nearer to that camera. Each point covers half the gap to the next beam.
-* **Semantics.** A point keeps the class that people gave it. For others the cameras that see a point vote, weighted by
-  the cosine to their axes. In a voxel the samples vote.
-* **Small objects.** A dynamic object with too few coloured points over the whole log is left out, and so are its
-  points: they would smear the static world.
-"""
+"""Fusing LiDAR sweeps and images into one static coloured cloud and one cloud per moving object: pure functions on
+arrays, one sweep in memory at a time. Each function states its rule."""
 
 from __future__ import annotations
 
@@ -51,7 +29,7 @@ MOVING_TURN_DEG: Final = 15.0
 
 @dataclass(frozen=True, slots=True)
 class FusionRules:
-    """The numbers in the rules above.
+    """The numbers of the rules of fusion.
 
     Args:
         voxel_m: keep one point per voxel of this side, the one seen from nearest by; 0 keeps all.
@@ -82,73 +60,59 @@ class SweepShots:
 
 @dataclass(frozen=True, slots=True)
 class TrackVerdict:
-    """Why a track counts as moving or static."""
+    """Whether a track moves, and why, in words."""
 
     moving: bool
-    displacement_m: float
-    path_m: float
-    turn_deg: float
     words: str
 
 
 @dataclass(slots=True)
 class FusionReport:
-    """What happened: counts of points, and a verdict and count per track."""
+    """What happened: counts of points; of tracks a verdict, and of moving ones the points, or why they are left
+    out."""
 
     sweeps: int = 0
     points_in: int = 0
-    points_static_in: int = 0
     points_moving_in: int = 0
     points_colored: int = 0
-    points_unseen: int = 0
     points_hidden: int = 0
     points_static: int = 0
     verdicts: dict[str, TrackVerdict] = field(default_factory=dict)
     object_points: dict[str, int] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
 
+    @property
+    def points_unseen(self) -> int:
+        """Points in no image."""
+        return self.points_in - self.points_colored - self.points_hidden
+
 
 # --- dynamic objects ------------------------------------------------------------------------------
 
 
 def judge_track(track: Track, rules: FusionRules) -> TrackVerdict:
-    """Decide whether a track moves; see the module text for the rule."""
-    centers = track.world_from_object[:, :3, 3]
-    displacement = float(np.linalg.norm(centers - np.median(centers[: min(3, len(centers))], axis=0), axis=1).max())
-    path = _dead_banded_path(centers, rules.moving_distance_m / 2)
-    long_box = track.size_m[0] >= 1.3 * track.size_m[1]
-    yaws = np.array([yaw_of(pose) for pose in track.world_from_object])
-    turn = np.rad2deg(_largest_turn(yaws)) if long_box else 0.0
-    reasons = []
-    if displacement > rules.moving_distance_m:
-        reasons.append(f"centre moved {displacement:.2f} m away from its start")
-    if path > rules.moving_distance_m:
-        reasons.append(f"centre travelled {path:.2f} m")
-    if turn > MOVING_TURN_DEG:
-        reasons.append(f"heading turned {turn:.0f} degrees")
-    words = (
-        "; ".join(reasons) or f"static: displacement {displacement:.2f} m, path {path:.2f} m, turn {turn:.0f} degrees"
-    )
-    return TrackVerdict(bool(reasons), displacement, path, float(turn), words)
-
-
-def _dead_banded_path(centers: Matrix, band_m: float) -> float:
-    """Length of the path through the centres, counting only steps that leave a ball of ``band_m`` around the last
-    anchor."""
-    anchor, length = centers[0], 0.0
+    """A track moves if its centre gets far from where it started, or travels a path (with a dead band, so that jitter
+    of annotations does not count; going out and coming back does), or if a long box turns (modulo half turns, after a
+    median over three keys). Everything else, parked cars included, belongs to the static world."""
+    centers, limit = track.world_from_object[:, :3, 3], rules.moving_distance_m
+    displacement = float(np.linalg.norm(centers - np.median(centers[:3], axis=0), axis=1).max())
+    anchor, path = centers[0], 0.0
     for center in centers[1:]:
         step = float(np.linalg.norm(center - anchor))
-        if step > band_m:
-            anchor, length = center, length + step
-    return length
-
-
-def _largest_turn(yaws_rad: Matrix) -> float:
-    """Largest change of heading from the first, radians, modulo half turns and after a median over three keys."""
-    turns = (yaws_rad - yaws_rad[0] + np.pi / 2) % np.pi - np.pi / 2
-    if len(turns) >= 3:
-        turns = np.median(np.stack([turns[:-2], turns[1:-1], turns[2:]]), axis=0)
-    return float(np.abs(turns).max())
+        if step > limit / 2:
+            anchor, path = center, path + step
+    turn = 0.0
+    if track.size_m[0] >= 1.3 * track.size_m[1]:
+        yaws = np.array([yaw_of(pose) for pose in track.world_from_object])
+        turns = (yaws - yaws[0] + np.pi / 2) % np.pi - np.pi / 2
+        if len(turns) >= 3:
+            turns = np.median(np.stack([turns[:-2], turns[1:-1], turns[2:]]), axis=0)
+        turn = float(np.rad2deg(np.abs(turns).max()))
+    reasons = [f"centre moved {displacement:.2f} m away from its start"] * (displacement > limit)
+    reasons += [f"centre travelled {path:.2f} m"] * (path > limit)
+    reasons += [f"heading turned {turn:.0f} degrees"] * (turn > MOVING_TURN_DEG)
+    still = f"static: displacement {displacement:.2f} m, path {path:.2f} m, turn {turn:.0f} degrees"
+    return TrackVerdict(bool(reasons), "; ".join(reasons) or still)
 
 
 def points_in_box(
@@ -168,7 +132,8 @@ def points_in_box(
 def separate(
     sweep: SweepShots, dynamic: Sequence[Track], rules: FusionRules
 ) -> tuple[NDArray[np.int32], dict[int, NDArray[np.float32]]]:
-    """Assign each point of a sweep to a dynamic object or to the static world.
+    """Assign each point of a sweep to a dynamic object or to the static world: points inside a moving box, slightly
+    grown and only above a margin over its floor, so that the road stays road. In overlapping boxes the smaller wins.
 
     Returns:
         ``owner`` i32[N], index into ``dynamic`` or STATIC; and for each of them present the points it owns in its own
@@ -221,19 +186,6 @@ def _velocity_in_lidar(track: Track, sweep: SweepShots, step_s: float = 0.05) ->
 # --- colours --------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Colors:
-    """Colours of a sweep's points: ``seen`` bool[N]; ``rgb`` u8[N, 3], ``semantics`` u8[N] and ``depth_m`` f32[N] (to
-    the camera that gave the colour) where seen; ``hidden`` bool[N]: in an image, but behind a nearer surface in all of
-    them."""
-
-    seen: NDArray[np.bool_]
-    hidden: NDArray[np.bool_]
-    rgb: NDArray[np.uint8]
-    semantics: NDArray[np.uint8]
-    depth_m: NDArray[np.float32]
-
-
 def color_points(
     sweep: SweepShots,
     owner: NDArray[np.int32],
@@ -241,9 +193,17 @@ def color_points(
     dynamic: Sequence[Track],
     rules: FusionRules,
     cameras: CameraColors = SAME_COLORS,
-) -> Colors:
-    """Common colours (and semantics) of a sweep's points from the images beside it; see the module text for the
-    rules."""
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]]:
+    """Common colours (and semantics) of a sweep's points from the images beside it.
+
+    A point takes the pixel (nearest, no interpolation) of an image taken at about the sweep's time, the object's motion
+    between sweep and image taken into account. If several cameras see it, the one whose optical axis points closest to
+    it wins, and all vote for its class, weighted by the cosine to their axes.
+
+    Returns:
+        seen bool[N]; hidden bool[N]: in an image, but behind a nearer surface in all of them; and where seen rgb
+        u8[N, 3], semantics u8[N] and depth f32[N] to the camera that gave the colour.
+    """
     count = len(owner)
     best = np.full(count, -1.0, np.float32)
     rgb = np.zeros((count, 3), np.uint8)
@@ -267,7 +227,7 @@ def color_points(
         if shot.semantics is not None:
             votes.append((ids, shot.semantics[row, column], cosine))
     seen = best > 0
-    return Colors(seen, in_image & ~seen, rgb, _count_votes(votes, count), depth_m)
+    return seen, in_image & ~seen, rgb, _count_votes(votes, count), depth_m
 
 
 def points_in_image(
@@ -351,11 +311,9 @@ def standing_points(xyz: NDArray[np.floating], cell_m: float = 2.0, margin_m: fl
 def hidden_points(
     xyz_cam: NDArray[np.float32], stands: NDArray[np.bool_], view: View, gap_deg: float
 ) -> NDArray[np.bool_]:
-    """Which points ``[N, 3]`` (camera frame, inside the image) lie behind a clearly nearer standing point; bool[N].
-
-    What hides is what stands (``standing_points``). The ground hides nothing: seen at a grazing angle its rings overlap
-    each other.
-    """
+    """Which points ``[N, 3]`` (camera frame, inside the image) lie behind a clearly nearer standing point
+    (``standing_points``), each of which covers half the gap to the next beam; bool[N]. The ground hides nothing: seen
+    at a grazing angle its rings overlap each other."""
     camera, rule = view.camera, RULES["colour"]
     nearest, index = draw_points(
         [PointLayer(np.ascontiguousarray(xyz_cam[stands]), np.eye(4))], View(camera, np.eye(4), 0.0), DrawLimits()
@@ -387,11 +345,10 @@ def _count_votes(
     votes: list[tuple[NDArray[np.intp], NDArray[np.uint8], NDArray[np.float32]]], count: int
 ) -> NDArray[np.uint8]:
     """Winner of the weighted votes per point u8[count]; 255 where nobody voted for a class."""
-    if not votes:
-        return np.full(count, palette.UNLABELLED, np.uint8)
-    if len(votes) == 1:
+    if len(votes) < 2:
         winner = np.full(count, palette.UNLABELLED, np.uint8)
-        winner[votes[0][0]] = votes[0][1]
+        for ids, labels, _ in votes:
+            winner[ids] = labels
         return winner
     classes = len(palette.CLASSES)
     tally = np.zeros((count, classes), np.float32)
@@ -410,9 +367,8 @@ def largest_beam_gap(xyz_lidar: NDArray[np.floating]) -> float:
 
 def _apply(a_from_b: Matrix, xyz_b: NDArray[np.floating]) -> NDArray[np.float32]:
     """Rigid motion of points in float32; the matrix was composed in float64."""
-    return xyz_b.astype(np.float32, copy=False) @ a_from_b[:3, :3].T.astype(np.float32) + a_from_b[:3, 3].astype(
-        np.float32
-    )
+    matrix = a_from_b.astype(np.float32)
+    return xyz_b.astype(np.float32, copy=False) @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 # --- accumulation ---------------------------------------------------------------------------------
@@ -466,21 +422,14 @@ class CloudAccumulator:
     def cloud(self, frame: Literal["world", "object"], with_semantics: bool) -> PointCloud:
         """All kept points as one cloud; the accumulator is empty afterwards."""
         self._merge()
-        if not self._parts:
-            none = np.zeros((0, 3))
-            return PointCloud(
-                none.astype(np.float32), none.astype(np.uint8), frame, np.zeros(0, np.uint8) if with_semantics else None
-            )
-        xyz, rgb, semantics, _, _ = self._parts.pop()
+        nothing = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.uint8))
+        xyz, rgb, semantics = self._parts.pop()[:3] if self._parts else nothing
         return PointCloud(xyz, rgb, frame, semantics if with_semantics else None)
 
 
 def voxel_keys(xyz: NDArray[np.floating], voxel_m: float) -> NDArray[np.int64]:
-    """One integer per voxel of side ``voxel_m`` for points ``[N, 3]``; 21 bits per axis.
-
-    Raises:
-        InputError: a coordinate is more than a million voxels from the origin.
-    """
+    """One integer per voxel of side ``voxel_m`` for points ``[N, 3]``; 21 bits per axis. InputError: a coordinate is
+    more than a million voxels from the origin."""
     cells = np.floor(np.asarray(xyz, np.float64) / voxel_m).astype(np.int64)
     limit = 1 << 20
     if len(cells) and (np.abs(cells) >= limit).any():
@@ -535,10 +484,10 @@ def fuse_sweeps(
 
     Returns:
         The fused cloud (static: world frame; objects: box frame, by track id) and a report. ``semantics`` are None
-        when neither points nor images carried labels. A log without points gives an empty static cloud.
+        when neither points nor images carried labels. A log without points gives an empty static cloud. Moving objects
+        with too few coloured points are left out, and so are their points: they would smear the static world.
     """
-    report = FusionReport()
-    report.verdicts = {track.id: judge_track(track, rules) for track in tracks}
+    report = FusionReport(verdicts={track.id: judge_track(track, rules) for track in tracks})
     dynamic = [track for track in tracks if report.verdicts[track.id].moving]
     static = CloudAccumulator(rules.voxel_m)
     objects = [CloudAccumulator(rules.voxel_m) for _ in dynamic]
@@ -546,29 +495,23 @@ def fuse_sweeps(
     for sweep in sweeps:
         labelled |= sweep.points.classes is not None or any(shot.semantics is not None for shot in sweep.shots)
         owner, owned = separate(sweep, dynamic, rules)
-        colors = color_points(sweep, owner, owned, dynamic, rules, cameras)
-        semantics, given = colors.semantics, sweep.points.classes
+        seen, hidden, rgb, semantics, depth_m = color_points(sweep, owner, owned, dynamic, rules, cameras)
+        given = sweep.points.classes
         if given is not None:  # images vote for points that people gave no class
             semantics = np.where(given == palette.UNLABELLED, semantics, given)
-        keep = colors.seen & (owner == STATIC)
-        static.add(
-            _apply(sweep.world_from_lidar, sweep.points.xyz[keep]),
-            colors.rgb[keep],
-            semantics[keep],
-            colors.depth_m[keep],
-        )
+        keep = seen & (owner == STATIC)
+        world = _apply(sweep.world_from_lidar, sweep.points.xyz[keep])
+        static.add(world, rgb[keep], semantics[keep], depth_m[keep])
         for index, xyz_object in owned.items():
             ids = np.flatnonzero(owner == index)
-            seen = colors.seen[ids]
-            ids = ids[seen]
-            objects[index].add(xyz_object[seen], colors.rgb[ids], semantics[ids], colors.depth_m[ids])
+            shown = seen[ids]
+            ids = ids[shown]
+            objects[index].add(xyz_object[shown], rgb[ids], semantics[ids], depth_m[ids])
         report.sweeps += 1
         report.points_in += len(owner)
         report.points_moving_in += int((owner != STATIC).sum())
-        report.points_colored += int(colors.seen.sum())
-        report.points_hidden += int(colors.hidden.sum())
-    report.points_static_in = report.points_in - report.points_moving_in
-    report.points_unseen = report.points_in - report.points_colored - report.points_hidden
+        report.points_colored += int(seen.sum())
+        report.points_hidden += int(hidden.sum())
     static_cloud = static.cloud("world", labelled)
     report.points_static = len(static_cloud)
     clouds: dict[str, PointCloud] = {}

@@ -1,13 +1,5 @@
-"""Multi-resolution hash grids (Müller et al. 2022, "Instant neural graphics primitives"): learnt features of places in
-3 or 4 dimensions.
-
-A grid has levels of growing resolution. The features of a point are, level by level, those of the corners of its cell,
-blended linearly along every axis. A level that has room for all its corners stores them in order; a finer one shares
-its entries by a hash of the corner's integer coordinates.
-
-The native op runs on float32 tensors on the CPU; ``torch_encode`` is the specification and runs everywhere. Gradients
-reach the table and, where they are asked for, the points. They do not depend on the number of threads.
-"""
+"""Learnt features of places in 3 or 4 dimensions: hash grids, and planes of place and time. The native op runs on
+float32 tensors on the CPU, its twin in torch everywhere; gradients do not depend on the number of threads."""
 
 from __future__ import annotations
 
@@ -29,15 +21,10 @@ from mudg.base.types import check_shape
 from mudg.core.native_ops import address
 
 # hex planes ---------------------------------------------------------------------------------------
-# Six planes of several sizes (HexPlane, Cao and Johnson 2023; K-Planes, Fridovich-Keil et al. 2023): learnt features of
-# places and times.
-#
-# The planes lie along xy, xz, yz and xt, yt, zt. The features of a place and time at one size are the product of the
-# six bilinear values there; those of the sizes are joined. All numbers are one tensor: size by size, plane by plane,
-# ``[second axis, first axis, features]``.
-#
-# The native op runs on float32 tensors on the CPU; ``torch_look_up`` is the specification and runs everywhere.
-# Gradients reach the planes and, where they are asked for, the places. They do not depend on the number of threads.
+# HexPlane (Cao and Johnson 2023), K-Planes (Fridovich-Keil et al. 2023): planes along xy, xz, yz and xt, yt, zt, of
+# several sizes. The features of a place and time at one size are the product of the six bilinear values there; those of
+# the sizes are joined. All numbers are one tensor: size by size, plane by plane, ``[second axis, first axis,
+# features]``.
 
 
 PLANES: Final = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
@@ -86,13 +73,11 @@ def look_up(places: Tensor, numbers: Tensor, sizes: PlaneSizes) -> Tensor:
     """Features ``[N, features * levels]`` of places ``[N, 4]``, -1 to 1 along x, y, z, t.
 
     Places outside get the features of the nearest place on the border. Differentiable once, in planes and places.
+    InputError: shapes do not fit.
 
     Args:
         places: ``[N, 4]``.
         numbers: ``[sizes.numbers]``.
-
-    Raises:
-        InputError: shapes do not fit.
     """
     check_shape(places, "planes of place and time: places", (None, 4))
     check_shape(numbers, "planes of place and time: numbers", (sizes.numbers,))
@@ -163,6 +148,9 @@ class _Native(torch.autograd.Function):
 
 
 # hash grid ----------------------------------------------------------------------------------------
+# Müller et al. 2022, "Instant neural graphics primitives": the features of a point are, level by level, those of the
+# corners of its cell, blended linearly along every axis. A level that has room for all its corners stores them in
+# order; a finer one shares its entries by a hash of the corner's integer coordinates.
 
 
 _PRIMES = (1, 2654435761, 805459861, 3674653429)
@@ -171,7 +159,7 @@ _MASK32 = (1 << 32) - 1
 
 @dataclass(frozen=True)
 class HashGrid:
-    """The shape of a grid.
+    """The shape of a grid. UsageError: a value outside these ranges.
 
     Args:
         dimensions: 3 or 4.
@@ -179,9 +167,6 @@ class HashGrid:
         features: per level: 1, 2, 4 or 8.
         coarsest, finest: cells along an axis of the first and the last level; those between grow geometrically.
         log2_entries: a level has at most 2 to this power entries.
-
-    Raises:
-        UsageError: a value outside these ranges.
     """
 
     dimensions: int
@@ -200,14 +185,8 @@ class HashGrid:
             and 4 <= self.log2_entries <= 30
         )
         if not fits:
-            raise UsageError(
-                "hash grid: sizes out of range",
-                got=str(self),
-                expected=(
-                    "3 or 4 dimensions, 1..32 levels, 1, 2, 4 or 8 features, coarsest <= finest <= 65536, 2^4..2^30"
-                    " entries"
-                ),
-            )
+            expected = "3 or 4 dimensions, 1..32 levels, 1, 2, 4 or 8 features, coarsest <= finest <= 65536, 2^4..2^30"
+            raise UsageError("hash grid: sizes out of range", got=str(self), expected=f"{expected} entries")
 
     @cached_property
     def resolutions(self) -> tuple[int, ...]:
@@ -244,13 +223,11 @@ def encode(points: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
     """Features ``[N, levels * features]`` of points ``[N, D]`` in the unit cube.
 
     Points outside get the features of the nearest place on the border. Differentiable once, in table and points.
+    InputError: shapes do not fit the grid.
 
     Args:
         points: ``[N, D]`` in [0, 1].
         table: ``grid.table_shape``.
-
-    Raises:
-        InputError: shapes do not fit the grid.
     """
     check_shape(points, "hash grid: points", (None, grid.dimensions))
     check_shape(table, "hash grid: table", grid.table_shape)

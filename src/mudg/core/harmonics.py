@@ -1,14 +1,11 @@
-"""Real spherical harmonics of colours, in numpy: values at directions, and their exact rotation.
-
-The basis is that of Gaussian splatting (Kerbl et al. 2023): bands 0 to 3, in each band m = -l .. l, with the factor
-(-1)^m (Condon-Shortley). A colour is ``0.5 + basis @ coefficients``. ``core/raster/torch_twin.py`` has the same basis
-in torch.
-"""
+"""Quaternions in torch, and real spherical harmonics of colours, with their exact rotation: the basis of Gaussian
+splatting (Kerbl et al. 2023), bands 0 to 3, in each m = -l .. l with the factor (-1)^m (Condon-Shortley). A colour is
+``0.5 + basis @ coefficients``."""
 
 from __future__ import annotations
 
 import functools
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -74,49 +71,38 @@ def degree_of(coefficients: int) -> int:
     return {1: 0, 4: 1, 9: 2, 16: 3}[coefficients]
 
 
-def basis(directions: Array, degree: int) -> Array:
-    """Values f64[N, (degree + 1)^2] at unit directions [N, 3]."""
-    x, y, z = np.asarray(directions, np.float64).T
+def basis_rows(x: Any, y: Any, z: Any, degree: int) -> list[Any]:
+    """Values of the (degree + 1)^2 harmonics at unit directions, given by their coordinates: arrays or tensors."""
     cos2, sin2 = x * x - y * y, 2 * x * y
-    rows = [np.full_like(x, C0)]
+    rows = [C0 + 0 * x]
     if degree >= 1:
         rows += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
     if degree >= 2:
-        rows += [
-            0.5462742152960396 * sin2,
-            -1.0925484305920792 * y * z,
-            0.31539156525252005 * (3 * z * z - 1),
-            -1.0925484305920792 * x * z,
-            0.5462742152960396 * cos2,
-        ]
+        rows += [0.5462742152960396 * sin2, -1.0925484305920792 * y * z, 0.31539156525252005 * (3 * z * z - 1)]
+        rows += [-1.0925484305920792 * x * z, 0.5462742152960396 * cos2]
     if degree >= 3:
         cos3, sin3 = x * cos2 - y * sin2, x * sin2 + y * cos2
         c = 0.4570457994644658 * (1 - 5 * z * z)
-        rows += [
-            -0.5900435899266435 * sin3,
-            1.445305721320277 * z * sin2,
-            c * y,
-            0.3731763325901154 * z * (5 * z * z - 3),
-            c * x,
-            1.445305721320277 * z * cos2,
-            -0.5900435899266435 * cos3,
-        ]
-    return np.stack(rows, 1)
+        rows += [-0.5900435899266435 * sin3, 1.445305721320277 * z * sin2, c * y]
+        rows += [0.3731763325901154 * z * (5 * z * z - 3), c * x, 1.445305721320277 * z * cos2]
+        rows += [-0.5900435899266435 * cos3]
+    return rows
+
+
+def basis(directions: Array, degree: int) -> Array:
+    """Values f64[N, (degree + 1)^2] at unit directions [N, 3]."""
+    return np.stack(basis_rows(*np.asarray(directions, np.float64).T, degree), 1)
 
 
 def rotated(coefficients: NDArray[np.float32], rotation: Array) -> NDArray[np.float32]:
-    """Coefficients that look from ``rotation @ d`` as the given ones look from ``d``.
-
-    Args:
-        coefficients: f32[N, (degree + 1)^2, 3]. rotation: f64[3, 3].
-    """
+    """Coefficients that look from ``rotation @ d`` as the given ones look from ``d``. ``coefficients``: f32[N, (degree
+    + 1)^2, 3]. rotation: f64[3, 3]."""
     degree = degree_of(coefficients.shape[1])
     turned = np.array(coefficients, np.float32)
     for band in range(1, degree + 1):
         rows = slice(band**2, (band + 1) ** 2)
-        turned[:, rows] = np.einsum(
-            "ij,njc->nic", band_rotation(rotation, band), coefficients[:, rows].astype(np.float64)
-        )
+        mixed = band_rotation(rotation, band)
+        turned[:, rows] = np.einsum("ij,njc->nic", mixed, coefficients[:, rows].astype(np.float64))
     return turned
 
 
@@ -134,8 +120,7 @@ def band_rotation(rotation: Array, band: int) -> Array:
 
 @functools.cache
 def _probes(band: int) -> tuple[Array, Array]:
-    """Well-spread directions [M, 3] (a spiral from pole to pole) and the inverse of a band's values there, [2 band + 1,
-    M]."""
+    """Well-spread directions [M, 3] and the inverse of a band's values there, [2 band + 1, M]."""
     directions = spiral(24)
     return directions, np.asarray(np.linalg.pinv(basis(directions, band)[:, band**2 : (band + 1) ** 2]), np.float64)
 
@@ -148,13 +133,9 @@ def spiral(count: int) -> Array:
     return np.stack([radius * np.cos(longitude), radius * np.sin(longitude), z], 1)
 
 
-# harmonics ----------------------------------------------------------------------------------------
-# Spherical harmonics of colours in a turned frame.
-#
-# A colour is the sum of harmonics of the direction from the camera to a Gaussian. Where the harmonics belong to a frame
-# that is turned against the world, evaluating them with the direction turned into that frame is the same as evaluating
-# turned coefficients with the direction in the world: functions of one degree mix among themselves, by an orthogonal
-# matrix (``core/harmonics.py``). So every renderer draws them without knowing of frames.
+# colours whose harmonics belong to a frame that is turned against the world ---------------------------
+# Functions of one band mix among themselves, by an orthogonal matrix: turned coefficients are those of the world, and
+# renderers need not know of frames.
 
 
 def mixing(rotation: Tensor, degree: int) -> Tensor:

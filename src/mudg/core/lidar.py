@@ -1,9 +1,5 @@
-"""LiDAR points as sparse truth at any view: where they are at a moment, which a view shows, and which other images saw
-them.
-
-Points in the boxes of dynamic objects travel with their box; all others stand still. What hides a point is decided by
-``core/project.py``.
-"""
+"""What laser beams meet, and LiDAR points as sparse truth at any view. Points in the boxes of dynamic objects travel
+with their box; all others stand still."""
 
 from __future__ import annotations
 
@@ -23,7 +19,7 @@ from mudg.core.fusion import STATIC
 from mudg.core.project import RULES, DrawLimits, PointLayer, draw_points, hidden_pixels
 
 # beams --------------------------------------------------------------------------------------------
-# What laser beams meet: surfaces of points, boxes, the ground. All in the frame of the sensor, beams from its origin.
+# Surfaces of points, boxes, the ground, in the frame of the sensor, beams from its origin.
 
 
 Array = NDArray[np.float64]
@@ -84,11 +80,8 @@ def met_box(beams: Array, sensor_from_box: Array, size_m: ArrayLike) -> Array:
 
 
 def met_ground(beams: Array, world_from_sensor: Array, ground: HeightMap, from_m: Array, within_m: float) -> Array:
-    """Range f64[B] at which beams meet known ground, metres; infinite where they do not.
-
-    Args:
-        from_m: range f64[B] behind which the ground is looked for, ``within_m`` far.
-    """
+    """Range f64[B] at which beams meet known ground, metres; infinite where they do not. ``from_m``: range f64[B]
+    behind which the ground is looked for, ``within_m`` far."""
     if not len(beams):
         return np.zeros(0)
     steps = np.arange(0.0, within_m + GROUND_STEP_M, GROUND_STEP_M)
@@ -209,8 +202,8 @@ def carried(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShownFrame:
-    """A shown frame: dense depth f32[H, W] metres (infinite where unknown), and its photograph u8[H, W, 3], a little
-    blurred."""
+    """A shown frame: dense depth f32[H, W] metres (infinite where unknown), and its photograph u8[H, W, 3],
+    ``blurred``."""
 
     view: View
     depth: NDArray[np.float32]

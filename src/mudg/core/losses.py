@@ -1,15 +1,5 @@
-"""Every loss, as pure functions: of the scene fit (maps where they are maps, scalars where a sum is part of the idea)
-and of the diffusion model (scalars, below).
-
-All work in float32 and float64 and are differentiable in the prediction. Masks are boolean and never change the shape
-of the work. Published form: Street Gaussians (recorded views) and the supervision of MuDG's scene stage (virtual
-views).
-
-    recorded:  (1 - w) L1 + w (1 - SSIM)  +  trimmed LiDAR depth  +  sky  +  semantics
-    virtual:   perceptual + robust dense depth + semantics, every pixel weighted by the observation's confidence
-
-``core.native_ops`` holds native twins of some, ``core.perceptual`` the distance in a network's features.
-"""
+"""Every loss of fits and of the diffusion model: pure functions, float32 and float64, differentiable in the prediction.
+Masks are boolean and never change the shape of the work. ``core.native_ops`` holds native twins of some."""
 
 from __future__ import annotations
 
@@ -26,8 +16,7 @@ from torch.autograd.function import once_differentiable
 from mudg.base.palette import UNLABELLED
 from mudg.base.types import check_shape
 
-# perceptual ---------------------------------------------------------------------------------------
-# Distances of two images in the features of a network or a filter bank: losses of a fit, and rows of the scores.
+# perceptual: distances in the features of a network or a filter bank ----------------------------------
 
 
 LPIPS_EPSILON: Final = 1e-10
@@ -39,23 +28,13 @@ def unit_features(stages: Sequence[Tensor]) -> list[Tensor]:
 
     A place without any feature has no direction: it stays 0 and passes no gradient, where the root would pass NaN.
     """
-    return [_unit(features) for features in stages]
-
-
-def _unit(features: Tensor) -> Tensor:
-    squared = features.square().sum(0, keepdim=True)
-    there = squared > 0
-    length = torch.where(there, squared, 1.0).sqrt() + LPIPS_EPSILON
-    return torch.where(there, features / length, 0.0)
-
-
-def distance_places(features: Tensor, target: Tensor, channel_weights: Tensor | None = None) -> Tensor:
-    """Squared difference at every place of one stage ``[h, w]``: of features ``[C, h, w]``, brought to length 1, and
-    unit features."""
-    squared = (_unit(features) - target) ** 2
-    if channel_weights is not None:
-        squared = squared * channel_weights.view(-1, 1, 1)
-    return squared.sum(0)
+    units = []
+    for features in stages:
+        squared = features.square().sum(0, keepdim=True)
+        there = squared > 0
+        length = torch.where(there, squared, 1.0).sqrt() + LPIPS_EPSILON
+        units.append(torch.where(there, features / length, 0.0))
+    return units
 
 
 def lpips_distance(
@@ -70,6 +49,7 @@ def lpips_distance(
 
     Per stage: every place's feature vector is brought to length 1, the squared difference is summed over channels and
     averaged over places; the stages are averaged (without ``channel_weights``) or summed (with them, as LPIPS does).
+    InputError: the two have other shapes.
 
     Args:
         prediction: features of one image, per stage ``[C_l, h_l, w_l]``.
@@ -81,14 +61,14 @@ def lpips_distance(
 
     Returns:
         Scalar: 0 for equal images, NaN when nothing counts.
-
-    Raises:
-        InputError: the two have other shapes.
     """
     total = prediction[0].new_zeros(())
     for stage, (features, target) in enumerate(zip(prediction, target_units, strict=True)):
         check_shape(features, f"features of an image, stage {stage}", tuple(target.shape))
-        places = distance_places(features, target, None if channel_weights is None else channel_weights[stage])
+        squared = (unit_features([features])[0] - target) ** 2
+        if channel_weights is not None:
+            squared = squared * channel_weights[stage].view(-1, 1, 1)
+        places = squared.sum(0)
         if weight is None:
             total = total + places.mean()
             continue
@@ -128,21 +108,11 @@ def confident_mean(values: Tensor, weight: Tensor) -> Tensor:
 # ---- colour --------------------------------------------------------------------------------------
 
 
-def l1_map(prediction: Tensor, target: Tensor) -> Tensor:
-    """Absolute difference, same shape as the inputs."""
-    check_shape(target, "l1_map", tuple(prediction.shape))
-    return (prediction - target).abs()
-
-
-@functools.lru_cache(maxsize=8)
-def _window(channels: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+@functools.lru_cache(maxsize=8)  # nothing is sent to a device in every step
+def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
     offset = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
     weights = torch.exp(-(offset**2) / (2 * SSIM_SIGMA_PX**2))
-    weights = (weights / weights.sum()).to(device, dtype)
-    return (
-        weights.view(1, 1, 1, -1).expand(channels, 1, 1, SSIM_WINDOW).contiguous(),
-        weights.view(1, 1, -1, 1).expand(channels, 1, SSIM_WINDOW, 1).contiguous(),
-    )
+    return (weights / weights.sum()).to(device, dtype)
 
 
 def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
@@ -151,13 +121,11 @@ def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
     11x11 Gaussian window with sigma 1.5 px, zero padding, C1 = 0.01^2, C2 = 0.03^2, for values in [0, 1].
     """
     check_shape(target, "ssim_map", tuple(prediction.shape))
-    channels = prediction.shape[0]
-    row, column = _window(5 * channels, prediction.dtype, prediction.device)
+    channels, half = prediction.shape[0], SSIM_WINDOW // 2
+    window = _window(prediction.dtype, prediction.device).repeat(5 * channels, 1, 1, 1)
     stack = torch.cat([prediction, target, prediction**2, target**2, prediction * target])[None]
-    half = SSIM_WINDOW // 2
-    blurred = F.conv2d(
-        F.conv2d(stack, row, padding=(0, half), groups=5 * channels), column, padding=(half, 0), groups=5 * channels
-    )
+    across = F.conv2d(stack, window, padding=(0, half), groups=5 * channels)
+    blurred = F.conv2d(across, window.transpose(2, 3), padding=(half, 0), groups=5 * channels)
     mean_p, mean_t, square_p, square_t, product = blurred[0].split(channels)
     variance_p, variance_t = square_p - mean_p**2, square_t - mean_t**2
     covariance = product - mean_p * mean_t
@@ -171,12 +139,8 @@ def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, we
     With a weight ``[H, W]`` per pixel: the ``confident_mean`` of both maps. ``core.native_ops.photometric`` computes
     the same value and gradient in one native pass.
     """
-    if weight is not None:
-        both = (1 - ssim_weight) * l1_map(prediction, target) + ssim_weight * (1 - ssim_map(prediction, target))
-        return confident_mean(both, weight)
-    return (1 - ssim_weight) * l1_map(prediction, target).mean() + ssim_weight * (
-        1 - ssim_map(prediction, target).mean()
-    )
+    both = (1 - ssim_weight) * (prediction - target).abs() + ssim_weight * (1 - ssim_map(prediction, target))
+    return both.mean() if weight is None else confident_mean(both, weight)
 
 
 def outside_mask_copied(prediction: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
@@ -312,9 +276,8 @@ def class_loss(
         channel = torch.full((1,), lift[0], device=logits.device)
         logits = logits.index_add(0, channel, lift[1].detach()[None].to(logits.dtype))
     labelled = torch.where((target >= 0) & (target < len(logits)), target, UNLABELLED)
-    return (semantic_map(logits, labelled) * weight).sum() / (
-        total.to(weight.dtype) if isinstance(total, Tensor) else total
-    )
+    total = total.to(weight.dtype) if isinstance(total, Tensor) else total
+    return (semantic_map(logits, labelled) * weight).sum() / total
 
 
 def object_map(object_alpha: Tensor, inside_boxes: Tensor, floor: float = 1e-3) -> Tensor:

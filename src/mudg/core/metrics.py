@@ -1,10 +1,6 @@
-"""Image, depth and semantic metrics, each as a small accumulator over a whole trajectory.
-
-A metric says what it measures of one view (``source``, a pure function that threads may call), adds that to its sums,
-and its ``value()`` is read once at the end. Metrics with the same source share one measurement. What a method did not
-produce stays None ("not produced"); what needs weights that are not there is listed in ``METRICS`` with ``build=None``
-("not computed"). Nothing is ever reported as zero for want of data.
-"""
+"""Metrics of views as small accumulators over a trajectory. A metric says what it measures of one view (``source``, a
+pure function that threads may call), adds that, and its ``value()`` is read once at the end. What a method did not
+produce stays None, and nothing is ever reported as zero for want of data."""
 
 from __future__ import annotations
 
@@ -22,7 +18,7 @@ from mudg.base import geometry, palette
 from mudg.base.errors import InputError
 from mudg.base.palette import CLASSES
 from mudg.base.types import Track, View
-from mudg.core import native_ops
+from mudg.core import native_ops, street_scores
 from mudg.core.lidar import PointTruth
 from mudg.core.losses import ssim_map
 from mudg.core.street_scores import VisibleAgent
@@ -75,45 +71,25 @@ MOVABLE = tuple(palette.ID[n] for n in ("person", "rider", "car", "truck", "bus"
 
 def flicker(generated: Tensor, truth: Tensor, frames: Sequence[TrueFrame]) -> float:
     """Change of static surfaces from one frame to the next in `generated`, over that in `truth` (1 = as steady as the
-    truth).
-
-    Arguments as for `changes`. NaN for one frame or without such pixels.
-    """
-    pairs = changes(generated, truth, frames)
-    true_change = sum(t for _, t in pairs)
-    return sum(m for m, _ in pairs) / true_change if true_change > 0 else math.nan
-
-
-def changes(generated: Tensor, truth: Tensor, frames: Sequence[TrueFrame]) -> list[tuple[float, float]]:
-    """Summed absolute change of static surfaces between each frame and the next, in `generated` and in `truth`, both
-    f32[T,3,H,W].
+    truth), both f32[T,3,H,W].
 
     Every pixel of a class that cannot move is carried by its true depth into the next frame and compared with what is
-    there (bilinear), if the same surface is seen there (depths within 3 %).
+    there (bilinear), if the same surface is seen there (depths within 3 %). NaN for one frame or without such pixels.
     """
-    motions = map(pixel_motion, frames[:-1], frames[1:])
-    return [
-        (change(generated[t], generated[t + 1], where), change(truth[t], truth[t + 1], where))
-        for t, where in enumerate(motions)
-    ]
+    motions = list(map(pixel_motion, frames[:-1], frames[1:]))
+    made, true = (
+        sum(change(rgb[t], rgb[t + 1], where) for t, where in enumerate(motions)) for rgb in (generated, truth)
+    )
+    return made / true if true > 0 else math.nan
 
 
 @dataclass(frozen=True)
 class TrueFrame:
-    """Truth of one frame: depth f32[1,H,W] metres, ids i64[H,W], world_from_cam f64[4,4], intrinsics f64[4]: fx, fy,
-    cx, cy."""
+    """Truth of one frame: its view, depth f32[1,H,W] metres, and ids i64[H,W]."""
 
+    view: View
     depth: Tensor
     ids: Tensor
-    world_from_cam: Tensor
-    intrinsics: Tensor
-
-    @classmethod
-    def of(cls, view: View, depth: Tensor, ids: Tensor) -> TrueFrame:
-        """The frame of a view of this size, with true depth and classes."""
-        camera = view.camera
-        lens = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
-        return cls(depth, ids, torch.from_numpy(view.world_from_cam.copy()), lens)
 
 
 @dataclass(frozen=True)
@@ -152,26 +128,27 @@ def _motion_of_rows(
 ) -> PixelMotion:
     """``pixel_motion`` of some rows of the frame."""
     (height, width), rows_of = whole.ids.shape, slice(chosen.start, chosen.stop)
-    frame = replace(whole, depth=whole.depth[:, rows_of], ids=whole.ids[rows_of])
-    instance = None if instance is None else instance[rows_of]
+    z, ids = whole.depth[0, rows_of], whole.ids[rows_of]
     rows, columns = torch.meshgrid(
         torch.arange(chosen.start, chosen.stop) + 0.5, torch.arange(width) + 0.5, indexing="ij"
     )
-    static = ~torch.isin(frame.ids, torch.tensor(MOVABLE)) & (frame.depth[0] < 90.0)
-    z = frame.depth[0]
-    ray_x, ray_y = geometry.pinhole_ray(frame.intrinsics.float(), columns, rows)
+    near = z < 90.0
+    static = ~torch.isin(ids, torch.tensor(MOVABLE)) & near
+    ray_x, ray_y = geometry.pinhole_ray(whole.view.camera.intrinsics, columns, rows)
     points = torch.stack([ray_x * z, ray_y * z, z, torch.ones_like(z)])
-    pose = (torch.linalg.inv(following.world_from_cam) @ frame.world_from_cam).float()
-    carried = torch.einsum("ij,jhw->ihw", pose, points)
+    there_from_world, world_from_here = (
+        torch.from_numpy(pose.copy()) for pose in (following.view.cam_from_world, whole.view.world_from_cam)
+    )
+    carried = torch.einsum("ij,jhw->ihw", (there_from_world @ world_from_here).float(), points)
     if moved and instance is not None:
+        instance = instance[rows_of]
         for number in instance.unique().tolist():
             if number in moved:
                 own = instance == number
-                with_it = (torch.linalg.inv(following.world_from_cam) @ moved[number] @ frame.world_from_cam).float()
-                carried[:, own] = with_it @ points[:, own]
-                static = static | (own & (frame.depth[0] < 90.0))
+                carried[:, own] = (there_from_world @ moved[number] @ world_from_here).float() @ points[:, own]
+                static = static | (own & near)
     x, y, ahead, _ = carried
-    u, v = geometry.pinhole(following.intrinsics.float(), x, y, ahead)
+    u, v = geometry.pinhole(following.view.camera.intrinsics, x, y, ahead)
     there = torch.stack([u * (2 / width) - 1, v * (2 / height) - 1], -1)[None]
     within = (there.abs() < 1).all(-1)[0] & (ahead > 0.5)
     depth_there = _sample_at(following.depth, there, "nearest")[0]
@@ -205,11 +182,7 @@ of."""
 
 def pieces_of(values: Tensor, channels: int = 1) -> Iterator[Tensor]:
     """All values of a tensor, flat: whole for images of up to 2.5 million pixels, else in pieces. What is worked out in
-    double precision would fill the memory at large sizes.
-
-    Args:
-        channels: values per pixel.
-    """
+    double precision would fill the memory at large sizes. ``channels``: values per pixel."""
     if values.numel() <= PIECE_VALUES * channels:
         yield values.reshape(-1)
         return
@@ -231,20 +204,11 @@ def psnr(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float
     if mask is not None and not bool(mask.all()):
         chosen = mask.expand_as(truth)
         prediction, truth = prediction[chosen], truth[chosen]
-    if prediction.numel() == 0:
-        return math.nan
     pieces = zip(pieces_of(prediction, 3), pieces_of(truth, 3), strict=True)
-    error = sum(float(((made.clamp(0, 1) - true).double() ** 2).sum()) for made, true in pieces) / prediction.numel()
-    return math.inf if error == 0 else -10.0 * math.log10(error)
-
-
-def psnr_of_errors(errors: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB from differences, of any sign, of values in [0, 1]; infinity without any, NaN of
-    nothing."""
-    if errors.numel() == 0:
+    squared = sum(float(((made.clamp(0, 1) - true).double() ** 2).sum()) for made, true in pieces)
+    if truth.numel() == 0:
         return math.nan
-    error = sum(float(piece.double().square().sum()) for piece in pieces_of(errors)) / errors.numel()
-    return math.inf if error == 0 else -10.0 * math.log10(error)
+    return math.inf if squared == 0 else -10.0 * math.log10(squared / truth.numel())
 
 
 def ssim(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
@@ -272,13 +236,11 @@ class DepthErrors:
 
 
 def depth_errors(prediction_m: Tensor, truth_m: Tensor, mask: Tensor) -> DepthErrors:
-    """Compare depth maps (camera z, metres) where ``mask`` is set and the truth is positive and finite.
+    """Compare depth maps (camera z, metres) where ``mask`` is set and the truth is positive and finite. InputError: a
+    counted prediction is not finite.
 
     Args:
         prediction_m, truth_m: ``[1, H, W]``. mask: bool ``[1, H, W]``.
-
-    Raises:
-        InputError: a counted prediction is not finite.
     """
     counted = mask & torch.isfinite(truth_m) & (truth_m > 0)
     predicted_m, true_m = prediction_m[counted], truth_m[counted]
@@ -349,7 +311,7 @@ class Pair:
     mask: Tensor | None = None
     moving: Tensor | None = None
     view: View | None = None
-    facts: ViewFacts | None = None
+    facts: ViewFacts = ViewFacts()
 
 
 class Metric(Protocol):
@@ -467,11 +429,8 @@ class Segmentation:
 
 class ExactMotion:
     """Where surfaces of one view are in the next: by true depth and poses, vehicles by their boxes. The last answer is
-    kept: method after method is held against the same two views.
-
-    Args:
-        tracks: number in the instance map and track of every vehicle that is followed; others do not count.
-    """
+    kept: method after method is held against the same two views. ``tracks``: number in the instance map and track of
+    every vehicle that is followed; others do not count."""
 
     def __init__(self, tracks: Sequence[tuple[int, Track]] = ()) -> None:
         self._tracks = tracks
@@ -488,32 +447,29 @@ class ExactMotion:
 
     def true_change(self, before: Pair, pair: Pair) -> float | None:
         """Summed absolute change of these surfaces in the truth; None where it is not known."""
-        motion = self.between(before, pair)
-        if motion is None or before.truth_rgb is None or pair.truth_rgb is None:
+        motion, first, last = self.between(before, pair), before.truth_rgb, pair.truth_rgb
+        if motion is None or first is None or last is None:
             return None
         if self._true_change is None:
-            self._true_change = change(before.truth_rgb, pair.truth_rgb, motion)
+            self._true_change = change(first, last, motion)
         return self._true_change
 
     def _found(self, before: Pair, pair: Pair) -> PixelMotion | None:
-        frames, instance = [_true_frame(one) for one in (before, pair)], before.facts and before.facts.instance
-        if frames[0] is None or frames[1] is None or before.view is None or pair.view is None:
-            return None
+        frames = []
+        for one in (before, pair):
+            if one.view is None or one.truth_depth is None or one.truth_semantics is None:
+                return None
+            known = torch.isfinite(one.truth_depth) & (one.truth_depth > 0)
+            frames.append(TrueFrame(one.view, torch.where(known, one.truth_depth, 1000.0), one.truth_semantics))
+        instance = before.facts.instance
         if instance is None:
-            return pixel_motion(frames[0], frames[1])
+            return pixel_motion(*frames)
         moved: dict[int, Tensor] = {}
         for number, track in self._tracks:
-            first, last = track.pose_at(before.view.time_s), track.pose_at(pair.view.time_s)
+            first, last = (track.pose_at(frame.view.time_s) for frame in frames)
             if first is not None and last is not None:
                 moved[number] = torch.from_numpy(last @ geometry.invert(first))
-        return pixel_motion(frames[0], frames[1], moved, torch.from_numpy(instance.astype(np.int64)))
-
-
-def _true_frame(pair: Pair) -> TrueFrame | None:
-    view, depth, ids = pair.view, pair.truth_depth, pair.truth_semantics
-    if view is None or depth is None or ids is None:
-        return None
-    return TrueFrame.of(view, torch.where(torch.isfinite(depth) & (depth > 0), depth, 1000.0), ids)
+        return pixel_motion(*frames, moved, torch.from_numpy(instance.astype(np.int64)))
 
 
 def change_of(motion: ExactMotion, per: Callable[[Pair, Pair, PixelMotion], float | None]) -> Neighbours:
@@ -539,7 +495,7 @@ def flicker_over_truth(motion: ExactMotion | None = None) -> Neighbours:
 def neighbour_of(pair: Pair) -> Pair:
     """What is kept of a view until the next one comes, to follow surfaces from one to the other: made and true colours,
     true depth and classes, and the instances. The rest would fill the memory at large sizes."""
-    facts = None if pair.facts is None else ViewFacts(instance=pair.facts.instance)
+    facts = ViewFacts(instance=pair.facts.instance)
     return replace(pair, depth=None, semantics=None, truth_depth_valid=None, mask=None, moving=None, facts=facts)
 
 
@@ -556,6 +512,109 @@ def _confusion_of(pair: Pair) -> Tensor | None:
     if pair.semantics is None or pair.truth_semantics is None:
         return None
     return confusion(pair.semantics, pair.truth_semantics, pair.mask)
+
+
+# ---- LiDAR points, vehicles and markings ---------------------------------------------------------
+
+
+def decibels(source: Callable[[Pair], tuple[float, int] | None]) -> Pooled:
+    """PSNR, at most 100 dB, from squared errors pooled over all views: ``source`` gives their sum and number."""
+    return Pooled(source, finish=lambda mean: min(100.0, -10 * math.log10(max(mean, 1e-12))))
+
+
+def _squares(apart: Tensor) -> tuple[float, int]:
+    return float(apart.double().square().sum()), apart.numel()
+
+
+def _point_depths(pair: Pair) -> DepthErrors | None:
+    points = pair.facts.points
+    if points is None or pair.depth is None:
+        return None
+    true = torch.from_numpy(points.depth)[None]
+    return depth_errors(pair.depth, true, true > 0 if pair.mask is None else (true > 0) & pair.mask)
+
+
+def _point_colors(pair: Pair) -> tuple[float, int] | None:
+    points = pair.facts.points
+    if points is None or pair.rgb is None or not points.colored.any():
+        return None
+    chosen = torch.from_numpy((points.depth > 0) & points.colored)
+    chosen = chosen if pair.mask is None else chosen & pair.mask[0]
+    true = torch.from_numpy(points.color[chosen.numpy()].T).float() / 255
+    return _squares(pair.rgb[:, chosen].clamp(0, 1) - true)
+
+
+def _point_classes(pair: Pair) -> Tensor | None:
+    points = pair.facts.points
+    if points is None or pair.semantics is None:
+        return None
+    true = torch.from_numpy(np.where(points.depth > 0, points.classes, 255).astype(np.int64))
+    return confusion(pair.semantics, true, pair.mask)
+
+
+def _agents(pair: Pair) -> tuple[float, int] | None:
+    """Sum of ``street_scores.agent_ious`` and number of vehicles."""
+    agents = pair.facts.agents
+    if agents is None or pair.semantics is None:
+        return None
+    ious = street_scores.agent_ious(agents, pair.semantics.numpy())
+    return sum(ious), len(ious)
+
+
+def _markings(pair: Pair) -> tuple[float, float] | None:
+    """Tolerant hits and union, in pixels, of the markings that a fixed rule finds with the exact ones."""
+    lanes = pair.facts.lanes
+    if lanes is None or pair.rgb is None or not lanes.exact:
+        return None
+    return street_scores.tolerant_iou(street_scores.bright_stripes(pair.rgb.numpy(), lanes.road), lanes.marking)
+
+
+def _lane_edges(pair: Pair) -> float | None:
+    lanes = pair.facts.lanes
+    if lanes is None or pair.rgb is None or not lanes.band.any():
+        return None
+    rows = street_scores.rows_of(lanes.band, 1)
+    made, true = (
+        street_scores.edges_of(street_scores.gray_of(rgb[:, rows])) for rgb in (pair.rgb.numpy(), lanes.reference)
+    )
+    return street_scores.edge_correlation(made, true, lanes.band[rows])
+
+
+def _lane_colors(pair: Pair) -> tuple[float, int] | None:
+    lanes = pair.facts.lanes
+    if lanes is None or pair.rgb is None or not lanes.band.any():
+        return None
+    band = torch.from_numpy(lanes.band)
+    return _squares(pair.rgb[:, band].clamp(0, 1) - torch.from_numpy(lanes.reference)[:, band])
+
+
+# ---- neighbouring views --------------------------------------------------------------------------
+
+
+def temporal_flickering() -> Neighbours:
+    """(255 - mean |frame - next frame|) / 255 on 8 bits, mean over neighbouring frames: VBench's measure, meant for
+    videos that stand still. A moving camera lowers it, also that of the truth; a blurred video has a high one."""
+
+    def in_bytes(pair: Pair) -> Tensor | None:
+        return None if pair.rgb is None else torch.stack([(c.clamp(0, 1) * 255).round().byte() for c in pair.rgb])
+
+    def steadiness(frames: tuple[Tensor, Tensor]) -> tuple[float, int]:
+        before, frame = frames
+        if before.shape != frame.shape:
+            return 0.0, 0
+        total = sum(int((a.short() - b).abs().sum()) for a, b in zip(before, frame, strict=True))
+        return (255.0 - total / frame.numel()) / 255.0, 1
+
+    return Neighbours(in_bytes, steadiness)
+
+
+def warp_error(motion: ExactMotion) -> Neighbours:
+    """Mean absolute difference of colour, of 1, between a surface in one frame and the same surface in the next,
+    pooled; surfaces that are hidden in either frame do not count. motion: shared by the methods on a trajectory."""
+    return change_of(motion, lambda _before, _pair, where: int(where.same.sum()))
+
+
+# ---- the table -----------------------------------------------------------------------------------
 
 
 def _of_colors(compare: Callable[[Tensor, Tensor, Tensor | None], float]) -> Pooled:
@@ -598,11 +657,6 @@ METRICS: Final[dict[str, MetricRow]] = {
     "lpips_vgg": MetricRow("LPIPS (VGG)", "", ("rgb", "LPIPS weights"), "lower", None),
     "fid": MetricRow("FID", "", ("rgb", "Inception weights"), "lower", None),
     "kid": MetricRow("KID", "", ("rgb", "Inception weights"), "lower", None),
-    "fd_dinov2": MetricRow("FD-DINOv2", "", ("rgb", "DINOv2 weights"), "lower", None),
-    "cmmd": MetricRow("CMMD", "", ("rgb", "CLIP weights"), "lower", None),
-    "clip_f": MetricRow("CLIP-F", "", ("rgb", "CLIP weights"), "higher", None),
-    "clip_v": MetricRow("CLIP-V", "", ("rgb", "CLIP weights"), "higher", None),
-    "subject_consistency": MetricRow("consistency (DINOv2)", "", ("rgb", "DINOv2 weights"), "higher", None),
     "fvd": MetricRow("FVD", "", ("rgb", "I3D weights"), "lower", None),
     "abs_rel": MetricRow("AbsRel", "", ("depth",), "lower", lambda: depth_error("abs_rel")),
     "rmse_m": MetricRow("RMSE", "m", ("depth",), "lower", lambda: depth_error("rmse_m")),
@@ -623,6 +677,29 @@ METRICS: Final[dict[str, MetricRow]] = {
 }
 
 
+EVERY_VIEW: Final = ("flicker", "temporal_flickering", "warp_error")
+"""Metrics that want all views of a trajectory, in order."""
+FACTS: Final[Mapping[str, Callable[[], Metric]]] = {
+    "lidar_abs_rel": lambda: depth_error("abs_rel", _point_depths),
+    "lidar_rmse_m": lambda: depth_error("rmse_m", _point_depths),
+    "lidar_delta1": lambda: depth_error("delta1", _point_depths),
+    "lidar_psnr": lambda: decibels(_point_colors),
+    "agreement": lambda: Segmentation("miou", _point_classes),
+    "agent_iou": lambda: Pooled(_agents),
+    "lane_iou": lambda: Pooled(_markings),
+    "lane_correlation": lambda: frame_mean(_lane_edges),
+    "lane_psnr": lambda: decibels(_lane_colors),
+    "temporal_flickering": temporal_flickering,
+}
+"""Rows of ``METRICS`` that are computed from ``ViewFacts`` or from neighbouring views, for true images, too; the warp
+error needs a motion besides."""
+
+
+def build_facts(motion: ExactMotion) -> dict[str, Metric]:
+    """A fresh accumulator for every row of ``FACTS``, and for the warp error."""
+    return {**{name: build() for name, build in FACTS.items()}, "warp_error": warp_error(motion)}
+
+
 def build_all(
     distances: Mapping[str, Callable[[Pair], float | None]] | None = None,
     motion: ExactMotion | None = None,
@@ -633,7 +710,7 @@ def build_all(
     Args:
         distances: what computes a row that needs weights.
         motion: shared by several methods on one trajectory (see ``flicker_over_truth``).
-        more: further accumulators, such as those of ``core/view_metrics.py``.
+        more: further accumulators, such as ``build_facts``.
     """
     own = {name: row.build() for name, row in METRICS.items() if row.build is not None}
     compared = {name: frame_mean(of) for name, of in (distances or {}).items()}
@@ -642,11 +719,5 @@ def build_all(
 
 def results(metrics: Mapping[str, Metric]) -> dict[str, float | str]:
     """Values of all rows of ``METRICS``: a number, "not produced" (input absent) or "not computed" (weights absent)."""
-    table: dict[str, float | str] = {}
-    for name in METRICS:
-        if name not in metrics:
-            table[name] = "not computed"
-            continue
-        number = metrics[name].value()
-        table[name] = "not produced" if number is None else number
-    return table
+    values = {name: metrics[name].value() if name in metrics else "not computed" for name in METRICS}
+    return {name: "not produced" if value is None else value for name, value in values.items()}

@@ -1,10 +1,5 @@
-"""Training steps that touch much memory, done in one native pass: losses with their gradients, pictures over the sky,
-means over boxes of pixels, and Adam.
-
-Each has a plain-torch twin (``core.losses.photometric``, ``core.losses.class_loss``, ``torch_over``,
-``torch_box_mean``, ``core.table.torch_adam_columns``), which is used, and named once, where the native library is
-missing or the tensors are not float32 on the CPU.
-"""
+"""Training steps that touch much memory, done in one native pass. Each has a plain-torch twin, which is used, and named
+once, where the native library is missing or the tensors are not float32 on the CPU."""
 
 from __future__ import annotations
 
@@ -30,11 +25,8 @@ def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, we
     for every pixel the mean over all of them of weight times ``(1 - w) |p - t| + w (1 - SSIM)``.
 
     Differentiable in the prediction (once); target and weight are data. The value does not depend on the number of
-    threads. SSIM: 11x11 Gaussian window, sigma 1.5 px, zero padding.
-
-    Raises:
-        InputError: shapes differ or are not [C, H, W].
-        UsageError: the weight is outside [0, 1].
+    threads. SSIM: 11x11 Gaussian window, sigma 1.5 px, zero padding. InputError: shapes differ or are not [C, H, W].
+    UsageError: the weight is outside [0, 1].
     """
     check_shape(prediction, "photometric: prediction", (None, None, None))
     check_shape(target, "photometric: target", tuple(prediction.shape))
@@ -67,6 +59,7 @@ def class_loss(
     """Scalar: cross entropy of every pixel, times its weight, summed and divided by ``total``.
 
     Differentiable in the logits (once); everything else is data. The value does not depend on the number of threads.
+    InputError: sizes differ, or there is no channel.
 
     Args:
         logits: ``[C, H, W]``.
@@ -74,9 +67,6 @@ def class_loss(
         weight: ``[H, W]``.
         total: positive; a scalar tensor is read where the library computes, and stays on the device elsewhere.
         lift: a channel, and ``[H, W]`` to add to its logits.
-
-    Raises:
-        InputError: sizes differ, or there is no channel.
     """
     check_shape(logits, "class loss: logits", (None, None, None))
     planes = {"target": target, "weight": weight, "lift": weight if lift is None else lift[1]}
@@ -109,13 +99,10 @@ def over(rgb: Tensor, alpha: Tensor, coarse: Tensor) -> Tensor:
     """``rgb + (1 - alpha) * coarse``, with the coarse picture enlarged to the size of the other (bilinear between pixel
     centres).
 
-    Differentiable (once) in all three.
+    Differentiable (once) in all three. InputError: shapes do not fit.
 
     Args:
         rgb: ``[C, H, W]``. alpha: ``[1, H, W]``. coarse: ``[C, h, w]``.
-
-    Raises:
-        InputError: shapes do not fit.
     """
     check_shape(rgb, "over: rgb", (None, None, None))
     check_shape(coarse, "over: coarse", (len(rgb), None, None))
@@ -136,10 +123,7 @@ def box_mean(values: Tensor, size: int) -> Tensor:
     """Means over ``size`` x ``size`` pixels (odd), of the same shape ``[..., H, W]``; at the borders, over what is
     there.
 
-    Differentiable (once).
-
-    Raises:
-        UsageError: an even size.
+    Differentiable (once). UsageError: an even size.
     """
     if size < 1 or size % 2 == 0:
         raise UsageError("the side of a box of pixels must be odd", got=str(size))
@@ -160,56 +144,41 @@ def torch_box_mean(values: Tensor, size: int) -> Tensor:
 def adam_columns(columns: Sequence[AdamColumn], step: int, chosen: Tensor | None = None) -> None:
     """One Adam step in place on several columns with the same rows (the kernel of ``Table.adam_step``).
 
-    Betas 0.9 and 0.999, epsilon 1e-15, bias-corrected for ``step`` (from 1).
+    Betas 0.9 and 0.999, epsilon 1e-15, bias-corrected for ``step`` (from 1). InputError: shapes differ, or ``chosen``
+    is not bool[N]. UsageError: ``step`` below 1.
 
     Args:
         columns: any number, N rows each; contiguous for the native path.
         chosen: bool[N]: only these rows move, parameters and moments; None = all.
-
-    Raises:
-        InputError: shapes differ, or ``chosen`` is not bool[N].
-        UsageError: ``step`` below 1.
     """
     if step < 1:
         raise UsageError("Adam steps count from 1", got=str(step))
     if not columns:
         return
+    rows = len(columns[0].parameter)
     for one in columns:
-        _check_column(one, columns[0].parameter, chosen)
-    tensors = tuple(t for one in columns for t in (one.parameter, one.gradient, one.moment1, one.moment2))
+        shape = tuple(one.parameter.shape)
+        check_shape(one.parameter, "adam: parameter", (rows, *shape[1:]))
+        for name in ("gradient", "moment1", "moment2"):
+            check_shape(getattr(one, name), f"adam: {name}", shape)
+    if chosen is not None and (chosen.shape != (rows,) or chosen.dtype != torch.bool):
+        got = f"{chosen.dtype} {tuple(chosen.shape)}"
+        raise InputError("adam: the chosen rows do not fit", expected=f"bool [{rows}]", got=got)
     in_place = tuple(t for one in columns for t in (one.parameter, one.moment1, one.moment2))
-    library = _library_for(tensors)
+    library = _library_for((*in_place, *(one.gradient for one in columns)))
     if library is None or not all(t.is_contiguous() for t in in_place):
         with torch.no_grad():
             torch_adam_columns(columns, step, chosen)
         return
-    rows = columns[0].parameter.shape[0]
     gradients = [one.gradient.detach().contiguous() for one in columns]
-    table = (_Column * len(columns))(
-        *(
-            _Column(
-                one.parameter.data_ptr(),
-                gradient.data_ptr(),
-                one.moment1.data_ptr(),
-                one.moment2.data_ptr(),
-                one.parameter.numel() // rows if rows else 0,
-                one.rate,
-            )
-            for one, gradient in zip(columns, gradients, strict=True)
-        )
-    )
+    table = (_Column * len(columns))()
+    for entry, one, gradient in zip(table, columns, gradients, strict=True):
+        entry.parameter, entry.gradient = one.parameter.data_ptr(), gradient.data_ptr()
+        entry.moment1, entry.moment2 = one.moment1.data_ptr(), one.moment2.data_ptr()
+        entry.width, entry.rate = one.parameter.numel() // rows if rows else 0, one.rate
     mask = None if chosen is None else chosen.contiguous()
-    real, integer = ctypes.c_double, ctypes.c_int64
-    library.mudg_adam(
-        table,
-        ctypes.c_int(len(columns)),
-        integer(rows),
-        address(mask),
-        real(BETA1),
-        real(BETA2),
-        real(EPSILON),
-        integer(step),
-    )
+    count, numbers = ctypes.c_int(len(columns)), map(ctypes.c_double, (BETA1, BETA2, EPSILON))
+    library.mudg_adam(table, count, ctypes.c_int64(rows), address(mask), *numbers, ctypes.c_int64(step))
     # The library wrote behind autograd's back: tell it, so that a graph that still needs the old values is refused.
     torch.autograd.graph.increment_version(in_place)
 
@@ -223,17 +192,6 @@ class _Column(ctypes.Structure):
         ("rate", ctypes.c_double),
         ("step_size", ctypes.c_float),
     ]
-
-
-def _check_column(column: AdamColumn, first: Tensor, chosen: Tensor | None) -> None:
-    shape = tuple(column.parameter.shape)
-    check_shape(column.parameter, "adam: parameter", (*first.shape[:1], *shape[1:]))
-    for name in ("gradient", "moment1", "moment2"):
-        check_shape(getattr(column, name), f"adam: {name}", shape)
-    if chosen is not None:
-        check_shape(chosen, "adam: chosen rows", shape[:1])
-        if chosen.dtype != torch.bool:
-            raise InputError("adam: the chosen rows must be bool", got=str(chosen.dtype))
 
 
 class _WithGradient(torch.autograd.Function):

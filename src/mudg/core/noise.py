@@ -1,16 +1,9 @@
 """Noise schedule, the algebra between noise, data and velocity, and the samplers. Pure functions of tensors.
 
-Symbols, as in the diffusion literature:
-
     alpha_bar_t   share of signal power left at step t;  alpha_t = sqrt(alpha_bar_t),  sigma_t = sqrt(1 - alpha_bar_t)
     x_t           alpha_t x_0 + sigma_t eps
     v_t           alpha_t eps - sigma_t x_0             (Salimans and Ho, "Progressive distillation", appendix D)
     SNR_t         alpha_t^2 / sigma_t^2
-
-The schedule is the one of the published street-view model: betas linear in their square roots (0.00085 to 0.012, 1000
-steps), rescaled so that the last step carries no signal at all (Lin et al., "Common diffusion noise schedules and
-sample steps are flawed", algorithm 1), and an optional *dynamic rescale* that multiplies x_0 by a factor falling from 1
-to `base_scale` over the first 400 steps.
 
 A step index `t` runs from 0 (nearly clean) to `steps - 1` (pure noise).
 """
@@ -37,14 +30,16 @@ RESCALE_STEPS = 400
 
 @dataclass(frozen=True)
 class ScheduleConfig:
-    """What fixes a noise schedule."""
+    """What fixes a noise schedule: betas linear in their square roots; with ``zero_terminal_snr`` rescaled so that the
+    last step carries no signal at all (Lin et al., "Common diffusion noise schedules and sample steps are flawed",
+    algorithm 1)."""
 
     steps: int = 1000
     beta_start: float = 0.00085
     beta_end: float = 0.012
     zero_terminal_snr: bool = True
     base_scale: float | None = None
-    """Dynamic rescale: factor on x_0 from step 400 on; None switches it off."""
+    """Dynamic rescale: factor on x_0, which falls from 1 to this over the first 400 steps; None switches it off."""
 
 
 class Schedule:
@@ -191,11 +186,8 @@ def ddim(
                  alpha_bar[0], which the published sampler does
 
     With a dynamic rescale the estimate of x0 is multiplied by scale_previous / scale_t at each step, and the final
-    result keeps the factor of the last step visited, as the published sampler does.
-    Returns [B,...].
-
-    Raises:
-        UsageError: eta > 0 without `draw`.
+    result keeps the factor of the last step visited, as the published sampler does. Returns [B,...]. UsageError: eta >
+    0 without `draw`.
     """
     if eta > 0 and draw is None:
         raise UsageError("stochastic sampling needs a source of noise", where="noise.ddim", got=f"eta = {eta}")

@@ -1,14 +1,5 @@
-"""Pictures: every way in which images and label maps change size, and every colour map of the package.
-
-Images change size by one of four rules, because what was trained and stored with one must not be read with another:
-
-* ``resize_area``: Pillow's box filter; what fits, clips and labellers use on recorded images.
-* ``resize_bicubic``: Pillow's bicubic filter; what depth networks were trained with.
-* ``shrink_exact``: the exact mean over each new pixel's area in float32; what importers write into scenes.
-* ``resize_rgb``: torch, bilinear with antialiasing; how scores and pages bring views to one size.
-
-Depth, labels and masks take the nearest pixel (``resize_nearest``). Networks resize their own feature maps themselves.
-"""
+"""Pictures: every way in which images and label maps change size, and every colour map of the package. Sizes change by
+one of four rules, because what was trained and stored with one must not be read with another."""
 
 from __future__ import annotations
 
@@ -82,10 +73,7 @@ def resize_nearest(values: Map, height: int, width: int) -> Map:
 
 def shrink_exact(rgb: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
     """Image u8[H, W, 3] to u8[height, width, 3]: each new pixel is the mean over its exact area of the old image.
-
-    Raises:
-        InputError: larger than the image.
-    """
+    InputError: larger than the image."""
     tall, wide = rgb.shape[:2]
     if height > tall or width > wide:
         raise InputError("images are never enlarged", expected=f"at most {wide}x{tall}", got=f"{width}x{height}")
@@ -165,11 +153,8 @@ def panels_of(observation: Observation) -> list[NDArray[np.uint8]]:
 
 
 def side_by_side(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """Panels u8[H, W, 3] of one height in a row, with white between them.
-
-    Raises:
-        InputError: no panels, or panels of different heights.
-    """
+    """Panels u8[H, W, 3] of one height in a row, with white between them. InputError: no panels, or panels of different
+    heights."""
     if len({len(panel) for panel in panels}) != 1:
         raise InputError("panels must be of one size, at least one", got=str([panel.shape for panel in panels]))
     white = np.full((len(panels[0]), 2, 3), 255, np.uint8)

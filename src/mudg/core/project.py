@@ -1,12 +1,5 @@
-"""Points into views: z-buffered sparse colour, depth and validity.
-
-Used for LiDAR depth targets and for the diffusion model's condition. The pinhole model and the pixel grid are those of
-``base.geometry.project``; tests hold the two together.
-
-The published system paints objects over the background in a second pass; here both are composed by depth, so a car
-behind a wall stays behind it. A far point that shines through the gaps of a sparsely sampled near surface is removed by
-a second z-buffer in which every point is a square of ``occluder_m`` metres (``ProjectConfig.occluder_m``).
-"""
+"""Points into views: the z-buffer, which points a camera sees, and sparse colour and depth of clouds. The pinhole model
+and the pixel grid are those of ``base.geometry.project``."""
 
 from __future__ import annotations
 
@@ -27,8 +20,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import UNLABELLED
 from mudg.base.types import Camera, FusedCloud, PointCloud, Track, View, check_shape
 
-# zbuffer ------------------------------------------------------------------------------------------
-# The z-buffer of points: the nearest point of every pixel, native or, operation for operation the same, in numpy.
+# zbuffer: the nearest point of every pixel, native or, operation for operation the same, in numpy --------
 
 
 _EMPTY: Final = np.uint64(0xFFFFFFFFFFFFFFFF)
@@ -82,17 +74,10 @@ def draw_points(
             _draw_numpy(xyz, first, cam_from_points, camera, splat, (limits.near_m, limits.far_m), keys)
         else:
             intrinsics = np.array(camera.intrinsics, np.float32)
-            library.mudg_zbuffer_draw(
-                pointer(xyz),
-                ctypes.c_int64(len(xyz)),
-                ctypes.c_uint32(first),
-                pointer(cam_from_points),
-                pointer(intrinsics),
-                ctypes.c_int(camera.width),
-                ctypes.c_int(camera.height),
-                *map(ctypes.c_float, (*splat, limits.near_m, limits.far_m)),
-                pointer(keys),
-            )
+            points = (pointer(xyz), ctypes.c_int64(len(xyz)), ctypes.c_uint32(first), pointer(cam_from_points))
+            size = map(ctypes.c_int, (camera.width, camera.height))
+            numbers = map(ctypes.c_float, (*splat, limits.near_m, limits.far_m))
+            library.mudg_zbuffer_draw(*points, pointer(intrinsics), *size, *numbers, pointer(keys))
         first += len(xyz)
     if library is not None:
         depth, index = np.empty(keys.shape, np.float32), np.empty(keys.shape, np.int32)
@@ -151,21 +136,8 @@ def _draw_numpy(
 
 
 # visible ------------------------------------------------------------------------------------------
-# Which LiDAR points a camera sees: one z-buffer, one rule, and its settings for each use by name.
-#
 # A scanner stands elsewhere than the camera and sees past things that hide what lies behind them. A point is hidden if
-# something clearly nearer lies around it in the image:
-#
-#     depth > nearer * (1 + ratio) + slack_m
-#
-# ``nearer`` is the depth of what may hide it. Points are sparse, so it is looked for around the point as well, within
-# ``reach``:
-#
-# * ``sides="any"``: the nearest depth within reach. For surfaces that fill the space between their points.
-# * ``sides="opposite"``: nearer depths on two opposite sides, above and below or left and right; of the two the
-#   farther. A surface seen through a gap is hidden, what lies beside an edge is not.
-#
-# ``RULES`` holds the settings; the sizes are in pixels, or follow from the angle between the scanner's beams.
+# something clearly nearer lies around it in the image. Points are sparse, so that is looked for within a reach.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,7 +146,9 @@ class HidingRule:
 
     Args:
         ratio, slack_m: a point is hidden if farther than ``nearer * (1 + ratio) + slack_m``.
-        sides: "any" or "opposite"; see the module text.
+        sides: which depths within reach are ``nearer``. "any": the nearest, for surfaces that fill the space between
+            their points. "opposite": nearer ones on two opposite sides, above and below or left and right, the farther
+            of the two: a surface seen through a gap is hidden, what lies beside an edge is not.
         reach_px: (horizontal, vertical) distance within which nearer points are looked for; those of an image when the
             angle between beams is not given, and at least this far when it is.
         reach_beams: (horizontal degrees, vertical share of the angle between beams): reach that follows from the
@@ -231,14 +205,12 @@ def visible_depth(
     near_m: float = 0.5,
     far_m: float = 200.0,
 ) -> NDArray[np.float32]:
-    """The nearest point of every pixel, without the hidden ones; f32[H, W] metres, NaN = none.
+    """The nearest point of every pixel, without the hidden ones; f32[H, W] metres, NaN = none. InputError: points have
+    the wrong shape.
 
     Args:
         xyz_world: [N, 3] metres; points that are not finite are left out.
         gap_deg: largest angle between neighbouring beams, for rules whose reach follows from it.
-
-    Raises:
-        InputError: points have the wrong shape.
     """
     check_shape(xyz_world, "visible_depth: points", (None, 3))
     layer = PointLayer(np.ascontiguousarray(xyz_world, np.float32), np.eye(4))
@@ -291,6 +263,8 @@ def _minimum(values: NDArray[np.float32], size: int, axis: int, shift: int) -> N
 
 
 # project ------------------------------------------------------------------------------------------
+# The published system paints objects over the background in a second pass; here both are composed by depth, so a car
+# behind a wall stays behind it.
 
 
 _MAX_POINTS: Final = 2**31 - 1
@@ -309,15 +283,15 @@ class ProjectConfig:
     far_m: float = 200.0
     """Farthest depth drawn, metres."""
     occluder_m: float = 0.0
-    """Side of the square, metres, with which points hide what lies behind them; 0 switches the test off."""
+    """Side of the squares, metres, of a second z-buffer that hides what shines through the gaps of a sparsely sampled
+    near surface; 0 switches the test off."""
     occluder_max_px: float = 9.0
     """Upper limit of that square, pixels."""
 
     def __post_init__(self) -> None:
         if not 0 < self.near_m < self.far_m:
-            raise UsageError(
-                "depth limits are out of order", expected="0 < near_m < far_m", got=f"{self.near_m}, {self.far_m}"
-            )
+            what, got = "depth limits are out of order", f"{self.near_m}, {self.far_m}"
+            raise UsageError(what, expected="0 < near_m < far_m", got=got)
         for name in ("static_splat_px", "object_splat_px", "occluder_max_px"):
             if not 0 < getattr(self, name) <= 1000:
                 raise UsageError(f"{name} is out of range", expected="> 0 and <= 1000 px", got=str(getattr(self, name)))
@@ -401,40 +375,22 @@ def _draw(
         raise InputError("too many points for one view", expected=f"<= {_MAX_POINTS}", got=str(total))
     depth, index = draw_points(layers, view, DrawLimits(config.near_m, config.far_m))
     if config.occluder_m > 0:
-        nearest, _ = draw_points(
-            layers, view, DrawLimits(config.near_m, config.far_m, config.occluder_m, config.occluder_max_px)
-        )
+        limits = DrawLimits(config.near_m, config.far_m, config.occluder_m, config.occluder_max_px)
+        nearest, _ = draw_points(layers, view, limits)
         hidden = RULES["drawn"].hides(nearest, depth)
         depth[hidden], index[hidden] = 0.0, -1
-    color = np.zeros((3, camera.height, camera.width), np.float32)
-    first = 0
+    color, first, library = np.zeros((3, camera.height, camera.width), np.float32), 0, native.library()
     for rgb in colors or ():
-        _paint(index, rgb, first, color)
-        first += len(rgb)
-    return SparseView(
-        torch.from_numpy(color),
-        torch.from_numpy(depth)[None],
-        torch.from_numpy(index >= 0)[None],
-        torch.from_numpy(index),
-    )
-
-
-def _paint(index: NDArray[np.int32], rgb: NDArray[np.uint8], first: int, color: NDArray[np.float32]) -> None:
-    """Write the colours of points first .. first + len(rgb) into ``color`` f32[3, H, W] where they are seen."""
-    library = native.library()
-    if library is not None:
-        table = np.ascontiguousarray(rgb)
-        library.mudg_zbuffer_color(
-            pointer(index),
-            ctypes.c_int64(index.size),
-            pointer(table),
-            ctypes.c_int64(first),
-            ctypes.c_int64(len(table)),
-            pointer(color),
-        )
-        return
-    mine = (index >= first) & (index < first + len(rgb))
-    color[:, mine] = (rgb[index[mine] - first].astype(np.float32) / np.float32(255)).T
+        table, count = np.ascontiguousarray(rgb), ctypes.c_int64
+        if library is not None:
+            size, numbers = count(index.size), (count(first), count(len(table)))
+            library.mudg_zbuffer_color(pointer(index), size, pointer(table), *numbers, pointer(color))
+        else:
+            mine = (index >= first) & (index < first + len(table))
+            color[:, mine] = (table[index[mine] - first].astype(np.float32) / np.float32(255)).T
+        first += len(table)
+    found, shown = torch.from_numpy(index), torch.from_numpy(index >= 0)[None]
+    return SparseView(torch.from_numpy(color), torch.from_numpy(depth)[None], shown, found)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -452,11 +408,8 @@ class ProjectedPoints:
 def project_sparse(
     cloud: FusedCloud, tracks: Sequence[Track], view: View, config: ProjectConfig, *, hide: bool
 ) -> ProjectedPoints:
-    """Project a fused cloud into a view, its objects where they are at that time.
-
-    Args:
-        hide: leave points out that shine through gaps between nearer ones (`core.visible`, rule `condition`).
-    """
+    """Project a fused cloud into a view, its objects where they are at that time. ``hide``: leave points out that shine
+    through gaps between nearer ones (rule `condition`)."""
     poses = {track.id: track.pose_at(view.time_s) for track in tracks if track.id in cloud.objects}
     placed = {name: pose for name, pose in poses.items() if pose is not None}
     seen = project_cloud(cloud, placed, view, config)

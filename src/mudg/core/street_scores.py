@@ -1,10 +1,5 @@
-"""How well vehicles are where they should be: NTA-IoU from a detector's boxes, and agent IoU from class maps and exact
-truth.
-
-``NTA-IoU`` (DriveDreamer4D) asks a detector for boxes in the generated image and compares each with the nearest
-projected 3-D box, which ignores what hides it. ``agent IoU`` is this package's own measure: the class map of an image
-against what is really visible. A box in an image is f64[4]: left, top, right, bottom in pixels.
-"""
+"""How well vehicles and road markings are where they should be, by published scores and our own. A box in an image is
+f64[4]: left, top, right, bottom in pixels."""
 
 from __future__ import annotations
 
@@ -22,12 +17,9 @@ from mudg.base.types import Track, View
 from mudg.core.pictures import resize_nearest
 
 # lane scores --------------------------------------------------------------------------------------
-# How well road markings are where they should be: NTL-IoU from a detector's masks, and lane IoU and lane gradients from
-# the images.
-#
 # ``NTL-IoU`` (DriveDreamer4D) compares the mask of a lane detector with lane lines of a map drawn into the view;
-# nothing hides them. ``lane IoU`` is this package's own measure: a fixed rule finds bright stripes on the road, and
-# they are compared with the exact markings.
+# nothing hides them. ``lane IoU`` is this package's own: a fixed rule finds bright stripes on the road, and they are
+# compared with the exact markings.
 
 
 NTL_WIDTH_PX: Final = 640
@@ -60,12 +52,10 @@ def lane_truth(view: View, lines: Sequence[NDArray[np.float64]]) -> Mask:
     """Lane lines of a map as the published score draws them, bool[360, 640].
 
     Points of a line within 75 m and at most 10 m beside the camera are kept, lines are cut where points are not; what
-    is left is drawn 20 pixels thick at 1920 x 1280 and reduced bilinearly; every touched pixel counts.
-
-    Args:
-        lines: places f64[N, 3] in the world, metres, of each line.
+    is left is drawn 20 pixels thick at 1920 x 1280 and reduced bilinearly; every touched pixel counts. ``lines``:
+    places f64[N, 3] in the world, metres, of each line.
     """
-    width, height = NTL_DRAWN
+    (width, height), half = NTL_DRAWN, NTL_LINE_PX / 2
     large = view.resized(width, height)
     picture = Image.new("L", (width, height))
     draw = ImageDraw.Draw(picture)
@@ -77,23 +67,16 @@ def lane_truth(view: View, lines: Sequence[NDArray[np.float64]]) -> Mask:
             & (local[:, 2] > NTL_NEAREST_M)
         )
         for run in np.split(np.arange(len(local)), np.flatnonzero(np.diff(kept.astype(np.int8))) + 1):
-            if len(run) and kept[run[0]]:
-                uv = np.stack(geometry.pinhole(large.camera.intrinsics, *local[run].T), 1)
-                _draw_line(draw, uv, width, height)
+            if not len(run) or not kept[run[0]]:
+                continue
+            uv = np.stack(geometry.pinhole(large.camera.intrinsics, *local[run].T), 1)
+            for begin, end in zip(uv[:-1], uv[1:], strict=True):
+                cut = _cut(begin, end, np.full(2, -half), np.array([width, height]) + half)
+                if cut is not None:
+                    draw.line(cut, fill=255, width=NTL_LINE_PX)
+                    for x, y in cut:  # round ends
+                        draw.ellipse([x - half, y - half, x + half, y + half], fill=255)
     return _reduced(np.asarray(picture))
-
-
-def _draw_line(draw: ImageDraw.ImageDraw, uv: NDArray[np.float64], width: int, height: int) -> None:
-    """A polyline with round ends; parts far outside are left out."""
-    half = NTL_LINE_PX / 2
-    low, high = np.array([-half, -half]), np.array([width + half, height + half])
-    for begin, end in zip(uv[:-1], uv[1:], strict=True):
-        cut = _cut(begin, end, low, high)
-        if cut is None:
-            continue
-        draw.line([tuple(cut[0]), tuple(cut[1])], fill=255, width=NTL_LINE_PX)
-        for x, y in cut:
-            draw.ellipse([x - half, y - half, x + half, y + half], fill=255)
 
 
 def _cut(
@@ -196,9 +179,9 @@ def rows_of(mask: Mask, margin: int) -> slice:
     """Rows in which a mask has pixels, and ``margin`` more on both sides where the image has them; none for an empty
     mask."""
     rows = np.flatnonzero(mask.any(1))
-    return (
-        slice(max(0, int(rows[0]) - margin), min(len(mask), int(rows[-1]) + 1 + margin)) if len(rows) else slice(0, 0)
-    )
+    if not len(rows):
+        return slice(0, 0)
+    return slice(max(0, int(rows[0]) - margin), min(len(mask), int(rows[-1]) + 1 + margin))
 
 
 def _grown(mask: Mask, pixels: int) -> Mask:
@@ -262,6 +245,9 @@ def seen_from(
 
 
 # box scores ---------------------------------------------------------------------------------------
+# ``NTA-IoU`` (DriveDreamer4D) asks a detector for boxes in the generated image and compares each with the nearest
+# projected 3-D box, which ignores what hides it. ``agent IoU`` is this package's own: the class map of an image against
+# what is really visible.
 
 
 ImageBox = NDArray[np.float64]
@@ -290,38 +276,23 @@ def clipped_box(view: View, world_from_box: NDArray[np.float64], size_m: NDArray
     """Outline of what lies ahead of a view's near plane (0.3 m) of a 3-D box, not cut at the image's edges; None
     outside the image."""
     hull = geometry.box_hull(view, world_from_box, size_m)
-    if hull is None:
-        return None
-    return np.concatenate([hull.points.min(0), hull.points.max(0)])
+    return None if hull is None else np.concatenate([hull.points.min(0), hull.points.max(0)])
 
 
-def published_box(view: View, world_from_box: NDArray[np.float64], size_m: NDArray[np.float64]) -> ImageBox | None:
-    """The same as published scores compute it: all eight corners are divided by their depth, also those behind the
-    camera, so that a box beside the camera becomes one that means nothing. None if no corner lies ahead."""
-    corners = geometry.transform_points(view.cam_from_world @ world_from_box, geometry.box_corners(size_m))
-    if not (corners[:, 2] > 0).any():
-        return None
-    with np.errstate(divide="ignore", invalid="ignore"):
-        uv = np.stack(geometry.pinhole(view.camera.intrinsics, *corners.T), 1)
-    return np.concatenate([uv.min(0), uv.max(0)]) if np.isfinite(uv).all() else None
-
-
-def nta_truths(view: View, tracks: Sequence[Track], as_published: bool = False) -> list[tuple[Track, ImageBox]]:
+def nta_truths(view: View, tracks: Sequence[Track]) -> list[tuple[Track, ImageBox]]:
     """Boxes of the vehicles that a view shows, in whole pixels of an image of 480 x 320; only those that lie inside it
     whole.
 
     Args:
         tracks: candidates; those without a pose at the view's time or that are no vehicles are left out. Nothing is
             asked about what hides them.
-        as_published: boxes of corners behind the camera, too (``published_box``).
     """
-    box_of = published_box if as_published else clipped_box
     scale = np.array([NTA_WIDTH_PX / view.camera.width, NTA_HEIGHT_PX / view.camera.height] * 2)
     limit = np.array([NTA_WIDTH_PX, NTA_HEIGHT_PX])
     found = []
     for track in tracks:
         pose = track.pose_at(view.time_s) if track.label in VEHICLE_LABELS else None
-        box = None if pose is None else box_of(view, pose, track.size_m)
+        box = None if pose is None else clipped_box(view, pose, track.size_m)
         if box is None:
             continue
         whole = np.trunc(box * scale)
@@ -395,10 +366,8 @@ def agent_ious(agents: Sequence[VisibleAgent], classes: NDArray[np.integer]) -> 
     """For each vehicle the IoU of its visible box with that of the largest connected region of vehicle pixels near it;
     0 if there is none or its centre is off by more than 10 pixels in an image 480 pixels wide.
 
-    Near means: inside the outline of the true 3-D box, made 1.2 times as large.
-
-    Args:
-        classes: train ids ``[H, W]`` of the image that is judged.
+    Near means: inside the outline of the true 3-D box, made 1.2 times as large. ``classes``: train ids ``[H, W]`` of
+    the image that is judged.
     """
     vehicle = np.isin(classes, VEHICLE_IDS)
     height, width = vehicle.shape

@@ -1,9 +1,5 @@
-"""A row-aligned table of parameters: every column, its two Adam moments and every counter share one row order.
-
-Row operations (``take``, ``append``, ``permute`` as a take) move all of them together, so a moment can never belong to
-another row's parameter. Columns are *raw* (unactivated) leaf tensors; what they mean is the business of
-``gaussians/model.py``.
-"""
+"""A row-aligned table of parameters: columns (raw leaf tensors), their Adam moments and all counters share one row
+order, and row operations move them together."""
 
 from __future__ import annotations
 
@@ -160,9 +156,6 @@ class Table:
         groups: dict[str, dict[str, Tensor]] = {"column": {}, "moment1": {}, "moment2": {}, "label": {}}
         for key, value in flat.items():
             group, _, name = key.partition(".")
-            if group == "partial":
-                what = "this scene's objects change colour over time, which is not supported any more"
-                raise InputError(what, where=key, remedy="fit it again, or render it with the version that fitted it")
             if group not in groups or not name:
                 raise InputError("not a tensor of a parameter table", where=key)
             groups[group][name] = value

@@ -1,22 +1,20 @@
-"""Camera paths: the recorded one, the same drive shifted sideways or raised, and drives that leave it bit by bit.
+"""Camera paths: the recorded one, the same drive shifted sideways or raised, drives that leave it bit by bit, and what
+rolling shutters make of them.
 
-Which left is used
-------------------
-``shifted`` moves the whole vehicle sideways along **the ego's own left axis at that moment, made horizontal**: the y
-axis of ``world_from_ego(time)`` with its vertical part removed, normalised. That is the direction left of travel for a
-car driving forwards. It is not the x axis of the camera (a side camera's x axis points along the road) and not a finite
-difference of positions (which has no direction while the car stands, and turns round when it reverses: here, left stays
-the vehicle's left). Where the vehicle's heading and the tangent of its path differ (sideslip, a pose origin far from
-the rear axle in a tight turn), the heading wins.
+Left is the y axis of ``world_from_ego`` at that moment, made horizontal: left of travel for a car driving forwards, and
+the vehicle's left also while it stands or reverses.
 """
 
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
@@ -32,11 +30,8 @@ def trajectory_name(camera: str, shift_m: float | None = None) -> str:
 
 
 def ego_left_world(world_from_ego: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Horizontal unit vector to the left of the vehicle, ``f64[3]`` in world axes.
-
-    Raises:
-        InputError: when the vehicle lies on its side, so that its left axis is vertical.
-    """
+    """Horizontal unit vector to the left of the vehicle, ``f64[3]`` in world axes. InputError: when the vehicle lies on
+    its side, so that its left axis is vertical."""
     left = world_from_ego[:3, 1].copy()
     left[2] = 0.0
     length = float(np.linalg.norm(left))
@@ -48,29 +43,23 @@ def ego_left_world(world_from_ego: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def recorded(scene: Scene, camera: str) -> Trajectory:
-    """The recorded views of one camera in time order.
-
-    Raises:
-        UsageError: unknown camera name, or a camera without frames.
-    """
+    """The recorded views of one camera in time order. UsageError: unknown camera name, or a camera without frames."""
     views = sorted((frame.view for frame in _frames(scene, camera)), key=lambda view: view.time_s)
     return Trajectory(trajectory_name(camera), tuple(views), "recorded")
 
 
 def shifted(scene: Scene, camera: str, shift_m: float) -> Trajectory:
-    """The drive of one camera with the vehicle moved sideways; camera orientation kept.
+    """The drive of one camera with the vehicle moved sideways; camera orientation kept. UsageError: unknown camera or a
+    number that is not finite. InputError: no ego pose at a frame's time.
 
     Args:
         scene: the log; its ego path gives the left direction at each frame's time.
         camera: camera name, any mounting direction.
-        shift_m: signed distance, positive to the left of the direction of travel (see the module's docstring).
+        shift_m: signed distance, positive to the left of the direction of travel.
 
     Returns:
         Trajectory of origin "shifted" with one view per recorded frame. Each camera centre moves by exactly
         ``shift_m``.
-
-    Raises:
-        UsageError: unknown camera or a number that is not finite. InputError: no ego pose at a frame's time.
     """
     if not np.isfinite(shift_m):
         raise UsageError("shift_m must be a finite number", got=str(shift_m))
@@ -93,22 +82,19 @@ def named(scene: Scene, camera: str, name: str) -> Trajectory:
 
     ``up+1``: the drive raised by 1 m. ``lane+0.1``: a lane change, with every frame 0.1 m further to the left of where
     the recorded vehicle is, along the left axis of the first frame. ``speed+0.1``: a faster drive, with every frame 0.1
-    m further ahead, along the forward axis of the first frame. A minus means down, right, slower.
+    m further ahead, along the forward axis of the first frame. A minus means down, right, slower. UsageError: a
+    malformed name, or an unknown camera. InputError: no ego pose at the first frame's time.
 
     Args:
         scene: the log. camera: camera name. name: kind, sign and metres.
 
     Returns:
         Trajectory ``<camera>_<name>`` with one view per recorded frame, at its time and with its orientation.
-
-    Raises:
-        UsageError: a malformed name, or an unknown camera. InputError: no ego pose at the first frame's time.
     """
     found = _NAMED.fullmatch(name)
     if found is None:
-        raise UsageError(
-            "malformed name of a path", expected="up+1, lane+0.1 or speed-0.1 (kind, sign, metres)", got=name
-        )
+        expected = "up+1, lane+0.1 or speed-0.1 (kind, sign, metres)"
+        raise UsageError("malformed name of a path", expected=expected, got=name)
     views = recorded(scene, camera).views
     left = ego_left_world(_ego_pose(scene.ego, views[0]))
     direction = {"up": WORLD_UP, "lane": left, "speed": np.cross(left, WORLD_UP)}[found["kind"]]
@@ -135,10 +121,8 @@ def readout_poses(path: EgoPath, view: View) -> NDArray[np.float64]:
     """Poses of a rolling shutter: world_from_cam f64[2, 4, 4] when the first and when the last row (or column) is read.
 
     The middle one is read at the view's time; ``camera.readout_s`` lies between first and last. The camera moves as the
-    vehicle does; before the first and after the last recorded pose the motion next to it goes on.
-
-    Raises:
-        InputError: the view's time is more than 0.2 s outside the vehicle's path.
+    vehicle does; before the first and after the last recorded pose the motion next to it goes on. InputError: the
+    view's time is more than 0.2 s outside the vehicle's path.
     """
     _ego_pose(path, view)
     times, poses = path.times_s, path.world_from_ego
@@ -153,6 +137,86 @@ def readout_poses(path: EgoPath, view: View) -> NDArray[np.float64]:
     ego_from_cam = geometry.invert(ego(view.time_s)) @ view.world_from_cam
     half = view.camera.readout_s / 2
     return np.stack([ego(view.time_s - half) @ ego_from_cam, ego(view.time_s + half) @ ego_from_cam])
+
+
+# rolling shutters, followed in one pass ---------------------------------------------------------------
+# Rows (or columns) of an image are read one after the other, while the camera and objects move. In the frame of the
+# camera at the middle of the read-out this displaces a point by the share of the read-out that has passed by its row,
+# times its motion against the camera over the whole read-out. So an image needs no strips, and any backend draws it.
+
+
+ROUNDS = 3
+"""Times that the row of a point is found again where the last round put it."""
+NEAREST_M = 0.2
+"""Nearer points, and those behind the camera, stay where they are."""
+
+
+@dataclass(frozen=True, eq=False)
+class Readout:
+    """How a view's image was read: ``world_from_cam`` f64[2, 4, 4] at the first and at the last row (or column),
+    ``begin_s`` and ``end_s`` then."""
+
+    world_from_cam: NDArray[np.float64]
+    begin_s: float
+    end_s: float
+
+    def motion(
+        self, view: View, first: NDArray[np.float64] | None = None, last: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """f64[3, 4]: takes a point (x, y, z, 1) of the world to its motion against the camera over the read-out,
+        metres, seen by the camera of ``view``. ``first``, ``last``: f64[4, 4], where points are then that belong to an
+        object, from where they are at the view's time; None: they stand still."""
+        ends = (np.eye(4) if first is None else first), (np.eye(4) if last is None else last)
+        seen = [view.world_from_cam @ geometry.invert(pose) @ end for pose, end in zip(self.world_from_cam, ends)]
+        return (seen[1] - seen[0])[:3]
+
+
+def readout_of(scene: Scene, view: View) -> Readout | None:
+    """How a recorded view was read; None for a global shutter, and where the direction of the shutter is unknown."""
+    camera = view.camera
+    if camera.readout_s <= 0 or camera.shutter == "global":
+        return None
+    half = camera.readout_s / 2
+    return Readout(readout_poses(scene.ego, view), view.time_s - half, view.time_s + half)
+
+
+def moved_by(points: Tensor, motion: Tensor) -> Tensor:
+    """Motion ``[N, 3]`` of points ``[N, 3]`` by a matrix of ``Readout.motion`` ``[3, 4]``."""
+    return torch.addmm(motion[:, 3], points, motion[:, :3].T)
+
+
+def as_read(points: Tensor, motions: Tensor, view: View) -> Tensor:
+    """World points ``[N, 3]`` moved to where the camera of ``view``, standing still, sees them as its shutter did;
+    ``motions`` ``[N, 3]`` over the read-out. Differentiable in both; the row on which a point lies counts as fixed."""
+    with torch.no_grad():
+        share = torch.zeros_like(points[:, 0])
+        for _ in range(ROUNDS):
+            share = _share(points + share[:, None] * motions, view)
+    return points + share[:, None] * motions
+
+
+def points_as_read(scene: Scene, view: View, xyz_world: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Points f32[N, 3] that stand still, moved to where the recorded view shows them; as they are for a global
+    shutter. NaN stays NaN."""
+    readout = readout_of(scene, view)
+    if readout is None:
+        return xyz_world
+    points, motion = torch.from_numpy(xyz_world), torch.from_numpy(readout.motion(view)).to(torch.float32)
+    return as_read(points, moved_by(points, motion), view).numpy()
+
+
+def _share(points: Tensor, view: View) -> Tensor:
+    """Share of the read-out that has passed when the row or column of a point is read, from the middle: -0.5 to 0.5,
+    ``[N]``."""
+    camera, pose = view.camera, torch.from_numpy(view.cam_from_world.copy()).to(points)
+    axis, focal, center, length = 1, camera.fy, camera.cy, camera.height
+    if camera.shutter in ("left_to_right", "right_to_left"):
+        axis, focal, center, length = 0, camera.fx, camera.cx, camera.width
+    z = points @ pose[2, :3] + pose[2, 3]
+    side = points @ pose[axis, :3] + pose[axis, 3]
+    share = ((focal * side / z.clamp_min(NEAREST_M) + center) / length - 0.5).clamp(-0.5, 0.5)
+    share = torch.where(z > NEAREST_M, share, 0.0)
+    return -share if camera.shutter in ("bottom_to_top", "right_to_left") else share
 
 
 def _frames(scene: Scene, camera: str) -> tuple:

@@ -65,32 +65,22 @@ def write_whole(folder: Path, records: Sequence[Mapping[str, Any]]) -> None:
     """``annotations/instances.json`` and ``annotations/panoptic.json``; ``instances_train.json`` and so on of several
     splits."""
     splits = list(dict.fromkeys(record["split"] for record in records))
-    for split in splits:
-        own = [record for record in records if record["split"] == split]
-        _write_split(folder / "annotations", own, f"_{split}" if len(splits) > 1 else "")
-
-
-def _write_split(folder: Path, records: Sequence[Mapping[str, Any]], ending: str) -> None:
-    things = set(DYNAMIC_IDS)
     categories = [
-        {"id": index + 1, "name": name, "isthing": int(index in things), "color": DISPLAY_COLORS[index].tolist()}
+        {"id": index + 1, "name": name, "isthing": int(index in DYNAMIC_IDS), "color": DISPLAY_COLORS[index].tolist()}
         for index, name in enumerate(CLASSES)
     ]
     info = {"description": "rendered by mudg", "version": version()}
-    images = [record["entry"] for record in records]
-    each = ({**one, "image_id": record["entry"]["id"]} for record in records for one in record["annotations"])
-    annotations = [{**one, "id": number + 1} for number, one in enumerate(each)]
-    whole = {"info": info, "licenses": [], "images": images, "categories": categories}
-    store.write_json(folder / f"instances{ending}.json", {**whole, "annotations": annotations})
-    panoptic = [
-        {
-            "image_id": record["entry"]["id"],
-            "file_name": record["entry"]["file_name"],
-            "segments_info": record["segments"],
-        }
-        for record in records
-    ]
-    store.write_json(folder / f"panoptic{ending}.json", {**whole, "annotations": panoptic})
+    for split in splits:
+        own = [record for record in records if record["split"] == split]
+        images = [record["entry"] for record in own]
+        whole = {"info": info, "licenses": [], "images": images, "categories": categories}
+        each = ({**one, "image_id": record["entry"]["id"]} for record in own for one in record["annotations"])
+        instances = [{**one, "id": number + 1} for number, one in enumerate(each)]
+        names = ({"image_id": image["id"], "file_name": image["file_name"]} for image in images)
+        panoptic = [{**name, "segments_info": one["segments"]} for name, one in zip(names, own, strict=True)]
+        ending = f"_{split}.json" if len(splits) > 1 else ".json"
+        store.write_json(folder / "annotations" / f"instances{ending}", {**whole, "annotations": instances})
+        store.write_json(folder / "annotations" / f"panoptic{ending}", {**whole, "annotations": panoptic})
 
 
 def class_of(box: ObjectBox, seen: NDArray[np.uint8]) -> int:

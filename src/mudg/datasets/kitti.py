@@ -17,24 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mudg.base import geometry, store
-from mudg.datasets.samples import DatasetPlace, LabelledView, ObjectBox, ViewSweep, clipped
+from mudg.datasets.samples import DatasetPlace, LabelledView, ObjectBox, clipped
 
-FILES: Final = (
-    "image_2/*.png",
-    "velodyne/*.bin",
-    "calib/*.txt",
-    "label_2/*.txt",
-    "ImageSets/*.txt",
-    "provenance.jsonl",
-)
-TRACKING_FILES: Final = (
-    "image_02/*/*.png",
-    "velodyne/*/*.bin",
-    "calib/*.txt",
-    "label_02/*.txt",
-    "oxts/*.txt",
-    "ImageSets/*.txt",
-    "provenance.jsonl",
+FILES: Final = tuple("image_2/*.png velodyne/*.bin calib/*.txt label_2/*.txt ImageSets/*.txt provenance.jsonl".split())
+TRACKING_FILES: Final = tuple(
+    "image_02/*/*.png velodyne/*/*.bin calib/*.txt label_02/*.txt oxts/*.txt ImageSets/*.txt provenance.jsonl".split()
 )
 TYPES: Final = {
     **dict.fromkeys(("car", "vehicle"), "Car"),
@@ -59,9 +46,7 @@ Matrix = NDArray[np.float64]
 def write_view(folder: Path, target: DatasetPlace, view: LabelledView) -> dict[str, Any]:
     """The files of a frame of the object benchmark."""
     name = f"{target.number:06d}"
-    store.write_image(folder / "image_2" / f"{name}.png", view.layers["rgb"])
-    _write_scan(folder / "velodyne" / f"{name}.bin", view.sweep)
-    cam_from_velo, velo_from_imu = frames_of(view)
+    cam_from_velo, velo_from_imu = _write_sensors(folder, "image_2", name, view)
     named = {"R0_rect": np.eye(3), "Tr_velo_to_cam": cam_from_velo[:3], "Tr_imu_to_velo": velo_from_imu[:3]}
     store.write_text(folder / "calib" / f"{name}.txt", calibration(view, named))
     lines = [label_line(box, view, f"{box.truncation:.2f}") for box in view.boxes]
@@ -78,10 +63,8 @@ def write_whole(folder: Path, records: Sequence[Mapping[str, Any]]) -> None:
 
 def write_tracked(folder: Path, target: DatasetPlace, view: LabelledView) -> dict[str, Any]:
     """The files of a frame of the tracking benchmark; every path is a sequence."""
-    sequence, name = f"{target.sequence:04d}", f"{target.frame:06d}"
-    store.write_image(folder / "image_02" / sequence / f"{name}.png", view.layers["rgb"])
-    _write_scan(folder / "velodyne" / sequence / f"{name}.bin", view.sweep)
-    cam_from_velo, velo_from_imu = frames_of(view)
+    sequence = f"{target.sequence:04d}"
+    cam_from_velo, velo_from_imu = _write_sensors(folder, "image_02", f"{sequence}/{target.frame:06d}", view)
     named = {"R_rect": np.eye(3), "Tr_velo_cam": cam_from_velo[:3], "Tr_imu_velo": velo_from_imu[:3]}
     lines = [
         f"{target.frame} {box.number} " + label_line(box, view, str(sum(box.truncation >= share for share in LEVELS)))
@@ -106,16 +89,14 @@ def _text(lines: Any) -> str:
     return "".join(f"{line}\n" for line in lines)
 
 
-def _write_scan(file: Path, sweep: ViewSweep | None) -> None:
-    """x, y, z in metres and the intensity of every return, float32."""
+def _write_sensors(folder: Path, images: str, name: str, view: LabelledView) -> tuple[Matrix, Matrix]:
+    """Write the image, and x, y, z in metres and the intensity of every return, float32; returns camera-from-velodyne
+    and velodyne-from-IMU f64[4, 4]."""
+    store.write_image(folder / images / f"{name}.png", view.layers["rgb"])
+    mount, sweep = view.mount, view.sweep
     if sweep is not None:
         rows = np.column_stack([sweep.reply.xyz, sweep.reply.intensity]).astype("<f4")
-        store.write_blocks(file, [rows.tobytes()])
-
-
-def frames_of(view: LabelledView) -> tuple[Matrix, Matrix]:
-    """Camera-from-velodyne and velodyne-from-IMU f64[4, 4]."""
-    mount, sweep = view.mount, view.sweep
+        store.write_blocks(folder / "velodyne" / f"{name}.bin", [rows.tobytes()])
     if mount is None:
         return VELO_TO_CAM, np.eye(4)
     cam_from_velo = VELO_TO_CAM if sweep is None else geometry.invert(mount) @ sweep.vehicle_from_lidar

@@ -67,11 +67,8 @@ class ObjectBox:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewSweep:
-    """What a LiDAR on the vehicle measures at the moment of a view, all beams at once.
-
-    Args:
-        reply: the returns, in the sensor's frame. vehicle_from_lidar, world_from_lidar: f64[4, 4]. name: of the sensor.
-    """
+    """What a LiDAR on the vehicle measures at the moment of a view, all beams at once: returns in the sensor's frame,
+    vehicle-from-lidar and world-from-lidar f64[4, 4], and its name."""
 
     reply: LidarReply
     vehicle_from_lidar: NDArray[np.float64]
@@ -81,12 +78,8 @@ class ViewSweep:
 
 @dataclass(frozen=True, slots=True)
 class DatasetPlace:
-    """Where a view stands in a data set.
-
-    Args:
-        number: among all views. drive: its name. split: train or val. sequence: number of its path, counted over all
-            drives. frame: number within the path, without gaps.
-    """
+    """Where a view stands in a data set: its number among all views, drive, split (train or val), number of its path
+    (``sequence``, counted over all drives), and number within the path, without gaps."""
 
     number: int
     drive: str
@@ -97,14 +90,10 @@ class DatasetPlace:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelledView:
-    """A view with its labels.
-
-    Args:
-        name: of its trajectory and number, such as ``front_shift+2.0/000003``. layers: as in ``CameraReply``;
-            ``instances`` u16[H, W] also marks parked objects. boxes: of all objects with at least part of their box in
-            the image. trust: see ``Trust``. mount: vehicle-from-camera f64[4, 4]; None: the log does not tell.
-        sweep: of the LiDAR that was asked for, or None.
-    """
+    """A view with its labels. ``name``: of its trajectory and number, such as ``front_shift+2.0/000003``. ``layers``:
+    as in ``CameraReply``; ``instances`` u16[H, W] also marks parked objects. ``boxes``: of all objects with at least
+    part of their box in the image. ``mount``: vehicle-from-camera f64[4, 4]; None: the log does not tell. ``sweep``: of
+    the LiDAR that was asked for."""
 
     name: str
     view: View
@@ -233,6 +222,11 @@ class Labeller:
                 within = outline_mask(view, pose, size)
                 hidden &= within if within is not None else False
                 occlusion = float(hidden.sum() / (hidden.sum() + pixels)) if pixels else 1.0
+            returns = 0
+            if sweep is not None:
+                xyz = sweep.reply.xyz.astype(np.float64)
+                local = geometry.transform_points(geometry.invert(pose) @ sweep.world_from_lidar, xyz)
+                returns = int((np.abs(local) <= np.asarray(size) / 2).all(1).sum())
             yield ObjectBox(
                 track_id=name,
                 label=self.labels[name],
@@ -245,7 +239,7 @@ class Labeller:
                 occlusion=occlusion,
                 truncation=outside(amodal, view.camera),
                 seen_from_deg=self._seen_from_deg(name, track, pose, view),
-                returns=0 if sweep is None else _returns_in(sweep, pose, size),
+                returns=returns,
             )
 
     def _seen_from_deg(self, name: str, track: Track | None, pose: NDArray[np.float64], view: View) -> float:
@@ -263,14 +257,6 @@ class Labeller:
         if not len(known):
             return 180.0
         return float(np.degrees(np.arccos(np.clip(known @ _direction(pose, view), -1, 1).max())))
-
-
-def _returns_in(sweep: ViewSweep, world_from_box: NDArray[np.float64], size_m: Sequence[float]) -> int:
-    """Returns of a sweep within a box."""
-    box_from_lidar = geometry.invert(world_from_box) @ sweep.world_from_lidar
-    xyz = sweep.reply.xyz.astype(np.float64)
-    inside = np.abs(geometry.transform_points(box_from_lidar, xyz)) <= np.asarray(size_m) / 2
-    return int(inside.all(1).sum())
 
 
 def _direction(world_from_box: NDArray[np.float64], view: View) -> NDArray[np.float64]:

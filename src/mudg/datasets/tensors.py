@@ -18,17 +18,8 @@ from mudg.datasets.write import LabelledDrive, wanted
 from mudg.sim.session import Layer
 
 LAYERS: Final[tuple[Layer, ...]] = ("rgb", "depth", "classes", "instances", "confidence")
-RAGGED: Final = (
-    "boxes_2d",
-    "boxes_amodal",
-    "cam_from_box",
-    "sizes_m",
-    "numbers",
-    "occlusion",
-    "truncation",
-    "labels",
-    "ids",
-    "points",
+RAGGED: Final = tuple(
+    "boxes_2d boxes_amodal cam_from_box sizes_m numbers occlusion truncation labels ids points".split()
 )
 """Entries that have as many rows as a view has objects, or a sweep has returns."""
 
@@ -67,10 +58,6 @@ class LabelledViews(Dataset[dict[str, Any]]):
         self.views = self.drive.views(self.settings)
         self._labeller: Labeller | None = self.drive.labeller(self.settings)
 
-    def _opened(self) -> Labeller:
-        self._labeller = self._labeller or self.drive.labeller(self.settings)
-        return self._labeller
-
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_labeller": None}
 
@@ -80,8 +67,9 @@ class LabelledViews(Dataset[dict[str, Any]]):
     def __getitem__(self, index: int) -> dict[str, Any]:
         if not -len(self) <= index < len(self):
             raise IndexError(f"view {index} of {len(self)}")
+        self._labeller = self._labeller or self.drive.labeller(self.settings)
         name, view = self.views[index]
-        return entry(wanted(self._opened().label(name, view, LAYERS), self.settings))
+        return entry(wanted(self._labeller.label(name, view, LAYERS), self.settings))
 
 
 def entry(view: LabelledView) -> dict[str, Any]:

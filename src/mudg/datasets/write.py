@@ -1,4 +1,4 @@
-"""``mudg dataset``: labelled views of reconstructions in the format of a data set.
+"""``mudg dataset``: labelled views of reconstructions in the format of a data set; and ``mudg render --layers``.
 
 Every view becomes its files and a record, so that an interrupted run goes on with the next view; what a format keeps
 in one file (COCO's annotations, lists of splits) is made of the records at the end. ``OUT/provenance.jsonl`` has a line
@@ -12,7 +12,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 
@@ -26,10 +26,11 @@ from mudg.datasets.samples import DatasetPlace, LabelledView, Labeller, ObjectBo
 from mudg.datasets.settings import DatasetConfig
 from mudg.editing.render import trajectories
 from mudg.editing.runs import find_run, scene_at
+from mudg.editing.script import EditScript
 from mudg.editing.settings import RenderConfig
 from mudg.scene.read import read_scene
 from mudg.sim.lidar import mounted
-from mudg.sim.session import Layer, Session, Trust
+from mudg.sim.session import Instant, Layer, Session, Trust
 
 Record = Mapping[str, Any]
 PNG_BYTES: Final = 2.2
@@ -41,14 +42,10 @@ RECORDS: Final = "records"
 
 @dataclass(frozen=True)
 class Format:
-    """How a data set is written.
-
-    Args:
-        layers: that it needs. files: patterns of what it writes. view: writes the files of a view below the work folder
-            and returns what the whole needs to know of it. whole: writes the files of the whole from the records, in
-            the order of the views. one_sweep: a sweep belongs to all cameras of a moment, not to each.
-        check: refuses what cannot be written on this machine. scratch: folders that the finished one does not have.
-    """
+    """How a data set is written: the ``layers`` that it needs and patterns of its ``files``. ``view`` writes the files
+    of a view below the work folder and returns what the whole needs to know of it; ``whole`` writes the files of the
+    whole from these records, in the order of the views. ``one_sweep``: a sweep belongs to all cameras of a moment, not
+    to each. ``check`` refuses what cannot be written on this machine. ``scratch``: folders that do not stay."""
 
     layers: tuple[Layer, ...]
     files: tuple[str, ...]
@@ -217,4 +214,63 @@ def object_record(box: ObjectBox) -> dict[str, Any]:
         "truncation": round(box.truncation, 4),
         "seen_from_deg": round(box.seen_from_deg, 2),
         "returns": box.returns,
+    }
+
+
+# --- mudg render --layers -------------------------------------------------------------------------
+#
+# OUT/layers/<trajectory>/layers.json            objects by number; per view its file, time, pose, trust and boxes
+# OUT/layers/<trajectory>/000000.safetensors     arrays as in ``CameraReply.layers``
+# OUT/layers/<trajectory>/000000_instances.png   u16; 000000_normals.png: u8, (n + 1) / 2, black without a surface
+
+
+def write_layers(
+    config: RenderConfig, scene: Path, model: Path, script: EditScript | None, path: Path | None, out: Path
+) -> list[str]:
+    """Draw the layers of all views that ``mudg render`` draws; returns names of the trajectories. Views that an
+    interrupted run wrote are kept."""
+    loaded = read_scene(scene)
+    labeller = Labeller(Session(model, script, loaded, config.device))
+    paths = trajectories(loaded, config, path)
+    with log.task("render layers", sum(len(one) for one in paths)) as bar:
+        for one in paths:
+            folder = out / "layers" / one.name
+            files = [folder / f"{number:06d}.json" for number in range(len(one))]
+            for file, view, later in zip(files, one.views, [*one.views[1:], None], strict=True):
+                if not file.is_file():
+                    store.write_json(file, _write_layers_of(labeller, config, view, later, file))
+                bar.advance()
+            objects = {str(number): name for number, name in enumerate(labeller.names, 1)}
+            whole = {"schema": 1, "objects": objects, "views": [store.read_json(file) for file in files]}
+            store.write_json(folder / "layers.json", whole)
+            for file in files:
+                file.unlink()
+    return [one.name for one in paths]
+
+
+def _write_layers_of(
+    labeller: Labeller, config: RenderConfig, view: View, later: View | None, file: Path
+) -> dict[str, Any]:
+    """Files of a view, beside ``file``; returns what the index says of it."""
+    layers = cast("list[Layer]", [layer for layer in config.layers if layer != "motion" or later is not None])
+    motion_to = None if later is None else Instant(later.time_s, later.world_from_cam)
+    labelled = labeller.label(file.stem, view, layers, motion_to=motion_to)
+    arrays = {layer: np.ascontiguousarray(labelled.layers[layer]) for layer in layers}
+    store.write_safetensors(file.with_suffix(".safetensors"), arrays)
+    if "instances" in arrays:
+        store.write_image(file.with_name(f"{file.stem}_instances.png"), arrays["instances"])
+    if "normals" in arrays:
+        toward = np.nan_to_num(np.round(127.5 * (arrays["normals"] + 1)), nan=0.0)
+        store.write_image(file.with_name(f"{file.stem}_normals.png"), toward.astype(np.uint8))
+    return {
+        "file": f"{file.stem}.safetensors",
+        "layers": layers,
+        "camera": dataclasses.asdict(view.camera),
+        "time_s": view.time_s,
+        "world_from_camera": view.world_from_cam.tolist(),
+        "trust": trust_record(labelled.trust),
+        "boxes": [
+            {**object_record(box), "number": box.number, "amodal_px": box.amodal_px, "visible_px": box.visible_px}
+            for box in labelled.boxes
+        ],
     }

@@ -554,7 +554,7 @@ def fit_city(rules: CityClipRules, city: int, log: CityLog) -> RenderAt:
         write_photos(folder / "scene", world.source(), world.ego_path(), log.tracks(), images, sweeps)
         write_fused(folder / "fused", log.cloud, {})
         work = RunDir.open(folder / "fit", fit.OUTPUT, result_settings(config), {})
-        fit.write_fit(config, fit.FitInputs(folder / "scene", folder / "fused"), work)
+        fit.write_fit(config, folder / "scene", folder / "fused", work)
         model = fit.load_model(work.path)
 
     return partial(render_planes, model)

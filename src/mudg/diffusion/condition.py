@@ -17,7 +17,7 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
 
-from mudg.base import geometry, palette, scratch
+from mudg.base import geometry, memory, palette
 from mudg.base.errors import InputError
 from mudg.base.types import Condition, FusedCloud, Photo, RenderPlanes, SparseDepth, Track, View
 from mudg.base.weather_settings import Conditions
@@ -447,7 +447,7 @@ def build_conditions(
     for n, (view, there, found) in enumerate(zip(small, far_ids, warped, strict=True)):
         here = points.look(view, there[0], None if renders is None else renders.map(lambda x, n=n: x[n]))
         own.append(here.with_hole(here.color, here.ids, found[0])[0])
-    scratch.rest_mapped()
+    memory.rest_mapped()
     depth, valid = (torch.stack([getattr(o, name) for o in own])[:, None] for name in ("depth", "measured"))
     color, backdrop = reduced(color), reduced(backdrop)
     return Condition(tuple(small), color, depth, valid, reference, warped, backdrop, ids, far_ids, renders), fine
@@ -704,12 +704,12 @@ def stacked(rows: Iterable[Sequence[Tensor]], count: int, folder: Path | None) -
     def empty(like: Tensor) -> Tensor:
         if folder is None or like.shape[-2] * like.shape[-1] <= LARGE_PIXELS:
             return like.new_empty((count, *like.shape))
-        return torch.from_numpy(scratch.mapped_array(folder, (count, *like.shape), like.numpy().dtype))
+        return torch.from_numpy(memory.mapped_array(folder, (count, *like.shape), like.numpy().dtype))
 
     stacks: list[Tensor] = []
     for number, row in enumerate(rows):
         stacks = stacks or [empty(x) for x in row]
         for stack, x in zip(stacks, row, strict=True):
             stack[number] = x
-        scratch.rest_mapped()
+        memory.rest_mapped()
     return stacks

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import palette, scratch, seeds
+from mudg.base import memory, palette, seeds
 from mudg.base.errors import UsageError
 from mudg.base.types import Clip, Condition, FinePatch, RenderPlanes
 from mudg.core import losses, noise
@@ -454,7 +454,7 @@ class MDM(nn.Module):
         def crop(rows: slice, columns: slice) -> ConditionPixels:
             """What the finisher reads of the condition, made tile by tile: all of it is large."""
             part = fine.cropped(rows, columns)
-            scratch.rest_mapped()
+            memory.rest_mapped()
             return self._pixels_of(Stacked.of([part]))
 
         with torch.autocast(self.device.type, torch.bfloat16, enabled=bf16):

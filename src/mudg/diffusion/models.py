@@ -7,7 +7,7 @@ Both have what the loop uses: `loss(clips, part, settings)`, also as `forward`, 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -353,16 +353,13 @@ def score(
     shards: Shards,
     request: SampleRequest,
     *,
-    prepare: Callable[[Clip], Clip] | None = None,
     picture: Path | None = None,
 ) -> dict[str, Any]:
     """Generate all clips of some cities and compare with the truth.
 
     Returns {"average": scores over the shifted clips, "by_shift": {shift: scores}, "clips": n, "steps": request.steps}.
     Keys as in `SCORES`; classes are pooled over all clips before the IoU. Draws a grid of up to 6 clips into `picture`.
-
-    request: how clips are sampled; the index is put in for each. prepare: changes each clip before it is used, for
-    example `without_classes`."""
+    request: how clips are sampled; the index is put in for each."""
     rows: dict[str, list[dict[str, float]]] = {}
     counts: dict[str, Tensor] = {}
     pairs: list[tuple[Clip, GeneratedClip]] = []
@@ -370,7 +367,6 @@ def score(
         count, frames = shards.reading(city, counts_at)
         for number in range(count):
             clip = shards.clip(city, number, range(min(model.config.window, frames)))
-            clip = clip if prepare is None else prepare(clip)
             sample = generated(model, clip.condition, replace(request, index=city * 16 + number))
             name = "recorded" if clip.shift_m == 0 else f"{abs(clip.shift_m):.0f} m"
             row, matrix = score_clip(clip, sample)
@@ -386,18 +382,13 @@ def score(
     return {"average": pooled, "by_shift": by_shift, "clips": sum(map(len, rows.values())), "steps": request.steps}
 
 
-def without_classes(clip: Clip) -> Clip:
-    """The clip as of a log without labels: no class comes with the condition."""
-    return replace(clip, condition=replace(clip.condition, semantics=None, backdrop_semantics=None))
-
-
 def score_clip(clip: Clip, sample: GeneratedClip) -> tuple[dict[str, float], Tensor]:
     """Scores of one clip and its class confusion i64[19,20]."""
     rgb, ids, given = clip.rgb, clip.semantics, clip.condition
     # far depth does not count, nor does guessed depth
     depth = torch.where(clip.depth_weight == 1, clip.depth, FAR_M)
     seen = given.valid if given.warped is None else given.valid | given.warped
-    frames = [TrueFrame.of(*one) for one in zip(given.views, depth, ids, strict=True)]
+    frames = [TrueFrame(*one) for one in zip(given.views, depth, ids, strict=True)]
     solid = (depth < 90.0) & (ids.unsqueeze(1) != SKY)
     flat = lambda x: x.transpose(0, 1).flatten(1, 2)
     error = metrics.depth_errors(flat(sample.depth), flat(depth), flat(solid))

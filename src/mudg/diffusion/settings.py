@@ -72,7 +72,7 @@ class SynthesizeConfig:
 class ConvertConfig:
     """Convert a published checkpoint to a model folder."""
 
-    network: Literal["diffusion", "inception", "i3d", "dinov2", "clip", "lpips", "lpips-vgg"] = "diffusion"
+    network: Literal["diffusion", "inception", "i3d", "lpips", "lpips-vgg"] = "diffusion"
     """What the checkpoint holds: a diffusion model, or a network of the scores (docs/scores.md). The other settings
     apply to diffusion models only."""
     resolution: Literal["auto", "320x512", "576x1024"] = "auto"

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -57,6 +57,7 @@ SIDE_VIEWS: Final = 16
 """Views that say which sides of objects the recording did not show, at most."""
 MOST_NAMED: Final = 4
 """More objects than these are counted in a message."""
+Thing = TypeVar("Thing")
 
 
 def street_left(model: SceneModel, plan: EditPlan, *, close: bool = True) -> SceneModel:
@@ -130,10 +131,10 @@ def _erased(plan: EditPlan, xyz: NDArray[np.floating]) -> NDArray[np.bool_]:
     return gone
 
 
-def spread(views: Sequence[View], most: int = edited.MOST_VIEWS) -> list[View]:
-    """At most so many of some views, evenly."""
-    which = np.unique(np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int))
-    return [views[int(index)] for index in which] if views else []
+def spread(things: Sequence[Thing], most: int = edited.MOST_VIEWS) -> list[Thing]:
+    """At most so many of some things, evenly."""
+    which = np.unique(np.linspace(0, len(things) - 1, min(most, len(things))).round().astype(int))
+    return [things[int(index)] for index in which] if things else []
 
 
 def views_of(actors: Sequence[Actor], views: Sequence[View]) -> list[View]:
@@ -302,7 +303,7 @@ FACT = "edits"
 @dataclass(frozen=True, slots=True, eq=False)
 class EditedDrive:
     """What a script made of a drive. ``plan``: what was done. ``scene``, ``cloud``: edited; None where they were not
-    given. ``notes``: what the reader should know (``plan.check``)."""
+    given. ``notes``: what the reader should know, each with ``kind``, ids, numbers and a sentence ``text``."""
 
     script: EditScript
     plan: EditPlan
@@ -329,9 +330,9 @@ def carry_out(
     its objects are those that a script can name where there is no scene; its ground where there is no cloud. None: only
     scene and cloud are wanted. InputError: something in the script that cannot be done here."""
     if model is not None and conditions_of(script.canonical()) is not None and not model.classes:
-        what = "weather, light and season need the classes of surfaces, and this scene was fitted without"
+        what = "weather and light need the classes of surfaces, and this scene was fitted without"
         remedy = "fit a scene with labels (`mudg annotate` makes them), or take them out of the script"
-        raise InputError(what, where="weather, light, season", remedy=remedy)
+        raise InputError(what, where="weather, light", remedy=remedy)
     ground = ground_of(cloud, model)
     world = EditWorld.of_model(model, ground) if scene is None else EditWorld.of_scene(scene, ground)
     closes = scene is not None and scene.source.recipe is None  # a city has exact pictures of what an object hid
@@ -347,8 +348,8 @@ def carry_out(
         plan.notes.append({"kind": "street not closed", "ids": names, "text": text})
     made = None if scene is None else edited_scene(scene, plan)
     views = tuple([frame.view for frame in s.frames] if s else [] for s in (scene, made))
-    plan.sides = plans.shown_anew(plan, *views)
-    notes = plans.check(plan, *views)
+    seldom, plan.sides = plans.shown_sides(plan, *views)
+    notes = [*plan.notes, *plans.collisions(plan), *seldom]
     for note in notes:
         log.warn(f"edit: {note['text']}")
     return EditedDrive(script, plan, made, None if cloud is None else edited_cloud(cloud, plan), notes)
@@ -505,9 +506,8 @@ def weather_of(draw: Drawer, conditions: Conditions, scene: Scene) -> InWeather:
     """Weather for all views of a drive, with its light and ground. ``draw``: the views as they are, with depth and
     classes. ``scene``: its recorded views tell the light of the drive, its path how fast the cameras are. InputError:
     views without depth or classes."""
-    frames = sorted(scene.frames, key=lambda frame: (frame.view.time_s, frame.view.camera.name))
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(WITNESSES, len(frames))).round().astype(int))
-    witnesses = [_shown(draw(frames[int(index)].view)) for index in chosen]
+    views = sorted((frame.view for frame in scene.frames), key=lambda view: (view.time_s, view.camera.name))
+    witnesses = [_shown(draw(view)) for view in spread(views, WITNESSES)]
     return InWeather(conditions, drive_facts(witnesses), SEED, functools.partial(trajectory.velocity, scene.ego))
 
 

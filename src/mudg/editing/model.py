@@ -1,8 +1,6 @@
-"""Edits of a fitted scene: its objects on other paths, taken away, put in, cut out of the background; their contact
-shadows; and the street and the sides that only show because of it.
-
-Everything returns a changed copy and shares what stays. How a path changes is the business of ``core/edit.py``.
-"""
+"""Edits of a fitted scene: its objects on other paths, taken away, put in, cut out of the background, with contact
+shadows; and the street and the sides that only show because of it. Everything returns a changed copy and shares what
+stays; how a path changes is the business of ``core/edit.py``."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
-"""From a script to what is to happen: every verb in order, on the paths of all road users and of the vehicle.
-
-Boxes of a scene and objects of a fitted scene lie almost in the same places, but not quite: a fit corrects paths. So a
-plan keeps what is done to a path as functions, to be applied to either.
-"""
+"""From a script to what is to happen: every verb in order, on the paths of all road users and of the vehicle. Boxes of
+a scene and objects of a fit lie not quite in the same places, for a fit corrects paths: so a plan keeps what is done to
+a path as functions, to be applied to either."""
 
 from __future__ import annotations
 
@@ -101,7 +99,7 @@ class EditPlan:
         notes: what the reader should know, with numbers.
         views: recorded ones, which say what nobody saw of the street; none where there is no scene.
         closed: actors without whose traces the street is to be shown, if they were recorded (``editing/model.py``).
-        sides: actors whose sides that no view showed are closed (``shown_anew``).
+        sides: actors whose sides that no view showed are closed (``shown_sides``).
     """
 
     before: EditWorld
@@ -377,12 +375,6 @@ ANOTHER_SIDE_RAD: Final = np.radians(3.0)
 """From a direction that differs by more than this, a view shows flanks that the recording may not have shown."""
 
 
-def check(plan: EditPlan, views_before: Sequence[View], views_after: Sequence[View]) -> list[dict[str, Any]]:
-    """Notes of a plan and what its checks found, each with ``kind``, ids, numbers and a sentence ``text``.
-    ``views_before``: recorded views. ``views_after``: the same with the edited path of the vehicle."""
-    return [*plan.notes, *collisions(plan), *unseen_sides(plan, views_before, views_after)]
-
-
 def collisions(plan: EditPlan) -> list[dict[str, Any]]:
     """Pairs of boxes that overlap after the edits and did not before, over all times. Pairs that no edit touches are
     not tried."""
@@ -431,46 +423,35 @@ def _deepest(a: Actor, b: Actor) -> tuple[float, float]:
     return float(overlap[worst]), float(times[worst])
 
 
-def unseen_sides(plan: EditPlan, views_before: Sequence[View], views_after: Sequence[View]) -> list[dict[str, Any]]:
-    """Objects that the edited drive shows from directions from which the recording hardly saw them."""
-    names = list(plan.after.actors) if plan.moves_ego else plan.touched()
-    found = []
-    for name in names:
-        asked = sides_seen(plan.after.actors[name], views_after)
-        if name in plan.inserted:
-            seen = np.array(plan.inserted[name].asset.seen_rad)
-        else:
+def shown_sides(
+    plan: EditPlan, views_before: Sequence[View], views_after: Sequence[View]
+) -> tuple[list[dict[str, Any]], set[str]]:
+    """Notes on objects that the edited drive shows from directions from which the recording hardly saw them; and those
+    of the recording of which some view shows a side that no recorded view shows, from more than `ANOTHER_SIDE_RAD`
+    away. ``views_before``: recorded views. ``views_after``: the same with the edited path of the vehicle."""
+    notes, anew = [], set()
+    for name in plan.after.actors if plan.moves_ego else plan.touched():
+        asked, insertion = sides_seen(plan.after.actors[name], views_after), plan.inserted.get(name)
+        if insertion is None:
             seen = sides_seen(plan.before.actors[name], views_before)
+        else:
+            seen = np.array(insertion.asset.seen_rad)
         if not len(asked):
             continue
-        if name in plan.inserted and not len(seen):
+        if insertion is not None and not len(seen):
             text = f"{name}: from which sides its own recording saw it is not known; export it with its scene"
-            found.append({"kind": "unknown sides", "ids": [name], "text": text})
+            notes.append({"kind": "unknown sides", "ids": [name], "text": text})
             continue
         apart = paths.angle_to_nearest(asked, seen)
-        share = float((apart > SELDOM_RAD).mean())
-        if share < LEAST_SHARE:
-            continue
-        largest = float(np.degrees(apart.max()))
-        sides = f"{share:.0%} of its views look at sides that the recording saw from more than 30 degrees away"
-        text = f"{name}: {sides} (up to {largest:.0f})" if len(seen) else f"{name}: the recording never shows it"
-        numbers = {"share": round(share, 3), "largest_deg": round(largest, 1)}
-        found.append({"kind": "seldom-seen side", "ids": [name], **numbers, "text": text})
-    return found
-
-
-def shown_anew(plan: EditPlan, views_before: Sequence[View], views_after: Sequence[View]) -> set[str]:
-    """Objects of the recording of which some view shows a side that no recorded view shows, from more than
-    `ANOTHER_SIDE_RAD` away, because their path or that of the vehicle has changed."""
-    found = set()
-    for name in plan.before.actors if plan.moves_ego else plan.changes:
-        if name not in plan.after.actors or name in plan.inserted:
-            continue
-        asked = sides_seen(plan.after.actors[name], views_after)
-        seen = sides_seen(plan.before.actors[name], views_before)
-        if len(asked) and len(seen) and paths.angle_to_nearest(asked, seen).max() > ANOTHER_SIDE_RAD:
-            found.add(name)
-    return found
+        if insertion is None and len(seen) and apart.max() > ANOTHER_SIDE_RAD:
+            anew.add(name)
+        share, largest = float((apart > SELDOM_RAD).mean()), float(np.degrees(apart.max()))
+        if share >= LEAST_SHARE:
+            sides = f"{share:.0%} of its views look at sides that the recording saw from more than 30 degrees away"
+            text = f"{name}: {sides} (up to {largest:.0f})" if len(seen) else f"{name}: the recording never shows it"
+            numbers = {"share": round(share, 3), "largest_deg": round(largest, 1)}
+            notes.append({"kind": "seldom-seen side", "ids": [name], **numbers, "text": text})
+    return notes, anew
 
 
 def sides_seen(actor: Actor, views: Sequence[View]) -> Array:

@@ -31,7 +31,7 @@ from mudg.baselines.emernerf import load_field, observe
 from mudg.core import trajectory
 from mudg.core.pictures import panels_of, side_by_side
 from mudg.core.raster.rasterize import drawing_device
-from mudg.core.shutter import readout_of
+from mudg.core.trajectory import readout_of
 from mudg.diffusion import views as loading
 from mudg.diffusion.model_files import is_published
 from mudg.diffusion.settings import SynthesizeConfig

@@ -17,7 +17,7 @@ from mudg.base import store
 from mudg.base.errors import InputError, nearest, short
 from mudg.base.plain_yaml import Lines, parse_yaml
 from mudg.base.records import Number, StrictRecord, after, checked_by, first_problem, place
-from mudg.base.weather_settings import Conditions, LightSettings, SeasonSettings, WeatherSettings
+from mudg.base.weather_settings import Conditions, LightSettings, WeatherSettings
 
 EGO: Final = "ego"
 """The id of the recording vehicle in edit scripts."""
@@ -237,9 +237,8 @@ VERBS: Final[dict[str, type[StrictRecord]]] = {
     "erase": EraseEdit,
     "weather": WeatherSettings,
     "light": LightSettings,
-    "season": SeasonSettings,
 }
-CONDITIONS: Final = ("weather", "light", "season")
+CONDITIONS: Final = ("weather", "light")
 """Verbs that change no geometry."""
 
 
@@ -301,8 +300,8 @@ class EditScript:
 
 
 def conditions_of(script: Sequence[Mapping[str, Any]]) -> Conditions | None:
-    """Weather, light and season that a script (``EditScript.canonical``) asks for, each as its last verb says; None: it
-    asks for none."""
+    """Weather and light that a script (``EditScript.canonical``) asks for, each as its last verb says; None: it asks
+    for none."""
     asked = {verb: settings for edit in script for verb, settings in edit.items() if verb in CONDITIONS}
     return Conditions.model_validate(asked) if asked else None
 

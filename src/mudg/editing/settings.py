@@ -87,25 +87,14 @@ class ScoreConfig:
     fvd_resize: Literal["videogpt", "google", "stylegan-v"] = "videogpt"
     """How FVD's network gets its 224 x 224 pixels: shorter side and crop (videogpt), or squashed (google,
     stylegan-v)."""
-    dino_weights: str = ""
-    """File with the weights of DINOv2, ViT-S/14 or ViT-L/14 (`dinov2_vits14_pretrain.pth`,
-    `dinov2_vitl14_pretrain.pth`, or their tensors as safetensors). FD-DINOv2 and the consistency of a video are then
-    computed (empty = not computed)."""
-    clip_weights: str = ""
-    """File with the image tower of CLIP ViT-L/14 at 336 pixels (`model.safetensors` of
-    openai/clip-vit-large-patch14-336, or OpenAI's names). CMMD, CLIP-F and CLIP-V are then computed (empty = not
-    computed)."""
     detections: str = ""
     """File with boxes that a detector found in the views, as COCO results. NTA-IoU is then computed (empty = not
     computed)."""
     lanes: str = ""
     """Folder with lane masks that a detector made of the views, METHOD/TRAJECTORY/000000.png. NTL-IoU is then computed
     (empty = not computed). Generated cities only: prepared logs have no lane lines."""
-    as_published: bool = False
-    """NTA-IoU: project true boxes as the published score does, corners behind the camera included, instead of cutting
-    them at the near plane."""
     error_pictures: bool = True
     """Write an image of the colour error at the middle view of every trajectory."""
     device: DeviceName = "auto"
-    """Device of the networks behind perceptual distance, LPIPS, FID, FVD, DINOv2 and CLIP: auto (CUDA if there is one),
+    """Device of the networks behind perceptual distance, LPIPS, FID and FVD: auto (CUDA if there is one),
     cpu, cuda, cuda:N. All other metrics run on the CPU."""

@@ -35,7 +35,6 @@ from mudg.editing.model import Asset, classes_of_rows, lowest_points
 from mudg.editing.runs import RunParts, find_run
 from mudg.editing.script import EditScript
 from mudg.exporting.settings import ExportConfig, ImportConfig
-from mudg.formats import ncore as ncore_package
 from mudg.formats.exporters import messages, ncore
 from mudg.formats.exporters.cameras import colmap_files, nerfstudio_files, picture_names, pictures
 from mudg.formats.splats.binary import MAX_BYTES
@@ -43,34 +42,11 @@ from mudg.formats.splats.cloud import SplatCloud, SplatNode, SplatScene, logit, 
 from mudg.formats.splats.cloud import known as known_axes
 from mudg.formats.splats.formats import COARSE_M, FORMATS, WriteRequest, file_from_world, losses, read_cloud
 from mudg.gaussians.model import COLUMNS, SceneModel
-from mudg.gaussians.nodes import DeformableNode, NodeRows, RigidNode, SkyNode, StaticNode
+from mudg.gaussians.nodes import DeformableNode, NodeRows, RigidNode, StaticNode
 from mudg.gaussians.rendering import DRAWING
 from mudg.gaussians.storage import load_model, model_of_scene, save_model
 from mudg.scene.clouds import read_fused
 from mudg.scene.read import open_files, read_points, read_scene
-
-# a log over time: messages and bags of ROS 2, recordings of NCore --------------------------------
-
-SUFFIXES: Final = {"mcap": ".mcap", "ros2": "", "ncore": ""}
-"""Formats, and the suffix of their file; none: a folder."""
-LOG_FOLDERS: Final = {"ros2": (1, (messages.BAG_METADATA, messages.BAG_FILE)), "ncore": (1, ncore.FILES)}
-"""Formats that are folders: version and files of each."""
-
-
-def records_of(scene: Scene, fused: Any = None) -> messages.LogRecords:
-    """The records of a scene on disk; pictures and points are read when they are asked for."""
-    files = open_files(scene.root)
-    picture = lambda frame: files.read(frame.image.path)
-    return messages.LogRecords(scene, picture, lambda sweep: read_points(scene, sweep), fused)
-
-
-def refuse_missing(name: str) -> None:
-    """ResourceError if the package of a format is not installed."""
-    if name == "ncore":
-        ncore_package.package()
-    elif name in ("mcap", "ros2"):
-        messages.mcap_writer()
-
 
 # scenes -------------------------------------------------------------------------------------------
 #
@@ -104,8 +80,11 @@ def splat_scene(model: SceneModel, time_s: float, names: Sequence[str] = ()) -> 
         sh = bands[:, : (model.sh_degree + 1) ** 2].cpu().numpy()
         nodes.append(_node(node, parts, own["log_scales"], sh, known, time_s))
     facts = {key: model.facts[key] for key in ("method", "scene", "drawing") if key in model.facts}
-    name = str(model.facts.get("scene", "scene"))
-    return SplatScene(name, tuple(nodes), sky=None if model.sky is None else sky_picture(model.sky), facts=facts)
+    name, sky = str(model.facts.get("scene", "scene")), None
+    if model.sky is not None:
+        panorama = model.sky.table["panorama"].detach()[0].clamp(0, 1).cpu().numpy()
+        sky = np.round(panorama.transpose(1, 2, 0) * 255).astype(np.uint8)
+    return SplatScene(name, tuple(nodes), sky=sky, facts=facts)
 
 
 def _node(
@@ -160,12 +139,6 @@ def _sampled(
 # -- sky -------------------------------------------------------------------------------------------
 
 
-def sky_picture(sky: SkyNode) -> NDArray[np.uint8]:
-    """The panorama u8[H, 2 H, 3] of a sky."""
-    values = sky.table["panorama"].detach()[0].clamp(0, 1).cpu().numpy()
-    return np.round(values.transpose(1, 2, 0) * 255).astype(np.uint8)
-
-
 def with_sky_sphere(scene: SplatScene) -> SplatScene:
     """The scene with its sky as flat Gaussians far away, for files that hold Gaussians alone; unchanged without a
     sky."""
@@ -216,9 +189,17 @@ CAMERAS: Final[Mapping[str, Callable[[Scene, PointCloud | None], dict[str, bytes
     "colmap": colmap_files,
 }
 """Formats of cameras: files beside the pictures."""
+SUFFIXES: Final = {"mcap": ".mcap", "ros2": "", "ncore": ""}
+"""Formats of a log over time, and the suffix of their file; none: a folder."""
+_PACKAGES: Final = {"ncore": ncore.package, "mcap": messages.mcap_writer, "ros2": messages.mcap_writer}
+"""Formats that need a package -> what loads it."""
 MOST_POINTS: Final = 500_000
 _CAMERA_FILES: Final = ("transforms.json", "points.ply", *below("sparse/0", ("*.bin",)), "images/")
-FOLDERS: Final = {**dict.fromkeys(CAMERAS, (1, _CAMERA_FILES)), **LOG_FOLDERS}
+FOLDERS: Final = {
+    **dict.fromkeys(CAMERAS, (1, _CAMERA_FILES)),
+    "ros2": (1, (messages.BAG_METADATA, messages.BAG_FILE)),
+    "ncore": (1, ncore.FILES),
+}
 """Formats that are folders: version and files of each."""
 
 
@@ -261,8 +242,14 @@ def check(config: ExportConfig, name: str, out: Path) -> None:
     if name not in FORMATS and name not in CAMERAS and name not in SUFFIXES:
         known = ", ".join((*FORMATS, *CAMERAS, *SUFFIXES))
         raise UsageError(f"there is no export format {name!r}", expected=f"one of {known}", remedy="see docs/export.md")
-    _refuse_settings(config, name)
-    refuse_missing(name)
+    if name == "alpasim" and config.time_s is not None:
+        what = "a file of this format holds all moments"
+        raise UsageError(what, where="--time-s", got=name, remedy="leave it out, or export ply")
+    for flag, given in (("--time-s", config.time_s is not None), ("--nodes", config.nodes)):
+        if given and name not in FORMATS:
+            raise UsageError("the format does not have this setting", where=flag, got=name, remedy="leave it out")
+    if name in _PACKAGES:
+        _PACKAGES[name]()
     suffixes = (SUFFIXES[name],) if name in SUFFIXES else FORMATS[name].suffixes if name in FORMATS else ()
     if name not in FOLDERS and not Path(out).name.lower().endswith(suffixes):
         expected = f"a name that ends in {' or '.join(suffixes)}"
@@ -274,7 +261,7 @@ def write_folder(name: str, exported: Exported, recorded: Scene, work: RunDir) -
     """Write cameras, or a log over time, to the work folder; returns a summary."""
     out = work.path
     if name not in CAMERAS:
-        return _write_messages(name, records_of(recorded, _points(exported)), out)
+        return _write_messages(name, _records(recorded, _points(exported)), out)
     names = picture_names(recorded)
     with log.task("export", len(names)) as bar:
         for place, content in pictures(recorded):
@@ -291,17 +278,6 @@ def write_file(config: ExportConfig, name: str, exported: Exported, file: Result
     """Write Gaussians, or a log over time, as one file; returns what the file is."""
     about = _log(exported, file.path) if name in SUFFIXES else _gaussians(config, name, exported, file.path)
     return {"format": name, "mudg": version(), **about}
-
-
-def _refuse_settings(config: ExportConfig, name: str) -> None:
-    if name == "alpasim" and config.time_s is not None:
-        what = "a file of this format holds all moments"
-        raise UsageError(what, where="--time-s", got=name, remedy="leave it out, or export ply")
-    usual = ExportConfig()
-    set_here = [key for key in ("time_s", "nodes") if getattr(config, key) != getattr(usual, key)]
-    if set_here and name not in FORMATS:
-        flag = set_here[0].replace("_", "-")
-        raise UsageError("the format does not have this setting", where=f"--{flag}", got=name, remedy="leave it out")
 
 
 # -- Gaussians -------------------------------------------------------------------------------------
@@ -373,9 +349,16 @@ def _count(scene: SplatScene) -> int:
 # -- cameras and messages --------------------------------------------------------------------------
 
 
+def _records(scene: Scene, fused: PointCloud | None) -> messages.LogRecords:
+    """The records of a scene on disk; pictures and points are read when they are asked for."""
+    files = open_files(scene.root)
+    picture = lambda frame: files.read(frame.image.path)
+    return messages.LogRecords(scene, picture, lambda sweep: read_points(scene, sweep), fused)
+
+
 def _log(exported: Exported, out: Path) -> dict[str, Any]:
     """Write the log as one MCAP file; returns its size."""
-    records = records_of(recorded_scene(exported), _points(exported))
+    records = _records(recorded_scene(exported), _points(exported))
     messages.write_mcap(out, messages.Ros2Messages(records))
     size = out.stat().st_size
     log.info(f"export: {_counts(records)}, {size / 1e6:.2f} MB")
@@ -391,7 +374,7 @@ def _write_messages(name: str, records: messages.LogRecords, out: Path) -> dict[
         what, count = "messages", sum(number for _, number in topics.values())
     else:
         cameras = records.scene.cameras.items()
-        if rolling := ", ".join(name for name, camera in cameras if ncore_package.unknown_shutter(camera)):
+        if rolling := ", ".join(name for name, camera in cameras if ncore.unknown_shutter(camera)):
             log.warn(f"export: the scene does not say which way the shutters of {rolling} roll; ncore says downwards")
         largest, what, count = ncore.write_ncore(out, records)[0], "boxes", len(records.scene.tracks)
     log.info(f"export: {_counts(records)}, {count} {what}, {largest.stat().st_size / 1e6:.2f} MB in {out}")

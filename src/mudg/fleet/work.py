@@ -21,10 +21,10 @@ import subprocess
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 
 import yaml
 
@@ -33,13 +33,10 @@ from mudg.base.errors import InputError, IntegrityError, MudgError, ResourceErro
 from mudg.base.memory import folder_bytes
 from mudg.base.run_folder import fcntl
 from mudg.fleet.plan import COMMAND, BatchPlan, Entry, Unit, command_of
-from mudg.fleet.records import BatchFolder, Ended
+from mudg.fleet.records import ASKED_TO_STOP, KILLED, BatchFolder, Ended
 
 # the process of a step: started, watched, asked to stop, and its last words ---------------------------
 
-KILLED: Final = 137
-"""Code of a step that was killed, as the system does where memory runs out."""
-ASKED_TO_STOP: Final = 143
 _LAST_BYTES: Final = 16_384
 """Bytes of what a step said that are kept."""
 _HELD: Final = "MUDG_BATCH_TURN"
@@ -145,27 +142,16 @@ def _turn(alone: bool, stop: Stop) -> Iterator[None]:
     for name in ("door", "room"):
         store.create_once(folder / name, b"")
     with store.open_file(folder / "door") as door, store.open_file(folder / "room") as room:
-        lock(door, alone, stop)
-        lock(room, alone, stop)
+        for file in (door, room):
+            while not stop.asked:
+                try:
+                    fcntl.flock(file, (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError:
+                    time.sleep(0.1)
         if not alone:
             fcntl.flock(door, fcntl.LOCK_UN)
         yield
-
-
-def lock(file: BinaryIO, alone: bool, stop: Stop | None) -> bool:
-    """Lock an open file until it is closed, alone or together with others. False where that could not be: work is to
-    stop meanwhile, or stop is None and it is locked already."""
-    pause_s = 0.02
-    while fcntl is not None:
-        try:
-            fcntl.flock(file, (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
-            return True
-        except BlockingIOError:
-            if stop is None or stop.asked:
-                return False
-            time.sleep(pause_s)
-            pause_s = min(1.0, 2 * pause_s)
-    return True
 
 
 def last_words(text: str, code: int) -> str:
@@ -192,12 +178,6 @@ def last_words(text: str, code: int) -> str:
 # the steps of a scene -----------------------------------------------------------------------------
 
 DONE, FAILED, STOPPED, LOST = "done", "failed", "stopped", "lost"
-REASONS: Final[Mapping[int, str]] = {
-    **dict(enumerate("a mistake in the program,usage,bad input,damaged result,memory or disk,numbers".split(","), 1)),
-    130: "interrupted",
-    KILLED: "killed, most likely for want of memory",
-    ASKED_TO_STOP: "asked to stop",
-}
 WAITS_S: Final = {4: (0.0,), 5: (10.0, 60.0), 130: (2.0, 2.0), KILLED: (5.0,), ASKED_TO_STOP: (2.0, 2.0)}
 """Exit code -> pauses before further tries; another signal: one more try. Other codes would come again."""
 _RESULT: Final = "result"

@@ -1,14 +1,6 @@
-"""Camera paths from files: TUM and KITTI poses, and nerfstudio's ``transforms.json``.
-
-====================== ===========================================================================================
-file                   rows
-====================== ===========================================================================================
-``.txt``, 8 numbers    TUM: time, position x y z, quaternion x y z w; camera axes x right, y down, z forward
-``.txt``, 12 numbers   KITTI: the rows of world-from-camera 3x4, same axes; no times
-``.json``              nerfstudio: ``frames`` with ``transform_matrix`` (camera axes x right, y up, z back), ``time``
-====================== ===========================================================================================
-
-Places are metres in the scene's world. Where no time is given, the views are spread evenly over the log.
+"""Camera paths from files, metres in the scene's world. ``.txt`` with 8 numbers a row (TUM): time, position, quaternion
+x y z w; with 12 (KITTI): world-from-camera 3x4; camera axes x right, y down, z forward. ``.json``: nerfstudio's
+``transforms.json``, axes x right, y up, z back. Where no time is given, views are spread evenly over the log.
 """
 
 from __future__ import annotations
@@ -22,6 +14,7 @@ from numpy.typing import NDArray
 from mudg.base import geometry, log, store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Scene, Trajectory, View
+from mudg.formats.importers.kitti import line_numbers
 
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 FAR_M = 5.0
@@ -73,16 +66,10 @@ def read_path(file: Path, scene: Scene, camera: Camera) -> Trajectory:
 def _of_text(file: Path) -> Rows:
     rows: Rows = []
     for number, line in enumerate(store.read_text(file).splitlines(), 1):
-        words, where = line.partition("#")[0].split(), f"{file}, line {number}"
-        if not words:
+        if not line.partition("#")[0].split():
             continue
-        try:
-            values = np.array([float(word) for word in words])
-        except ValueError as error:
-            raise InputError("not a number", where=where, got=line[:60]) from error
-        if len(values) not in (8, 12) or not np.isfinite(values).all():
-            expected = "8 finite numbers (TUM) or 12 (KITTI)"
-            raise InputError("not a pose", where=where, expected=expected, got=f"{len(values)} words: {line[:60]}")
+        where = f"{file}, line {number}"
+        values = line_numbers(line.partition("#")[0], (8, 12), where, "pose (8 numbers: TUM, 12: KITTI)")
         if len(values) == 12:
             rows.append((None, np.vstack([values.reshape(3, 4), [0, 0, 0, 1]]), where))
             continue

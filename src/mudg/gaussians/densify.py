@@ -1,13 +1,10 @@
 """Densification by screen gradient: add Gaussians where the image lacks detail, remove those without effect.
 
-The published schedule (Kerbl 2023, with the thresholds of Street Gaussians): every ``every`` steps rows whose mean
-screen gradient exceeds a threshold are cloned (small) or split in two (large); rows that are transparent, grown out of
-proportion, or have left their box are removed; now and then opacities are pulled down so that what is not needed fades.
-The background is judged by absolute gradients (AbsGS: contributions of single pixels do not cancel), objects by plain
-ones. Growth is bounded by ``max_rows``: the rows with the largest gradients go first.
-
-State is explicit: statistics belong to rows of the table, the schedule is a function of the step. The caller chooses
-the views that count (``gaussians/fit.py``: recorded views only, see ``Observation.kind``).
+The published schedule (Kerbl 2023, with the thresholds of Street Gaussians): rows whose mean screen gradient exceeds a
+threshold are cloned (small) or split in two (large); rows that are transparent, grown out of proportion, or have left
+their box are removed; now and then opacities are pulled down so that what is not needed fades. The background is judged
+by absolute gradients (AbsGS: contributions of single pixels do not cancel), objects by plain ones. Where the budget is
+short, rows with the largest gradients go first. Only recorded views count.
 """
 
 from __future__ import annotations
@@ -29,6 +26,11 @@ from mudg.gaussians.nodes import RigidNode
 
 SPLIT_SHRINK = 1.6
 """Both halves of a split Gaussian are this much smaller (published value)."""
+LARGEST_M, BOX_MARGIN = 8.0, 1.25
+"""Larger rows are removed, and object rows outside this many half-sizes of their box (plus 0.1 m)."""
+RESET_OPACITY = 0.01
+TIME_GRADIENT = 2e-3
+"""Threshold on the mean gradient of ``tau``, for Gaussians that have one (``baselines/pvg.py``)."""
 
 
 @dataclass(frozen=True)
@@ -38,14 +40,12 @@ class DensifySettings:
     Args:
         start, stop, every: rows change after step s when start <= s <= stop and s is a multiple of ``every``.
         max_rows: growth stops here. growth: at most this share of the present rows is added at a time.
-        least_opacity: rows below are removed. prune_scale_m: so are larger rows. box_margin: and object rows outside
-            this many half-sizes of their box.
+        least_opacity: rows below are removed.
         static_gradient, object_gradient: thresholds on the mean absolute screen gradient, in units of half the image
             (published: 6e-4 for the background, 2e-4 for objects).
         split_above_m: rows whose largest scale exceeds this are split, smaller ones cloned.
-        reset_every: steps between opacity resets, 0 = never. reset_opacity: the value opacities are pulled down to.
-        time_gradient: threshold on the mean gradient of ``tau``, for Gaussians that have one (``baselines/pvg.py``).
-        late: step from which their splits give three children with shorter lives, not two.
+        reset_every: steps between opacity resets (to ``RESET_OPACITY``), 0 = never.
+        late: step from which splits of Gaussians with a life span give three children with shorter lives, not two.
     """
 
     start: int
@@ -54,14 +54,10 @@ class DensifySettings:
     max_rows: int = 150_000
     growth: float = 0.3
     least_opacity: float = 0.005
-    prune_scale_m: float = 8.0
-    box_margin: float = 1.25
     static_gradient: float = 6e-4
     object_gradient: float = 2e-4
     split_above_m: float = 0.2
     reset_every: int = 0
-    reset_opacity: float = 0.01
-    time_gradient: float = 2e-3
     late: int = 0
 
     def due(self, step: int) -> bool:
@@ -89,9 +85,7 @@ class DensifyStats:
 
     def to(self, device: torch.device) -> DensifyStats:
         """The same statistics on a device."""
-        return DensifyStats(
-            self.gradient.to(device), self.seen.to(device), None if self.time is None else self.time.to(device)
-        )
+        return DensifyStats(**{name: value.to(device) for name, value in self.state().items()})
 
     def observe(
         self,
@@ -110,9 +104,9 @@ class DensifyStats:
         gradient = trace.abs_grad2d
         if plain_from is not None and plain_from < len(gradient) and trace.means2d.grad is not None:
             gradient = torch.cat([gradient[:plain_from], trace.means2d.grad[plain_from:]])
-        half_size = _half_size(width, height, gradient.device)
         visible = trace.visible
-        length = torch.view_as_complex(gradient * half_size).abs()  # far faster than a norm over rows of two
+        # far faster than a norm over rows of two
+        length = torch.view_as_complex(gradient * _half_size(width, height, gradient.device)).abs()
         self.gradient += length * visible
         self.seen += visible
         if time_gradient is not None:
@@ -121,14 +115,12 @@ class DensifyStats:
 
     def state(self) -> dict[str, Tensor]:
         """For a checkpoint."""
-        return {"gradient": self.gradient, "seen": self.seen, **({} if self.time is None else {"time": self.time})}
+        return {name: value for name, value in vars(self).items() if value is not None}
 
     @classmethod
     def from_state(cls, tensors: Mapping[str, Tensor]) -> DensifyStats:
         """Inverse of ``state``."""
-        return cls(
-            tensors["gradient"].clone(), tensors["seen"].clone(), tensors["time"].clone() if "time" in tensors else None
-        )
+        return cls(**{name: value.clone() for name, value in tensors.items()})
 
 
 @functools.lru_cache(maxsize=64)
@@ -147,17 +139,14 @@ def densify(
     large = model.table["log_scales"].detach().amax(1).exp() > settings.split_above_m
     if stats.time is not None:
         world = model.nodes[0]
-        hurried = stats.time / stats.seen.clamp_min(1) >= settings.time_gradient
+        hurried = stats.time / stats.seen.clamp_min(1) >= TIME_GRADIENT
         large |= hurried & (model.table["log_beta"].detach().exp() > world.short_life)
     split_rows = (grow & large).nonzero()[:, 0]
     clone_rows = (grow & ~large).nonzero()[:, 0]
     keep = torch.ones(len(model.table), dtype=torch.bool, device=model.device)
     keep[split_rows] = False
-    for columns, labels in (
-        copied_rows(model.table, clone_rows),
-        *_halves(model, split_rows, step, run_seed, settings),
-    ):
-        model.table.append(columns, labels)
+    for born in (copied_rows(model.table, clone_rows), *_halves(model, split_rows, step, run_seed, settings)):
+        model.table.append(*born)
     keep = torch.cat([keep, keep.new_ones(len(model.table) - len(keep))])
     doomed = useless_rows(model, settings)
     pruned = int((doomed & keep).sum())
@@ -166,9 +155,9 @@ def densify(
     return {"cloned": len(clone_rows), "split": len(split_rows), "pruned": pruned, "rows": len(model.table)}
 
 
-def reset_opacity(model: SceneModel, settings: DensifySettings) -> None:
-    """Pull every opacity down to at most ``settings.reset_opacity`` and forget its moments."""
-    ceiling = torch.logit(torch.tensor(settings.reset_opacity))
+def reset_opacity(model: SceneModel) -> None:
+    """Pull every opacity down to at most ``RESET_OPACITY`` and forget its moments."""
+    ceiling = torch.logit(torch.tensor(RESET_OPACITY))
     model.table.columns["logits"].detach().clamp_(max=float(ceiling))
     model.table.reset_moments("logits")
 
@@ -187,12 +176,11 @@ def shorten_needles(table: Table, longest_to_middle: float) -> None:
 def _rows_to_grow(model: SceneModel, stats: DensifyStats, settings: DensifySettings) -> Tensor:
     """Bool[N]: rows over their threshold, the strongest first where the budget is short."""
     mean = stats.gradient / stats.seen.clamp_min(1)
-    static = torch.tensor([not isinstance(node, RigidNode) for node in model.nodes]).to(model.device)[
-        model.table.labels["node"].long()
-    ]
+    is_static = torch.tensor([not isinstance(node, RigidNode) for node in model.nodes]).to(model.device)
+    static = is_static[model.table.labels["node"].long()]
     relative = mean / torch.where(static, settings.static_gradient, settings.object_gradient)
     if stats.time is not None:
-        relative = torch.maximum(relative, stats.time / stats.seen.clamp_min(1) / settings.time_gradient)
+        relative = torch.maximum(relative, stats.time / stats.seen.clamp_min(1) / TIME_GRADIENT)
     wanted = relative > 1
     budget = min(settings.max_rows - len(model.table), int(settings.growth * len(model.table)))
     if budget <= 0:
@@ -233,17 +221,16 @@ def _halves(
 
 
 def useless_rows(model: SceneModel, settings: DensifySettings) -> Tensor:
-    """Bool[N]: transparent, oversized, not finite, or outside ``box_margin`` times the box it belongs to (plus 0.1
-    m)."""
+    """Bool[N]: transparent, oversized, not finite, or outside the box that it belongs to."""
     table = model.table
     means = table["means"].detach()
     doomed = torch.sigmoid(table["logits"].detach()) < settings.least_opacity
-    doomed |= table["log_scales"].detach().amax(1).exp() > settings.prune_scale_m
+    doomed |= table["log_scales"].detach().amax(1).exp() > LARGEST_M
     doomed |= ~torch.isfinite(means).all(1)
     half_size = torch.full((len(model.nodes), 3), torch.inf)
     for index, node in enumerate(model.nodes):
         if isinstance(node, RigidNode):
-            half_size[index] = torch.tensor(node.size_m) / 2 * settings.box_margin + 0.1
+            half_size[index] = torch.tensor(node.size_m) / 2 * BOX_MARGIN + 0.1
     return doomed | (means.abs() > half_size.to(model.device)[table.labels["node"].long()]).any(1)
 
 
@@ -257,5 +244,5 @@ def densify_if_due(
     if schedule.due(step):
         report = densify(model, stats, step, schedule, run_seed)
     if schedule.reset_due(step):
-        reset_opacity(model, schedule)
+        reset_opacity(model)
     return report

@@ -1,7 +1,5 @@
-"""fit: recorded frames (and virtual observations) in, a dynamic Gaussian scene out.
-
-The loop is ``optimise`` and reads top to bottom. Nothing but what it calls touches the parameters. With ``start`` it
-goes on with a finished fit (``gaussians/storage.py``).
+"""fit: recorded frames (and virtual observations) in, a dynamic Gaussian scene out. A step is ``optimise``, read top to
+bottom; with ``start`` it goes on with a finished fit (``gaussians/storage.py``).
 
     OUT/model.json, gaussians.safetensors, nodes.safetensors    the fitted scene (``load_model``) and its certainty
     OUT/appearance.json, appearance.safetensors                 corrections of cameras and colours, where learnt
@@ -13,44 +11,51 @@ from __future__ import annotations
 
 import math
 import shutil
-import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mudg.base import checkpoint, log, palette, store
 from mudg.base.devices import memory_of
 from mudg.base.errors import UsageError
 from mudg.base.layout import MODEL_FILES
-from mudg.base.processes import Interruption, one_torch_thread
+from mudg.base.processes import one_torch_thread
 from mudg.base.run_folder import RunDir, VerbOutput
 from mudg.base.types import FusedCloud, Gaussians, Render, Scene
+from mudg.base.weights import read_checkpoint
 from mudg.core import losses, metrics, native_ops
 from mudg.core.pictures import panels_of
 from mudg.core.raster.rasterize import RasterConfig, drawing_device, rasterize
 from mudg.gaussians import storage, views
-from mudg.gaussians.appearance import Appearance
+from mudg.gaussians.corrections import Appearance, refine_poses
 from mudg.gaussians.densify import DensifySettings, DensifyStats, densify_if_due, shorten_needles
 from mudg.gaussians.model import CERTAINTY, SceneModel, compose_as_read, composite_sky, sky_lift
 from mudg.gaussians.nodes import RigidNode
-from mudg.gaussians.perception import Perception, perception_of
-from mudg.gaussians.poses import refine_poses
 from mudg.gaussians.recipes import DrawnView, recipe_of
 from mudg.gaussians.rendering import NEAR_M as NEAR_M
 from mudg.gaussians.rendering import boxes_in_view, drawing_facts, objects_only, raster_of
 from mudg.gaussians.rendering import render_view as render_view
-from mudg.gaussians.schedule import FiniteCheck, appearance_rates, densify_schedule, learning_rates, pose_round_due
-from mudg.gaussians.settings import METHODS, FitConfig
+from mudg.gaussians.schedule import (
+    FiniteCheck,
+    Progress,
+    appearance_rates,
+    densify_schedule,
+    learning_rates,
+    pose_round_due,
+    run_steps,
+)
+from mudg.gaussians.settings import METHODS, FitConfig, VirtualConfig
 from mudg.gaussians.storage import load_model as load_model
 from mudg.gaussians.storage import save_model as save_model
 from mudg.gaussians.trust import certainty_of, unseen_maps, unseen_rows
 from mudg.gaussians.views import TrainView, ViewSet, load_recorded
+from mudg.networks.featnets import FilterBank, LpipsFeatures
 from mudg.scene.clouds import read_fused
 from mudg.scene.fuse import fused_without_boxes
 from mudg.scene.observations import ObservationSet
@@ -77,26 +82,24 @@ def check(config: FitConfig, *, fused: bool, virtual: bool, continued: bool) -> 
         raise UsageError(f"{config.method} needs virtual observations", remedy=remedy)
 
 
-@dataclass(frozen=True)
-class FitInputs:
-    """What a fit reads: scene and fused cloud (folders), sets of virtual views by name, and the finished fit that it
-    goes on with."""
-
-    scene: Path
-    fused: Path
-    virtual: Mapping[str, ObservationSet] = field(default_factory=dict)
-    start: storage.StartFit | None = None
-
-
-def write_fit(config: FitConfig, inputs: FitInputs, work: RunDir) -> dict[str, Any]:
-    """Fit a scene and write the model to the work folder; returns a summary. An interrupted fit goes on from its newest
-    checkpoint. NumericsError: a loss or gradient is not finite. InputError: damaged inputs."""
+def write_fit(
+    config: FitConfig,
+    scene: Path,
+    fused: Path,
+    work: RunDir,
+    virtual: Mapping[str, ObservationSet] | None = None,
+    start: storage.StartFit | None = None,
+) -> dict[str, Any]:
+    """Fit a scene, from its folder and that of its fused cloud, and write the model to the work folder; returns a
+    summary. An interrupted fit goes on from its newest checkpoint. ``virtual``: sets of virtual views by name.
+    ``start``: the finished fit that it goes on with. NumericsError: a loss or gradient is not finite. InputError:
+    damaged inputs."""
     device = drawing_device(config.device, "fit", config.raster)
     config = recipe_of(config.method).used(config)
-    if inputs.start is not None:
+    if start is not None:
         config = storage.whole_run(config)
     with one_torch_thread(), memory_of(device, "fit"):
-        state = _prepare(config, inputs, work.path).to(device)
+        state = _prepare(config, scene, fused, virtual or {}, start, work.path).to(device)
         optimise(state, config, work)
         add_certainty(state, config)
     storage.save_model(state.model, work.path)
@@ -106,19 +109,16 @@ def write_fit(config: FitConfig, inputs: FitInputs, work: RunDir) -> dict[str, A
 
 
 @dataclass
-class FitState:
-    """Everything that changes while fitting, and what it is fitted to."""
+class FitState(Progress):
+    """Everything that changes while fitting, and what it is fitted to. ``begun_at``: steps of the schedule that counted
+    as done when the fit began, above 0 where it goes on with a finished one."""
 
     model: SceneModel
     views: ViewSet
     stats: DensifyStats
     schedule: DensifySettings | None
-    step: int
-    seconds: float = 0.0
-    last: Mapping[str, float] | None = None
     appearance: Appearance = field(default_factory=lambda: Appearance({}))
     begun_at: int = 0
-    """Steps of the schedule that counted as done when the fit began: above 0 where it goes on with a finished one."""
 
     @property
     def device(self) -> torch.device:
@@ -136,16 +136,23 @@ class FitState:
         return {**counts, "seconds": round(self.seconds, 2), **(self.last or {})}
 
 
-def _prepare(config: FitConfig, inputs: FitInputs, out: Path) -> FitState:
+def _prepare(
+    config: FitConfig,
+    folder: Path,
+    clouds: Path,
+    virtual: Mapping[str, ObservationSet],
+    start: storage.StartFit | None,
+    out: Path,
+) -> FitState:
     """Read views, then continue from the newest checkpoint or build the starting model."""
-    scene, fused, start = read_scene(inputs.scene), read_fused(inputs.fused), inputs.start
+    scene, fused = read_scene(folder), read_fused(clouds)
     if not METHODS[config.method].boxes:
-        scene, fused = replace(scene, tracks=()), fused_without_boxes(scene, inputs.fused)
-    shown, classes = recorded_views(config, scene, inputs.virtual, start, out)
-    if inputs.virtual:
+        scene, fused = replace(scene, tracks=()), fused_without_boxes(scene, clouds)
+    shown, classes = recorded_views(config, scene, virtual, start, out)
+    if virtual:
         measured = views.fused_lidar(fused, scene.tracks) if config.virtual.lidar_weight else None
-        loaded = views.load_virtual(inputs.virtual, classes, measured)
-        shown = replace(shown, virtual=views.keep(loaded, sum(map(len, inputs.virtual.values())), out))
+        loaded = views.load_virtual(virtual, classes, measured)
+        shown = replace(shown, virtual=views.keep(loaded, sum(map(len, virtual.values())), out))
     found = checkpoint.latest(out / "steps")
     if found is None and start is None:
         return start_state(config, scene, fused, shown, classes)
@@ -155,9 +162,10 @@ def _prepare(config: FitConfig, inputs: FitInputs, out: Path) -> FitState:
     model = SceneModel.from_state(found.state["model"], {name: found.tensors(name) for name in ("gaussians", "nodes")})
     stats, corrections = DensifyStats.from_state(found.tensors("stats")), found.tensors("appearance")
     appearance = Appearance.from_state(found.state["appearance"], corrections)
-    seconds, last = float(found.state["seconds"]), found.state["last"]
     begun_at = 0 if start is None else storage.begun_at(config.iterations)
-    return FitState(model, shown, stats, _schedule_of(config), found.step, seconds, last, appearance, begun_at)
+    state = FitState(model, shown, stats, _schedule_of(config), appearance, begun_at)
+    state.resume(found)
+    return state
 
 
 def recorded_views(
@@ -186,7 +194,7 @@ def start_state(
     model.facts |= {"method": config.method, "scene": scene.id, "classes": [palette.CLASSES[i] for i in classes]}
     model.facts |= drawing_facts(config.drawing)
     stats = DensifyStats.zeros(len(model.table))
-    return FitState(model, shown, stats, _schedule_of(config), 0, appearance=_nothing_corrected(config, shown))
+    return FitState(model, shown, stats, _schedule_of(config), _nothing_corrected(config, shown))
 
 
 def _schedule_of(config: FitConfig) -> DensifySettings | None:
@@ -200,7 +208,7 @@ def continued_state(config: FitConfig, start: storage.StartFit, shown: ViewSet, 
     appearance = storage.continued_appearance(start, _nothing_corrected(config, shown))
     log.info(f"start: {len(model.table)} Gaussians of {start.folder}")
     stats, step = DensifyStats.zeros(len(model.table)), storage.begun_at(config.iterations)
-    return FitState(model, shown, stats, _schedule_of(config), step, appearance=appearance, begun_at=step)
+    return FitState(model, shown, stats, _schedule_of(config), appearance, step, step=step)
 
 
 def _nothing_corrected(config: FitConfig, shown: ViewSet) -> Appearance:
@@ -214,73 +222,48 @@ def add_certainty(state: FitState, config: FitConfig) -> None:
     state.model.table.labels[CERTAINTY] = certainty
 
 
-# ---- the loop ------------------------------------------------------------------------------------
+# ---- a step --------------------------------------------------------------------------------------
 
 
 def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
     """Fit ``state.model`` to its views up to step ``config.iterations``, one view each (or two, see
-    ``VirtualConfig.beside``).
-
-    Same inputs, same result, also across an interruption: every draw comes from (seed, step), and checkpoints hold all
-    that changes. Ctrl-C (or SIGTERM) is taken at the end of a step: checkpoint, then KeyboardInterrupt.
-    """
+    ``VirtualConfig.beside``). Same inputs, same result, also across an interruption: every draw comes from (seed,
+    step), and checkpoints hold all that changes."""
     raster, perception = raster_of(state.model, config.raster), perception_of(config.virtual, state.device)
     virtual_from, virtual_to = (share * config.iterations for share in (config.virtual.start, config.virtual.stop))
-    virtual_from, pace = state.begun_at or virtual_from, checkpoint.Pace()
+    virtual_from = state.begun_at or virtual_from
     sizes = views.HalvedViews(config.virtual.half_size * config.iterations)
 
-    with log.task(f"fit {config.method}", config.iterations, state.step) as bar, Interruption() as interruption:
-        while state.step < config.iterations:
-            began = time.perf_counter()
-            step = state.step + 1
-            if step - 1 <= virtual_from < step and state.views.virtual and config.virtual.gaussians:
-                start_unseen_gaussians(state, config, raster)
-            probability = config.virtual.probability if virtual_from < step <= virtual_to else 0.0
-            chosen = state.views.choose(config.seed, step, probability, config.virtual.beside)
-            # The one way to the device; results come back in gaussians/rendering.py.
-            seen = [sizes.sized(view, step).as_tensors(state.device) for view in chosen]
-            check = FiniteCheck(step, at_once=state.device.type == "cpu")
-            learn = partial(_learn_from, state, config=config, raster=raster, perception=perception, check=check)
-            learnt = [learn(view, step=step, first=view is seen[0]) for view in seen]
-            check.refuse()
-            adam_step(state.model, step, config.iterations, state.begun_at)
-            rates = appearance_rates(step, config.iterations)
-            state.appearance.adam_step(step - state.begun_at, rates, native_ops.adam_columns)
-            if step % SHAPE_EVERY == 0:
-                shorten_needles(state.model.table, config.densify.longest_to_middle)
-                now, first = (learning_rates(at, config.iterations)["deform"] for at in (step, 1))
-                for node in state.model.nodes:
-                    if isinstance(node, RigidNode):  # less and less, as the steps of the optimiser shrink
-                        node.after_step(now / first)
-            if pose_round_due(config, step):
-                moved_m = refine_poses(state.model, state.views.recorded, raster, state.appearance)
-                folder.log(step=step, boxes_moved_m=round(moved_m, 5))
-            densified = densify_if_due(state.model, state.stats, state.schedule, step, config.seed)
-            if densified:
-                state.stats = DensifyStats.zeros(len(state.model.table), state.device)
+    def take(step: int) -> tuple[dict[str, Any], partial[dict[str, float]]]:
+        if step - 1 <= virtual_from < step and state.views.virtual and config.virtual.gaussians:
+            start_unseen_gaussians(state, config, raster)
+        probability = config.virtual.probability if virtual_from < step <= virtual_to else 0.0
+        chosen = state.views.choose(config.seed, step, probability, config.virtual.beside)
+        # The one way to the device; results come back in gaussians/rendering.py.
+        seen = [sizes.sized(view, step).as_tensors(state.device) for view in chosen]
+        check = FiniteCheck(step)
+        learn = partial(_learn_from, state, config=config, raster=raster, perception=perception, check=check)
+        learnt = [learn(view, step=step, first=view is seen[0]) for view in seen]
+        check.refuse()
+        adam_step(state.model, step, config.iterations, state.begun_at)
+        rates = appearance_rates(step, config.iterations)
+        state.appearance.adam_step(step - state.begun_at, rates, native_ops.adam_columns)
+        if step % SHAPE_EVERY == 0:
+            shorten_needles(state.model.table, config.densify.longest_to_middle)
+            now, first = (learning_rates(at, config.iterations)["deform"] for at in (step, 1))
+            for node in state.model.nodes:
+                if isinstance(node, RigidNode):  # less and less, as the steps of the optimiser shrink
+                    node.after_step(now / first)
+        if pose_round_due(config, step):
+            moved_m = refine_poses(state.model, state.views.recorded, raster, state.appearance)
+            folder.log(step=step, boxes_moved_m=round(moved_m, 5))
+        densified = densify_if_due(state.model, state.stats, state.schedule, step, config.seed)
+        if densified:
+            state.stats = DensifyStats.zeros(len(state.model.table), state.device)
+        return {"view": seen[0].name, **densified}, partial(_numbers, state, seen[0], *learnt[0])
 
-            state.step, state.seconds = step, state.seconds + time.perf_counter() - began
-            if step % 20 == 0 or step == config.iterations or densified:
-                state.last = _progress(state, seen[0], *learnt[0])
-                folder.log(step=step, view=seen[0].name, seconds=round(state.seconds, 3), **state.last, **densified)
-                shown = f"psnr {state.last['psnr']:.1f}, " if "psnr" in state.last else ""
-                bar.update(f"{shown}{len(state.model.table)} Gaussians")
-            if step % config.preview_every == 0 or step == config.iterations:
-                write_preview(state, raster, folder.path / "preview" / f"{step:06d}.png")
-            if interruption.requested or (step % config.checkpoint_every == 0 and pace.due()):
-                with pace.saving():
-                    save_checkpoint(state, folder.path / "steps")
-            bar.advance()
-            if interruption.requested:
-                folder.pause(state.summary())
-                interruption.stop_now()
-
-
-class LearntPicture(NamedTuple):
-    """What a step rendered: colours f32[3, H, W] without the sky, and coverage f32[1, H, W]."""
-
-    rgb: Tensor
-    alpha: Tensor
+    save = lambda: save_checkpoint(state, folder.path / "steps")
+    run_steps(state, config, folder, take, save, lambda path: write_preview(state, raster, path))
 
 
 def _learn_from(
@@ -293,10 +276,10 @@ def _learn_from(
     raster: RasterConfig,
     perception: Perception,
     check: FiniteCheck,
-) -> tuple[LearntPicture, dict[str, Tensor]]:
-    """Render a view and add the gradients of its loss to the parameters'. Returns the picture (not all that was
-    rendered: that would stay in memory while the next view is), and the weighted loss terms. ``first``: of the views of
-    this step; terms that do not depend on the view count with it."""
+) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """Render a view and add the gradients of its loss to the parameters'. Returns colours f32[3, H, W] without the sky
+    and coverage f32[1, H, W] (not all that was rendered: that would stay in memory while the next view is), and the
+    weighted loss terms. ``first``: of the views of this step; terms that do not depend on the view count with it."""
     recipe, recorded = recipe_of(config.method), view.kind == "recorded"
     model = recipe.drawn_model(state.model, view, step, config) if recorded else state.model
     growing = recorded and isinstance(state.schedule, DensifySettings) and step <= state.schedule.stop
@@ -320,7 +303,7 @@ def _learn_from(
         timed = state.model.table["tau"].grad if "tau" in state.model.table.columns else None
         state.stats.observe(render.trace, camera.width, camera.height, state.model.counts()[0], timed)
     terms = {name: term.detach() for name, term in terms.items()}
-    return LearntPicture(render.rgb.detach(), render.alpha.detach()), terms
+    return render.rgb.detach(), render.alpha.detach(), terms
 
 
 def start_unseen_gaussians(state: FitState, config: FitConfig, raster: RasterConfig) -> None:
@@ -390,6 +373,34 @@ def virtual_terms(
     return terms
 
 
+Perception = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""Render ``[3, H, W]`` and target ``[3, H, W]`` in [0, 1], weight ``[1, H, W]`` -> distance, differentiable in the
+render."""
+
+
+def perception_of(config: VirtualConfig, device: torch.device | None = None) -> Perception:
+    """The distance that ``config.perception`` names, of images on a device (None: the CPU). UsageError: LPIPS without a
+    file of its weights. InputError: the file holds something else."""
+    features: nn.Module = FilterBank()
+    distance = losses.feature_distance
+    if config.perception == "lpips":
+        if not config.lpips_weights:
+            what, remedy = "LPIPS needs a weight file", "set virtual.lpips_weights"
+            raise UsageError(what, where="virtual.perception lpips", remedy=remedy)
+        features = trunk = LpipsFeatures(read_checkpoint(Path(config.lpips_weights)), config.lpips_weights)
+        distance = lambda render, target, weight: losses.lpips_distance(
+            render, losses.unit_features(target), weight, trunk.channel_weights
+        )
+    features = features.to(device)
+
+    def compare(render: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+        with torch.no_grad():
+            wanted = features(target)
+        return distance(features(render), wanted, weight)
+
+    return compare
+
+
 def correction_terms(
     state: FitState, gaussians: Gaussians, view: TrainView, config: FitConfig, raster: RasterConfig, step: int
 ) -> dict[str, Tensor]:
@@ -407,9 +418,6 @@ def correction_terms(
     return terms
 
 
-# ---- the optimiser -------------------------------------------------------------------------------
-
-
 def adam_step(model: SceneModel, step: int, iterations: int, begun_at: int = 0) -> None:
     """One Adam step on every table of the model, then gradients are dropped; moments are those of the steps after
     ``begun_at``."""
@@ -419,26 +427,20 @@ def adam_step(model: SceneModel, step: int, iterations: int, begun_at: int = 0) 
         table.clear_gradients()
 
 
-# ---- on disk -------------------------------------------------------------------------------------
-
-
 def save_checkpoint(state: FitState, folder: Path) -> None:
     """All that changes: model with moments, statistics, step."""
     values, groups = state.model.state()
     groups = {**groups, "stats": state.stats.state()}
     names, groups["appearance"] = state.appearance.state()
     groups["appearance"] = groups["appearance"] or {"none": torch.zeros(1)}
-    facts = {"model": values, "seconds": state.seconds, "last": dict(state.last or {}), "appearance": names}
-    checkpoint.save(folder, state.step, groups, facts)
+    checkpoint.save(folder, state.step, groups, {"model": values, **state.facts(), "appearance": names})
 
 
-# ---- pictures ------------------------------------------------------------------------------------
-
-
-def _progress(state: FitState, view: TrainView, render: LearntPicture, terms: Mapping[str, Tensor]) -> dict[str, float]:
+def _numbers(
+    state: FitState, view: TrainView, rgb: Tensor, alpha: Tensor, terms: Mapping[str, Tensor]
+) -> dict[str, float]:
     with torch.no_grad():
-        rgb = composite_sky(state.model, view.view, render.rgb, render.alpha)
-        psnr = metrics.psnr(rgb, view.rgb, view.mask)
+        psnr = metrics.psnr(composite_sky(state.model, view.view, rgb, alpha), view.rgb, view.mask)
         values = torch.stack(list(terms.values())).tolist()
     seen = {} if math.isnan(psnr) else {"psnr": round(min(psnr, 99.0), 3)}  # no pixel of a generated view may count
     return {**seen, **{f"loss_{name}": round(value, 6) for name, value in zip(terms, values)}}

@@ -38,8 +38,8 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import CLASSES, ID
 from mudg.base.types import Gaussians, View
 from mudg.core import native_ops
-from mudg.core.shutter import Readout, as_read, moved_by
 from mudg.core.table import Table
+from mudg.core.trajectory import Readout, as_read, moved_by
 from mudg.gaussians.nodes import NodeRows, RigidNode, SkyNode, StaticNode
 
 NODES: Final[Mapping[str, str]] = {
@@ -155,8 +155,6 @@ class SceneModel:
         nodes = tuple(moved.moved(object_from_new) if node is moved else node for node in self.nodes)
         return replace(self, nodes=nodes, facts=dict(self.facts))
 
-    # -- state -------------------------------------------------------------------------------------
-
     def state(self) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
         """JSON values and named groups of tensors (``gaussians``, ``nodes``) that rebuild the model with its
         moments."""
@@ -167,8 +165,6 @@ class SceneModel:
             tensors |= {f"{index}/{name}": value for name, value in own.items()}
         tensors.setdefault("none", torch.zeros(1))
         values = {"nodes": nodes, "classes": list(self.classes), "sh_degree": self.sh_degree, "facts": self.facts}
-        if self.sh_degree > 0:
-            values["harmonics"] = "node"  # in the frame of their object
         if self.colors.to_common:
             values["camera_colors"] = self.colors.record()
         return values, {"gaussians": self.table.state(), "nodes": tensors}
@@ -192,9 +188,8 @@ class SceneModel:
         table = Table.from_state(groups["gaussians"])
         owner = table.labels["node"]
         if len(owner) and (int(owner.min()) < 0 or int(owner.max()) >= len(nodes)):
-            raise InputError(
-                "a Gaussian belongs to no node of the scene", got=f"node {int(owner.max())} of {len(nodes)}"
-            )
+            got = f"node {int(owner.max())} of {len(nodes)}"
+            raise InputError("a Gaussian belongs to no node of the scene", got=got)
         classes = tuple(int(value) for value in values["classes"])
         if any(not 0 <= value < len(CLASSES) for value in classes):
             raise InputError("a semantic class does not exist", expected=f"0..{len(CLASSES) - 1}", got=str(classes))
@@ -202,18 +197,12 @@ class SceneModel:
             what = "the Gaussians have other classes than the scene"
             raise InputError(what, expected=f"{len(classes)} channels", got=str(tuple(table["semantics"].shape)))
         colors = CameraColors.of_record(values["camera_colors"]) if "camera_colors" in values else SAME_COLORS
-        degree = int(values["sh_degree"])
-        if degree > 0 and values.get("harmonics") != "node":
-            what, remedy = "the scene's spherical harmonics are not in the frames of its objects", "fit the scene again"
-            raise InputError(what, where="harmonics", expected="node", got=str(values.get("harmonics")), remedy=remedy)
-        return cls(table, tuple(nodes), sky, classes, degree, dict(values["facts"]), colors)
+        return cls(table, tuple(nodes), sky, classes, int(values["sh_degree"]), dict(values["facts"]), colors)
 
 
 def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussians:
-    """All Gaussians of the scene in the world at a time, activated, differentiable in every column.
-
-    Objects that do not exist at that time stay in the rows with opacity 0, so that rows always match the table.
-    ``semantics``: add the class logits as ``extra`` channels."""
+    """All Gaussians of the scene in the world at a time, activated, differentiable in every column. Objects that do not
+    exist then stay in the rows with opacity 0. ``semantics``: add the class logits as ``extra`` channels."""
     table, counts = model.table, model.counts()
     all_rows = NodeRows(table["means"], table["quats"], torch.sigmoid(table["logits"]), table["sh_dc"])
     common = (all_rows.means, all_rows.quats, all_rows.opacity, all_rows.sh_dc)
@@ -248,7 +237,7 @@ def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussia
 
 def compose_as_read(model: SceneModel, view: View, readout: Readout | None, semantics: bool = True) -> Gaussians:
     """``compose`` at a view's time. With a read-out, every Gaussian is where the view's camera, standing still, sees it
-    as its rolling shutter did (``core/shutter.py``); how an object deforms meanwhile is left out."""
+    as its rolling shutter did (``core/trajectory.py``); how an object deforms meanwhile is left out."""
     gaussians = compose(model, view.time_s, semantics)
     if readout is None:
         return gaussians
@@ -272,10 +261,7 @@ def composite_sky(model: SceneModel, view: View, rgb: Tensor, alpha: Tensor) -> 
 
 def sky_lift(model: SceneModel, alpha: Tensor) -> tuple[int, Tensor] | None:
     """Channel of the sky among the class logits and what it gains ``[H, W]`` where nothing covers it; None without that
-    class.
-
-    The opacity is taken as it is (no gradient through it from here): classes do not carve geometry.
-    """
+    class. No gradient goes through the opacity: classes do not carve geometry."""
     if ID["sky"] not in model.classes:
         return None
     return model.classes.index(ID["sky"]), SKY_LOGIT * (1 - alpha.detach()[0])

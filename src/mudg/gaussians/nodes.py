@@ -1,9 +1,6 @@
-"""The nodes of a scene: a static world, and one node per dynamic object. Each says how its Gaussians lie at a time.
-
-``Node.at_time`` is the one place where time changes a Gaussian: it is given the node's rows and returns them as they
-are then, moved, faded or recoloured. A rigid node moves them with its box; a deformable one also within it. A new kind
-of node is a class with ``at_time`` and one row in ``model.NODES``.
-"""
+"""The nodes of a scene: a static world, and one node per dynamic object. ``Node.at_time`` is the one place where time
+changes a Gaussian: a rigid node moves its rows with its box, a deformable one also within it. A new kind of node is a
+class with ``at_time`` and one row in ``model.NODES``."""
 
 from __future__ import annotations
 
@@ -55,10 +52,8 @@ def second_differences(times_s: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def key_noise(times_s: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Standard deviation f64[C] of independent noise on the keys ``values`` f64[K, C]; 0 for fewer than `FEWEST_KEYS`
-    keys.
-
-    Third differences are blind to constant acceleration, and the median (Gaussian consistency 0.6745) to single jerks.
-    """
+    keys. Third differences are blind to constant acceleration, and the median (Gaussian consistency 0.6745) to single
+    jerks."""
     count = len(times_s)
     if count < FEWEST_KEYS:
         return np.zeros(values.shape[1])
@@ -71,12 +66,8 @@ def key_noise(times_s: NDArray[np.float64], values: NDArray[np.float64]) -> NDAr
 
 
 def motion_weights(accelerations: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weights [M] of the inner keys, from their accelerations f64[M, C] in units of the usual one: 1 and more for even
-    motion.
-
-    Student's t with `TAIL` degrees of freedom instead of a Gaussian: turning into a side street is rare, not
-    impossible.
-    """
+    """Weights [M] of the inner keys, from their accelerations f64[M, C] in units of the usual one: Student's t with
+    `TAIL` degrees of freedom instead of a Gaussian, for turning into a side street is rare, not impossible."""
     return (TAIL + 1) / (TAIL + (accelerations**2).mean(1))
 
 
@@ -84,11 +75,7 @@ def smoothed(
     times_s: NDArray[np.float64], values: NDArray[np.float64], noise: float, acceleration: float
 ) -> NDArray[np.float64]:
     """The likeliest values f64[K, C] behind noisy keys, given the size of noise and of acceleration (standard
-    deviations).
-
-    Reweighted least squares, five rounds. Means and straight lines stay as they are. No noise, or fewer than three
-    keys: as given.
-    """
+    deviations), by five rounds of reweighted least squares. No noise, or fewer than three keys: as given."""
     if noise <= 0 or len(times_s) < 3:
         return values.copy()
     difference = second_differences(times_s) * (noise / acceleration)
@@ -188,13 +175,12 @@ class RigidNode(Node):
     """A tracked dynamic object: rows in the frame of its box, carried by the box's pose.
 
     The pose at a time comes from the two neighbouring keys of the track. Each key may be corrected by offsets in the
-    frame of the box, ``corrected = world_from_object @ (yaw about z, then dx dy dz)``; **both** neighbours' corrected
+    frame of the box, ``corrected = world_from_object @ (yaw about z, then dx dy dz)``; both neighbours' corrected
     positions and rotations are interpolated (straight line, slerp). Outside the track's span the object does not exist.
 
     The offsets, one row per key: ``shift`` [K, 3] metres and ``yaw`` [K] radians; ``learn_pose``: whether a fit may
-    change them, not by gradient steps but by ``gaussians/poses.py``. Poses are worked out on the CPU, also where the
-    offsets are on another device: a copy of them is kept here, and what moves the rows at a time goes there once.
-    """
+    change them, not by gradient steps but by ``gaussians/corrections.py``. Poses are worked out on the CPU, also where
+    the offsets are on another device: a copy is kept here, and what moves the rows at a time goes there once."""
 
     kind = "rigid"
 
@@ -233,8 +219,6 @@ class RigidNode(Node):
         """Starting values of what a kind of node has per key besides the offsets."""
         return {}
 
-    # -- pose --------------------------------------------------------------------------------------
-
     def _offsets_here(self) -> tuple[Tensor, Tensor]:
         """Shift and yaw on the CPU: the columns themselves, or the copy of those of another device."""
         shift, yaw = self.offsets["shift"], self.offsets["yaw"]
@@ -272,8 +256,7 @@ class RigidNode(Node):
         return after - 1, after, float((time_s - times[after - 1]) / (times[after] - times[after - 1]))
 
     def pose_at(self, time_s: float) -> tuple[Tensor, Tensor] | None:
-        """Position ``[3]`` m and unit quaternion ``[4]`` at a time, on the CPU; differentiable in the offsets if they
-        are there. None outside the span."""
+        """Position ``[3]`` m and unit quaternion ``[4]`` at a time, on the CPU; None outside the span."""
         found = self.keys_around(time_s)
         if found is None:
             return None
@@ -316,10 +299,8 @@ class RigidNode(Node):
         self.add_offsets(shift - now[0], yaw - now[1])
 
     def settled_offsets(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Offsets that take independent noise out of the track: shift f64[K, 3] m and yaw f64[K] rad.
-
-        The size of the noise is what the track itself betrays, at least `LEAST_NOISE_M` and `LEAST_NOISE_RAD`.
-        """
+        """Offsets that take independent noise out of the track, of the size that it betrays itself: shift f64[K, 3] m
+        and yaw f64[K] rad."""
         positions = self.world_from_object[:, :3, 3]
         heading = np.unwrap([geometry.yaw_of(pose) for pose in self.world_from_object])
         noise = key_noise(self.times_s, np.column_stack([positions, heading]))
@@ -328,8 +309,6 @@ class RigidNode(Node):
         path = smoothed(self.times_s, positions, noise_m, ACCELERATION_M_S2) - positions
         turn = smoothed(self.times_s, heading[:, None], noise_rad, YAW_ACCELERATION_RAD_S2)[:, 0] - heading
         return (self.world_from_object[:, :3, :3].transpose(0, 2, 1) @ path[..., None])[..., 0], turn
-
-    # -- rows --------------------------------------------------------------------------------------
 
     def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
         """See ``Node``."""
@@ -408,15 +387,10 @@ class RigidNode(Node):
 
 
 class DeformableNode(RigidNode):
-    """A person or a cyclist: a rigid node whose rows also move within the box, differently at every time.
-
-    The deformation is a grid of control points that spans the box (the corners of `DEFORM_CELLS` cells); each has a
-    displacement at every key of the track, and a row moves by what its place in the grid interpolates (three-linear in
-    space, linear in time; free-form deformation, Sederberg & Parry 1986). The rows of the shared table need no column
-    of their own for it, so cloning and splitting them changes nothing, and a static Gaussian pays nothing.
-
-    Parameters: as ``RigidNode``, and ``deform`` [K, 3, z, y, x], metres in the frame of the box.
-    """
+    """A person or a cyclist: a rigid node whose rows also move within the box, differently at every time: by a grid of
+    control points that spans it (the corners of `DEFORM_CELLS` cells), each with a displacement at every key of the
+    track (free-form deformation, Sederberg & Parry 1986). Column ``deform`` [K, 3, z, y, x], metres in the frame of the
+    box, beside those of ``RigidNode``."""
 
     kind = "deformable"
 
@@ -491,11 +465,9 @@ def object_node(track: Track, learn_pose: bool = False, deformable: bool = False
 
 
 class SkyNode:
-    """Colour of the sky by direction: a longitude-latitude panorama, seen wherever nothing covers it.
-
-    Column ``panorama`` ``[1, 3, Hs, 2 Hs]``, colours around [0, 1] (raw; clamped when an image is written). Row 0 looks
-    straight up, the last row straight down; the columns run from longitude -pi to pi (world x axis in the middle).
-    """
+    """Colour of the sky by direction, seen wherever nothing covers it: a panorama, column ``panorama`` ``[1, 3, Hs, 2
+    Hs]``, raw colours around [0, 1]. Row 0 looks straight up, the last row straight down; the columns run from
+    longitude -pi to pi (world x axis in the middle)."""
 
     kind = "sky"
 
@@ -514,47 +486,22 @@ class SkyNode:
         return int(self.table["panorama"].shape[2])
 
     def coarse_picture(self, view: View) -> Tensor:
-        """Sky colour ``[3, h, w]`` on a coarse grid of a view's pixels; differentiable in the panorama.
-
-        The panorama is far coarser than an image, so it is sampled for every s-by-s block of pixels (s chosen such that
-        samples stay denser than texels), to be interpolated between them.
-        """
-        camera = view.camera
+        """Sky colour ``[3, h, w]`` on a coarse grid of a view's pixels, to be interpolated between them (the panorama
+        is far coarser than an image); differentiable in the panorama."""
         texel_rad = np.pi / self.rows
-        stride = int(np.clip(0.7 * texel_rad * min(camera.fx, camera.fy), 1, 8))
-        height, width = -(-camera.height // stride), -(-camera.width // stride)
-        here = self.table.device.type == "cpu"
-        grid = torch.from_numpy(self._grid(view, height, width)) if here else self._grid_there(view, height, width)
-        grid = grid.to(self.table["panorama"].dtype)
-        padded = F.pad(self.table["panorama"], (1, 1, 0, 0), mode="circular")
-        return F.grid_sample(padded, grid[None], mode="bilinear", padding_mode="border", align_corners=False)[0]
-
-    def _grid(self, view: View, height: int, width: int) -> NDArray[np.float32]:
-        """Sampling positions in the padded panorama, ``f32[height, width, 2]`` in [-1, 1]."""
-        x, y = geometry.pixel_rays(view.camera.resized(width, height))
-        # Written out: a matrix product of this shape wakes the threads of BLAS at every step of a fit.
-        right, down, ahead = view.world_from_cam[:3, 0], view.world_from_cam[:3, 1], view.world_from_cam[:3, 2]
-        rays = x[None, :, None] * right + (y[:, None, None] * down + ahead)
-        return self.panorama_grid(rays, padding=1)
-
-    def _grid_there(self, view: View, height: int, width: int) -> Tensor:
-        """As ``_grid``, computed where the panorama is, from plain numbers: nothing is copied there."""
-        camera, device = view.camera.resized(width, height), self.table.device
-        columns, rows = (torch.arange(n, dtype=torch.float64, device=device) + 0.5 for n in (width, height))
+        stride = int(np.clip(0.7 * texel_rad * min(view.camera.fx, view.camera.fy), 1, 8))
+        height, width = -(-view.camera.height // stride), -(-view.camera.width // stride)
+        camera, panorama = view.camera.resized(width, height), self.table["panorama"]
+        # computed where the panorama is, from plain numbers: nothing is copied there
+        columns, rows = (torch.arange(n, dtype=torch.float64, device=panorama.device) + 0.5 for n in (width, height))
         across, down = geometry.pinhole_ray(camera.intrinsics, columns, rows)
         pose = view.world_from_cam[:3, :3].tolist()
         x, y, z = (across * right + (down[:, None] * below + ahead) for right, below, ahead in pose)
-        span = 2 * self.rows / (2 * self.rows + 2)
         longitude, elevation = torch.atan2(y, x), torch.atan2(z, torch.hypot(x, y))
-        return torch.stack([(longitude / np.pi) * span, -2 * elevation / np.pi], -1)
-
-    def panorama_grid(self, directions_world: NDArray[np.float64], padding: int = 0) -> NDArray[np.float32]:
-        """Directions ``[..., 3]`` to panorama positions ``[..., 2]`` in [-1, 1] (x: longitude, y: from up to down)."""
-        longitude = np.arctan2(directions_world[..., 1], directions_world[..., 0])
-        elevation = np.arctan2(directions_world[..., 2], np.hypot(directions_world[..., 0], directions_world[..., 1]))
-        columns = 2 * self.rows
-        x = (longitude / np.pi) * columns / (columns + 2 * padding)
-        return np.stack([x, -2 * elevation / np.pi], -1).astype(np.float32)
+        padded, texels = F.pad(panorama, (1, 1, 0, 0), mode="circular"), 2 * self.rows
+        grid = torch.stack([(longitude / np.pi) * texels / (texels + 2), -2 * elevation / np.pi], -1)
+        grid = grid.float().to(panorama.dtype)[None]
+        return F.grid_sample(padded, grid, mode="bilinear", padding_mode="border", align_corners=False)[0]
 
     def fill(self, measured: Iterable[tuple[NDArray[np.float64], NDArray[np.float32]]]) -> None:
         """Start from measured sky colours: mean per texel; texels nobody saw take the nearest seen one's colour.
@@ -563,7 +510,9 @@ class SkyNode:
         rows, columns = self.rows, 2 * self.rows
         total, count = np.zeros((3, rows * columns)), np.zeros(rows * columns)
         for directions_world, rgb in measured:
-            grid = self.panorama_grid(directions_world)
+            longitude = np.arctan2(directions_world[:, 1], directions_world[:, 0])
+            elevation = np.arctan2(directions_world[:, 2], np.hypot(directions_world[:, 0], directions_world[:, 1]))
+            grid = np.stack([longitude / np.pi, -2 * elevation / np.pi], -1).astype(np.float32)
             column = np.clip(((grid[:, 0] + 1) / 2 * columns).astype(np.int64), 0, columns - 1)
             row = np.clip(((grid[:, 1] + 1) / 2 * rows).astype(np.int64), 0, rows - 1)
             texel = row * columns + column

@@ -117,6 +117,31 @@ class OwnRecipe(Recipe):
                 raise UsageError(f"{config.method} {reason}", where=name, expected=expected, got=got, remedy=remedy)
 
 
+REPAIRED: Final = {
+    "probability": 0.3,
+    "continued_probability": 0.3,
+    "color_weight": 0.3,
+    "ssim_weight": 0.2,
+    "gaussians": 0,
+    **dict.fromkeys(("perceptual_weight", "depth_weight", "lidar_weight", "semantic_weight"), 0.0),
+}
+"""Settings of ``virtual`` that ``difix`` fixes: three in ten steps learn from the colour of a repaired render."""
+
+
+class RepairRecipe(Recipe):
+    """The fit of ``difix``: Difix3D (Wu et al. 2025), a scene that learns from its own renders beside the path,
+    repaired.
+
+    Published, and here: renders at poses that move towards the wanted ones step by step (``benchmarks/chain.py``) are
+    repaired in one pass of a network that sees the render and a recorded image. Different here (``docs/baselines.md``):
+    the network is our diffusion model; objects have boxes, as in ``street_gaussians``. Left out: the repair of what the
+    finished scene shows."""
+
+    def used(self, config: FitConfig) -> FitConfig:
+        """See ``Recipe``."""
+        return replace(config, virtual=replace(config.virtual, **REPAIRED))
+
+
 RECIPES: Final[Mapping[str, str]] = {
     "gs3d": "mudg.gaussians.recipes:OwnRecipe",
     "bezier": "mudg.baselines.bezier:BezierRecipe",
@@ -125,10 +150,10 @@ RECIPES: Final[Mapping[str, str]] = {
     "s3gaussian": "mudg.baselines.s3gaussian:FieldRecipe",
 }
 """Of published methods that are fitted to recorded views alone: where their class is, imported when it is needed."""
-SUPERVISED: Final[Mapping[str, str]] = {"difix": "mudg.baselines.difix:RepairRecipe"}
 
 
 def recipe_of(method: str) -> Recipe:
     """What a method does beyond the common loop."""
-    home = RECIPES.get(method) or SUPERVISED.get(method)
-    return Recipe() if home is None else pkgutil.resolve_name(home)()
+    if method in RECIPES:
+        return pkgutil.resolve_name(RECIPES[method])()
+    return RepairRecipe() if method == "difix" else Recipe()

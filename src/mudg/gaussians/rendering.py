@@ -15,7 +15,7 @@ from torch import Tensor
 from mudg.base import geometry, palette
 from mudg.base.types import Gaussians, Observation, Render, RenderPlanes, View
 from mudg.core.raster.rasterize import Backend, RasterConfig, rasterize
-from mudg.core.shutter import Readout
+from mudg.core.trajectory import Readout
 from mudg.gaussians.model import SceneModel, compose, compose_as_read, composite_semantics, composite_sky
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.settings import DrawingConfig

@@ -1,30 +1,93 @@
-"""When a fit does what: learning rates, densification and rounds of box corrections as functions of the step.
-
-Steps count from 1 to the length of the run; a fit that goes on with a finished one begins in the middle
-(``gaussians/storage.py``).
-"""
+"""The loop of a fit, and when it does what: learning rates, densification and rounds of box corrections as functions of
+the step. Steps count from 1; a fit that goes on with a finished one begins in the middle (``gaussians/storage.py``)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from mudg.base import checkpoint, log
 from mudg.base.errors import NumericsError
-from mudg.core.table import Table
-from mudg.gaussians.appearance import Appearance
+from mudg.base.processes import Interruption
+from mudg.base.run_folder import RunDir
+from mudg.gaussians.corrections import Appearance
 from mudg.gaussians.densify import DensifySettings
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.settings import DensifyConfig, FitConfig, StartConfig
 
+# the loop -----------------------------------------------------------------------------------------
+
+LOG_EVERY = 20
+
+
+@dataclass(kw_only=True)
+class Progress:
+    """How far a fit is: finished steps, their seconds, and the numbers of the last one that was logged."""
+
+    step: int = 0
+    seconds: float = 0.0
+    last: Mapping[str, float] | None = None
+
+    def facts(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return {"seconds": self.seconds, "last": dict(self.last or {})}
+
+    def resume(self, found: checkpoint.Checkpoint) -> None:
+        """Inverse of ``facts``."""
+        self.step, self.seconds, self.last = found.step, float(found.state["seconds"]), found.state["last"]
+
+    def summary(self) -> dict[str, Any]:
+        """For run.json; the first entry is the size of what is fitted."""
+        raise NotImplementedError
+
+
+def run_steps(
+    state: Progress,
+    config: FitConfig,
+    folder: RunDir,
+    take: Callable[[int], tuple[dict[str, Any], Callable[[], dict[str, float]]]],
+    save: Callable[[], None],
+    draw: Callable[[Path], None],
+) -> None:
+    """Take steps up to ``config.iterations``, with log, checkpoints and pictures. Ctrl-C (or SIGTERM) is taken at the
+    end of a step: checkpoint, then KeyboardInterrupt. ``take``: does a step and returns facts for the log and what
+    makes its numbers; ``rows`` among the facts, after densification, are always logged."""
+    pace = checkpoint.Pace()
+    with log.task(f"fit {config.method}", config.iterations, state.step) as bar, Interruption() as interruption:
+        while state.step < config.iterations:
+            began, step = time.perf_counter(), state.step + 1
+            facts, numbers = take(step)
+            state.step, state.seconds = step, state.seconds + time.perf_counter() - began
+            if step % LOG_EVERY == 0 or step == config.iterations or "rows" in facts:
+                state.last = numbers()
+                folder.log(step=step, seconds=round(state.seconds, 3), **facts, **state.last)
+                shown = f"psnr {state.last['psnr']:.1f}, " if "psnr" in state.last else ""
+                what, size = next(iter(state.summary().items()))
+                bar.update(f"{shown}{size} {what}")
+            if step % config.preview_every == 0 or step == config.iterations:
+                draw(folder.path / "preview" / f"{step:06d}.png")
+            if interruption.requested or (step % config.checkpoint_every == 0 and pace.due()):
+                with pace.saving():
+                    save()
+            bar.advance()
+            if interruption.requested:
+                folder.pause(state.summary())
+                interruption.stop_now()
+
+
 # finite -------------------------------------------------------------------------------------------
 #
 # Nothing that is not finite reaches the parameters: loss terms and gradients are checked before every step of the
-# optimiser. On the CPU each is looked at as soon as it is known. On another device looking means waiting for all that
-# was sent there, so the numbers of a whole step are gathered there and come back in one copy.
+# optimiser. To look at a number on another device means waiting for all that was sent there, so those of a whole step
+# are gathered and come back in one copy.
 
 SCENE_REMEDY = "the parameters are those of the step before; report the scene, or leave this view out"
 VIEW_REMEDY = "the parameters are those of the step before; leave this view out"
@@ -32,53 +95,48 @@ TERM_REMEDY = "check this view's image and labels; the parameters are those of t
 
 
 class FiniteCheck:
-    """The numbers of one step that must be finite, in the order in which they were computed. ``step``: for messages.
-    ``at_once``: look at every number when it is added, not in ``refuse``."""
+    """The numbers of one step that must be finite, in the order in which they were computed. ``step``: for messages."""
 
-    def __init__(self, step: int, at_once: bool) -> None:
-        self._step, self._at_once = step, at_once
+    def __init__(self, step: int) -> None:
+        self._step = step
         self._numbers: list[Tensor] = []
-        self._facts: list[tuple[str, str, str, tuple[Table, Tensor] | None]] = []
-        """Of each number: what it is, where, the remedy; of a sum of gradients their table and themselves."""
+        self._facts: list[tuple[str, str, str, Tensor, Callable[[], None]]] = []
+        """Of each number: what it is, where, the remedy, what it is the sum of, and what drops that."""
+
+    def _add(self, what: str, where: str, remedy: str, values: Tensor, drop: Callable[[], None]) -> None:
+        self._numbers.append(values.detach().sum())
+        self._facts.append((what, f"{where}, step {self._step}", remedy, values.detach(), drop))
 
     def terms(self, view: str, terms: Mapping[str, Tensor]) -> None:
         """Add the loss terms of a view."""
         for name, value in terms.items():
-            self._numbers.append(value.detach())
-            self._facts.append((f"the loss term {name!r}", f"view {view}, step {self._step}", TERM_REMEDY, None))
-        if self._at_once:
-            self.refuse()
+            self._add(f"the loss term {name!r}", f"view {view}", TERM_REMEDY, value, lambda: None)
+
+    def sums(self, view: str, gradients: Mapping[str, Tensor], remedy: str, drop: Callable[[], None]) -> None:
+        """Add gradients after the backward pass of a view, by their sums: the cheapest pass over memory there is."""
+        for name, gradient in gradients.items():
+            self._add("a gradient", f"{name}, view {view}", remedy, gradient, drop)
 
     def gradients(self, view: str, model: SceneModel, appearance: Appearance) -> None:
-        """Add the gradients after the backward pass of a view, by their sums: the cheapest pass over memory there
-        is."""
+        """Add those of everything that a fit learns."""
         learnt = {"gaussians": model.table, **model.node_tables()}
         learnt |= {f"appearance {group}": table for group, table in appearance.tables.items()}
         for owner, table in learnt.items():
+            named = {f"{owner}.{name}": gradient for name, gradient in table.gradients().items()}
             remedy = VIEW_REMEDY if owner.startswith("appearance ") else SCENE_REMEDY
-            for name, gradient in table.gradients().items():
-                where = f"{owner}.{name}, view {view}, step {self._step}"
-                self._numbers.append(gradient.sum())
-                self._facts.append(("a gradient", where, remedy, (table, gradient)))
-        if self._at_once:
-            self.refuse()
+            self.sums(view, named, remedy, table.clear_gradients)
 
     def refuse(self) -> None:
         """NumericsError naming the first of the numbers that is not finite, if there is one; no parameter has been
         touched."""
         numbers = torch.stack(self._numbers).tolist() if self._numbers else []
         facts, self._numbers, self._facts = self._facts, [], []
-        for number, (what, where, remedy, summed) in zip(numbers, facts):
-            if math.isfinite(number):
-                continue
-            got = str(number)
-            if summed is not None:
-                count = int((~torch.isfinite(summed[1])).sum())
-                if not count:  # only the sum overflowed
-                    continue
-                summed[0].clear_gradients()
-                got = f"{count} values"
-            raise NumericsError(f"{what} is not finite", where=where, got=got, remedy=remedy)
+        for number, (what, where, remedy, values, drop) in zip(numbers, facts):
+            count = 0 if math.isfinite(number) else int((~torch.isfinite(values)).sum())
+            if count:  # else at most the sum overflowed
+                drop()
+                got = f"{count} values" if values.ndim else str(number)
+                raise NumericsError(f"{what} is not finite", where=where, got=got, remedy=remedy)
 
 
 # short fits: good enough to learn from what a fit gets wrong, in a few seconds --------------------

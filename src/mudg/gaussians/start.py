@@ -11,7 +11,7 @@ filled and the sky stands in.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Final
 
 import numpy as np
@@ -25,11 +25,15 @@ from mudg.base.camera_colors import CameraColors
 from mudg.base.errors import InputError
 from mudg.base.palette import DYNAMIC_IDS, ID, UNLABELLED
 from mudg.base.types import FusedCloud, PointCloud, Scene
+from mudg.core.fusion import largest_beam_gap
+from mudg.core.project import RULES as HIDING_RULES
+from mudg.core.project import visible_depth
 from mudg.core.table import Table
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import SYMMETRIC_LABELS, RigidNode, SkyNode, StaticNode, object_node
 from mudg.gaussians.settings import METHODS, FitConfig
 from mudg.gaussians.views import StoredView
+from mudg.scene.read import read_points
 
 SH_C0: Final = 0.28209479177387814
 START_OPACITY: Final = 0.1
@@ -56,38 +60,6 @@ def neighbour_scale(xyz: NDArray[np.float32], smallest_m: float = 0.005, largest
         return np.full(len(xyz), 0.1, np.float32)
     distance, _ = cKDTree(xyz).query(xyz, k=4, workers=1)
     return np.sqrt((distance[:, 1:] ** 2).mean(1)).clip(smallest_m, largest_m).astype(np.float32)
-
-
-def columns_from_points(
-    xyz: NDArray[np.float32],
-    rgb: NDArray[np.uint8],
-    semantics: NDArray[np.uint8] | None,
-    classes: Sequence[int],
-    sh_degree: int,
-    scale_m: NDArray[np.float32] | None = None,
-) -> dict[str, Tensor]:
-    """Starting columns for ``N`` coloured points: round, colour of the point, class of the point where known. ``xyz``:
-    f32[N, 3] metres in the node's frame. ``rgb``: u8[N, 3]. ``semantics``: u8[N] train ids (255 = unknown) or None.
-    ``scale_m``: f32[N]; default from the three nearest neighbours."""
-    count = len(xyz)
-    scale = neighbour_scale(xyz) if scale_m is None else scale_m
-    logits = np.zeros((count, len(classes)), np.float32)
-    if semantics is not None:
-        for channel, train_id in enumerate(classes):
-            logits[semantics == train_id, channel] = 3.0
-    quats = np.zeros((count, 4), np.float32)
-    quats[:, 0] = 1.0
-    columns = {
-        "means": torch.from_numpy(np.array(xyz, np.float32)),
-        "quats": torch.from_numpy(quats),
-        "log_scales": torch.from_numpy(np.log(scale))[:, None].repeat(1, 3),
-        "logits": torch.full((count,), float(np.log(START_OPACITY / (1 - START_OPACITY)))),
-        "sh_dc": torch.from_numpy((rgb.astype(np.float32) / 255 - 0.5) / SH_C0)[:, None],
-        "semantics": torch.from_numpy(logits),
-    }
-    if sh_degree > 0:
-        columns["sh_rest"] = torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3)
-    return columns
 
 
 def box_grid(size_m: Sequence[float], rgb: Sequence[float]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
@@ -136,9 +108,22 @@ class StartPoints:
         rows = np.arange(len(self))[rows] if isinstance(rows, slice) else rows
         return StartPoints(self.xyz[rows], self.rgb[rows], self.semantics[rows], self.scale_m[rows])
 
-    def columns(self, classes: tuple[int, ...], sh_degree: int) -> dict[str, torch.Tensor]:
-        """Rows of the table of Gaussians."""
-        return columns_from_points(self.xyz, self.rgb, self.semantics, classes, sh_degree, scale_m=self.scale_m)
+    def columns(self, classes: Sequence[int], sh_degree: int) -> dict[str, Tensor]:
+        """Rows of the table of Gaussians: round, with colour and class of their point."""
+        count = len(self)
+        quats = torch.zeros(count, 4)
+        quats[:, 0] = 1.0
+        columns = {
+            "means": torch.from_numpy(np.array(self.xyz, np.float32)),
+            "quats": quats,
+            "log_scales": torch.from_numpy(np.log(self.scale_m))[:, None].repeat(1, 3),
+            "logits": torch.full((count,), float(np.log(START_OPACITY / (1 - START_OPACITY)))),
+            "sh_dc": torch.from_numpy((self.rgb.astype(np.float32) / 255 - 0.5) / SH_C0)[:, None],
+            "semantics": 3.0 * torch.from_numpy(self.semantics[:, None] == np.array(classes, np.uint8)).float(),
+        }
+        if sh_degree > 0:
+            columns["sh_rest"] = torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3)
+        return columns
 
 
 def start_model(
@@ -204,7 +189,7 @@ def mirrored_points(
 
 def _object_columns(
     node: RigidNode, cloud: PointCloud, classes: tuple[int, ...], config: FitConfig, most: int
-) -> Mapping[str, torch.Tensor]:
+) -> Mapping[str, Tensor]:
     rows = voxel_filter(cloud.xyz, 0.06)
     rows = rows[np.sort(seeds.numpy_rng(config.seed, 0, f"object {node.name}").permutation(len(rows))[:most])]
     xyz, rgb, semantics = cloud.xyz[rows], cloud.rgb[rows], _labels(cloud)[rows]
@@ -290,3 +275,124 @@ def painted_sky(views: Sequence[StoredView], cameras: CameraColors) -> SkyNode:
     sky = SkyNode.uniform(SKY_ROWS)
     sky.fill(pixels(stored, stored.sky) for stored in views if stored.sky is not None)
     return sky
+
+
+# ---- methods without boxes -----------------------------------------------------------------------
+#
+# LiDAR points where and when they were measured, coloured by the photographs of that time. Nothing here knows tracked
+# boxes or the fused cloud (whose dynamic points lie in boxes): a point of a moving car stays where its sweep met it.
+# Colours come from training photographs at most half a frame from the sweep, so that a moving point has the colour of
+# its own moment; points that none of these shows are left out.
+
+SAME_DEPTH = 0.02
+"""A point is seen by a camera whose nearest depth at its pixel differs by at most this share."""
+MOMENT_FRAMES = 2
+"""Frames that share one of the moments by which points are thinned a second time."""
+LARGEST_M = 150.0
+
+
+def timed_points(
+    scene: Scene, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig, colors: CameraColors
+) -> tuple[StartPoints, NDArray[np.float64]]:
+    """Starting points of a log, thinned to ``config.start.gaussians``, and what LiDAR did not reach (as in
+    ``start_model``); and when they were measured, f64[N] seconds, NaN where LiDAR did not reach.
+
+    Half of them are one per cube of space, half one per cube and every few frames, so that what moves has points all
+    along its way. InputError: no photograph shows any LiDAR point."""
+    xyz, rgb, semantics, time_s = _measured(scene, views, classes, colors)
+    if len(xyz) == 0:
+        what = "no LiDAR point is seen by a training photograph of its time"
+        raise InputError(what, where=scene.root, remedy="check the LiDAR of the scene and --cameras")
+    centers = np.stack([stored.view.center_world for stored in views]).astype(np.float32)
+    half = replace(config, start=replace(config.start, gaussians=max(50, config.start.gaussians // 2)))
+    parts = [thinned(xyz, centers, half), *_by_moment(xyz, time_s, scene, half)]
+    chosen = [
+        (StartPoints(xyz[rows], rgb[rows], semantics[rows], neighbour_scale(xyz[rows])), time_s[rows]) for rows in parts
+    ]
+    filled = fill_unreached(views, xyz, classes, colors)
+    if filled is not None:
+        chosen.append((filled, np.full(len(filled), np.nan)))
+    return StartPoints.joined([part for part, _ in chosen]), np.concatenate([times for _, times in chosen])
+
+
+def world_model(
+    node: StaticNode,
+    columns: Mapping[str, Tensor],
+    classes: tuple[int, ...],
+    config: FitConfig,
+    colors: CameraColors,
+    sky: SkyNode | None = None,
+) -> SceneModel:
+    """A scene that is one node with these rows, and a sky."""
+    table = Table(columns, {"node": torch.zeros(len(columns["means"]), dtype=torch.int32)})
+    return SceneModel(table, (node,), sky, classes, config.sh_degree, colors=colors)
+
+
+def frame_seconds(scene: Scene) -> float:
+    """Seconds between frames; 0.1 where there is only one."""
+    times = sorted({frame.view.time_s for frame in scene.frames})
+    return (times[-1] - times[0]) / (len(times) - 1) if len(times) > 1 else 0.1
+
+
+def _measured(
+    scene: Scene, views: Sequence[StoredView], classes: tuple[int, ...], colors: CameraColors
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64]]:
+    near_s = 0.5 * frame_seconds(scene) + 1e-3
+    found: list[tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64]]] = []
+    for sweep in scene.sweeps:
+        nearest: dict[str, int] = {}
+        for index in sorted(range(len(views)), key=lambda index: abs(views[index].view.time_s - sweep.time_s)):
+            if abs(views[index].view.time_s - sweep.time_s) <= near_s:
+                nearest.setdefault(views[index].view.camera.name, index)
+        if not nearest:
+            continue
+        points = read_points(scene, sweep)
+        xyz, gap = geometry.transform_points(sweep.world_from_lidar, points.xyz), largest_beam_gap(points.xyz)
+        free = np.ones(len(xyz), bool)
+        for index in nearest.values():
+            rows, rgb, semantics = _seen(views[index], xyz, gap, classes, colors)
+            mine = free[rows]
+            rows = rows[mine]
+            free[rows] = False
+            found.append((xyz[rows], rgb[mine], semantics[mine], sweep.time_s + points.dt_s[rows].astype(np.float64)))
+    if not found:
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.uint8), np.zeros(0)
+    xyz, rgb, semantics, time_s = (np.concatenate(column) for column in zip(*found))
+    return xyz, rgb, semantics, time_s
+
+
+def _seen(
+    stored: StoredView, xyz: NDArray[np.float32], gap_deg: float, classes: tuple[int, ...], colors: CameraColors
+) -> tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.uint8]]:
+    """Rows of the points that a photograph shows, their common colours and train ids."""
+    view, camera = stored.view, stored.view.camera
+    uv, z = geometry.project(view, xyz)
+    with np.errstate(invalid="ignore"):
+        inside = ((uv >= 0) & (uv < (camera.width, camera.height))).all(1) & (z > 0.5) & (z < LARGEST_M)
+    rows = np.flatnonzero(inside)
+    column, row = uv[rows, 0].astype(int), uv[rows, 1].astype(int)
+    nearest = visible_depth(view, xyz, HIDING_RULES["sweep"], gap_deg=gap_deg, far_m=LARGEST_M)[row, column]
+    with np.errstate(invalid="ignore"):
+        seen = np.abs(nearest - z[rows]) <= SAME_DEPTH * z[rows]
+    if stored.mask is not None:
+        seen &= stored.mask[row, column]
+    rows, row, column = rows[seen], row[seen], column[seen]
+    common = colors.bytes_to_common(camera.name, stored.rgb[row, column])
+    return rows, common, stored.train_ids(row, column, classes)
+
+
+def _by_moment(
+    xyz: NDArray[np.float32], time_s: NDArray[np.float64], scene: Scene, config: FitConfig
+) -> list[NDArray[np.int64]]:
+    """Rows, one per cube of space, of every moment; at most the wanted number in all."""
+    moment = np.floor((time_s - time_s.min()) / (MOMENT_FRAMES * frame_seconds(scene)) + 1e-6).astype(np.int64)
+    parts = []
+    for number in np.unique(moment):
+        mine = np.flatnonzero(moment == number)
+        parts.append(mine[voxel_filter(xyz[mine], 2 * config.start.voxel_m)])
+    share = min(1.0, config.start.gaussians / max(1, sum(map(len, parts))))
+    chosen = []
+    for index, rows in enumerate(parts):
+        order = seeds.numpy_rng(config.seed, index, "moment").permutation(len(rows))
+        chosen.append(rows[np.sort(order[: max(4, int(share * len(rows)))])])
+    return chosen

@@ -18,7 +18,7 @@ from mudg.base.records import understood
 from mudg.base.run_folder import run_state
 from mudg.base.types import Camera, Scene, View
 from mudg.core.table import Table
-from mudg.gaussians.appearance import Appearance
+from mudg.gaussians.corrections import Appearance
 from mudg.gaussians.model import CERTAINTY, SceneModel
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.rendering import DRAWING, drawing_facts, raster_of, render_view
@@ -28,23 +28,25 @@ from mudg.networks.folders import read_settings
 GAUSSIANS, RADIANCE = "gaussians", "radiance"
 
 
+def _write(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
+    """Without optimiser moments."""
+    store.write_safetensors(path, {key: value for key, value in tensors.items() if "moment" not in key})
+
+
 def save_model(model: SceneModel, folder: Path) -> None:
     """The fitted scene without optimiser moments."""
     values, groups = model.state()
     store.write_json(folder / "model.json", {"schema": 1, **values})
     for name, tensors in groups.items():
-        kept = {key: value for key, value in tensors.items() if "moment" not in key}
-        store.write_safetensors(folder / f"{name}.safetensors", kept)
+        _write(folder / f"{name}.safetensors", tensors)
 
 
 def save_appearance(appearance: Appearance, folder: Path) -> None:
-    """What was learnt about cameras, images and virtual sets, for those who want to know; renders do not use it."""
+    """What was learnt about cameras and images, for those who want to know; renders do not use it."""
     if appearance:
         names, tensors = appearance.state()
         store.write_json(folder / "appearance.json", {"schema": 1, "names": names})
-        store.write_safetensors(
-            folder / "appearance.safetensors", {k: v for k, v in tensors.items() if "moment" not in k}
-        )
+        _write(folder / "appearance.safetensors", tensors)
 
 
 def load_appearance(folder: Path) -> Appearance:
@@ -95,29 +97,20 @@ def load_model(folder: Path) -> SceneModel:
     groups = {name: store.read_tensors(folder / f"{name}.safetensors") for name in ("gaussians", "nodes")}
     with understood("a fitted scene", str(folder)):
         model = SceneModel.from_state(values, groups)
-        if not (folder / store.MANIFEST).is_file():
-            _try_out(model)
+        if not (folder / store.MANIFEST).is_file():  # do the parts fit together? draw each object, small
+            TypeAdapter(DrawingConfig).validate_python(model.facts.get(DRAWING, {}))
+            camera = Camera("trial", 16, 12, 16.0, 16.0, 8.0, 6.0)
+            for time_s in {0.0, *(float(node.times_s.mean()) for node in model.nodes if isinstance(node, RigidNode))}:
+                with contextlib.suppress(UsageError, ResourceError):  # drawn in a way that this machine lacks
+                    render_view(model, View(camera, np.eye(4), time_s), raster_of(model))
         return model
-
-
-def _try_out(model: SceneModel) -> None:
-    """Fail where the parts of a scene that no manifest vouches for do not fit together: draw a small picture while each
-    object is there."""
-    TypeAdapter(DrawingConfig).validate_python(model.facts.get(DRAWING, {}))
-    camera = Camera("trial", 16, 12, 16.0, 16.0, 8.0, 6.0)
-    for time_s in {0.0, *(float(node.times_s.mean()) for node in model.nodes if isinstance(node, RigidNode))}:
-        with contextlib.suppress(UsageError, ResourceError):  # drawn in a way that this machine lacks
-            render_view(model, View(camera, np.eye(4), time_s), raster_of(model))
 
 
 # continued ----------------------------------------------------------------------------------------
 #
-# Going on with a finished fit: its Gaussians, sky and corrections are the start of another one.
-#
-# The new steps are the second half of a run of twice as many: 500 more steps are the steps 501 to 1000 of a run of
-# 1000, with the learning rates, the densification and the rounds of box corrections that these have. (Going on where a
-# run of all steps together would be, at two thirds for 500 after 1000, was measured to learn less from virtual views:
-# the steps are too short by then.)
+# Gaussians, sky and corrections of a finished fit are the start of another one, whose steps are the second half of a
+# run of twice as many: 500 more steps are the steps 501 to 1000 of a run of 1000. (Going on where a run of all steps
+# together would be was measured to learn less from virtual views: the steps are too short by then.)
 
 START_METHOD = "street_gaussians"
 NEW_CLASS_LOGIT = -6.0
@@ -140,20 +133,15 @@ class StartFit:
         state = _state_of_edited(folder) or _state_of(folder)
         remedy = "give the folder of a finished `mudg fit --method street_gaussians` as --start-from"
         if state.get("verb") != "fit" or state.get("state") != "complete":
-            got = f"{state['verb']}, {state['state']}" if state else "no run of mudg"
-            raise InputError(
-                "this folder holds no finished fit to go on with", where=str(folder), got=got, remedy=remedy
-            )
+            what, got = "this folder holds no finished fit to go on with", "no run of mudg"
+            got = f"{state['verb']}, {state['state']}" if state else got
+            raise InputError(what, where=str(folder), got=got, remedy=remedy)
         for name, expected in inputs.items():
-            found = state.get("inputs", {}).get(name)
+            found, kind = state.get("inputs", {}).get(name), {"fused": "fused cloud"}.get(name, name)
             if found != expected:
-                raise InputError(
-                    f"the finished fit belongs to another {WHAT[name]}",
-                    where=f"{folder / 'run.json'}, inputs.{name}",
-                    expected=expected,
-                    got=str(found),
-                    remedy=f"fit street_gaussians to this {WHAT[name]} first",
-                )
+                what, where = f"the finished fit belongs to another {kind}", f"{folder / 'run.json'}, inputs.{name}"
+                first = f"fit street_gaussians to this {kind} first"
+                raise InputError(what, where=where, expected=expected, got=str(found), remedy=first)
         facts = description_of(folder).get("facts")
         method = facts.get("method") if isinstance(facts, dict) else None
         if method != START_METHOD:
@@ -180,9 +168,6 @@ def _state_of_edited(folder: Path) -> dict[str, Any]:
         return {}
     inputs = {"scene": store.digest(run / "scene"), "fused": store.digest(run / "fuse")}
     return {"verb": "fit", "state": state.get("state"), "inputs": inputs}
-
-
-WHAT = {"scene": "scene", "fused": "fused cloud"}
 
 
 def begun_at(iterations: int) -> int:

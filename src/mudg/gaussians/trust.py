@@ -1,19 +1,11 @@
 """How well photographs constrain every Gaussian; which part of a virtual view no recorded camera ever saw, and
-Gaussians to start there.
-
-Behind a parked bus a generated view is the best there is; nothing was measured there, so no Gaussian could start there.
-For every pixel of a virtual view, its point (at the depth of the virtual view itself) is carried to a number of
-recorded views, with its dynamic object if it lies in one's box, and compared with the depth that the model renders
-there. If a recorded view shows that point, or something behind it, the pixel is *seen*. Points that are hidden in every
-recorded view, or outside all their images, are *unseen*: ``unseen_rows`` makes Gaussians of them.
-"""
+Gaussians to start there."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,15 +15,13 @@ from torch import Tensor
 from mudg.base import geometry, log, seeds
 from mudg.base.types import Render, View
 from mudg.core.raster.rasterize import RasterConfig, rasterize
-from mudg.gaussians.appearance import Appearance
+from mudg.gaussians.corrections import UNCORRECTED, Appearance
 from mudg.gaussians.model import SceneModel, compose, compose_as_read, composite_sky
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.start import StartPoints, voxel_filter
 from mudg.gaussians.views import StoredView, TrainView
 
 # certainty ----------------------------------------------------------------------------------------
-#
-# How well the photographs constrain every Gaussian of a fitted scene: its certainty.
 #
 # A render beside the recorded path is right where several photographs saw the same surface and agree about it, and
 # where LiDAR agrees with its depth. Three sums per Gaussian say so, over recorded views and their pixels, with the
@@ -68,7 +58,7 @@ def certainty_of(
     model: SceneModel,
     views: Sequence[StoredView],
     raster: RasterConfig,
-    appearance: Appearance | None = None,
+    appearance: Appearance = UNCORRECTED,
     most: int = 0,
 ) -> Tensor:
     """Certainty of every Gaussian of a model, f16[N], from recorded views, evenly chosen if there are more than
@@ -84,13 +74,13 @@ def certainty_of(
 
 
 def weight_sums(
-    model: SceneModel, view: TrainView, raster: RasterConfig, appearance: Appearance | None = None
+    model: SceneModel, view: TrainView, raster: RasterConfig, appearance: Appearance = UNCORRECTED
 ) -> Tensor:
     """``[4, N]``: over the pixels of one view, the blending weights of every Gaussian times each of
     ``difference_images``."""
     with torch.no_grad():
         gaussians = compose_as_read(model, view.view, view.readout, semantics=False)
-        pose = None if appearance is None else appearance.world_from_cam(view.view, view.name)
+        pose = appearance.world_from_cam(view.view, view.name)
     features = torch.zeros(len(gaussians), 4, device=model.device, requires_grad=True)
     render = rasterize(replace(gaussians, extra=features), view.view, raster, world_from_cam=pose)
     if render.extra is None:
@@ -101,11 +91,10 @@ def weight_sums(
 
 
 @torch.no_grad()
-def difference_images(model: SceneModel, render: Render, view: TrainView, appearance: Appearance | None) -> Tensor:
+def difference_images(model: SceneModel, render: Render, view: TrainView, appearance: Appearance) -> Tensor:
     """``[4, H, W]``: 1 where the photograph counts, and its difference from the render; 1 where LiDAR measured, and the
     relative difference (at most 1)."""
-    rgb = composite_sky(model, view.view, render.rgb, render.alpha)
-    rgb = rgb if appearance is None else appearance.colored(rgb, view.name, view.kind)
+    rgb = appearance.colored(composite_sky(model, view.view, render.rgb, render.alpha), view.name, view.kind)
     used = view.mask[0].float()
     color = (rgb - view.rgb).abs().mean(0) * used
     lidar, depth = torch.zeros_like(used), torch.zeros_like(used)
@@ -116,7 +105,13 @@ def difference_images(model: SceneModel, render: Render, view: TrainView, appear
     return torch.stack([used, color, lidar, depth])
 
 
-# trust --------------------------------------------------------------------------------------------
+# unseen surfaces ----------------------------------------------------------------------------------
+#
+# Behind a parked bus a generated view is the best there is; nothing was measured, so no Gaussian could start there.
+# For every pixel of a virtual view, its point (at the view's own depth) is carried to a number of recorded views, with
+# its dynamic object if it lies in one's box, and compared with the depth that the model renders there. If a recorded
+# view shows that point, or something behind it, the pixel is seen. Others are unseen: ``unseen_rows`` makes Gaussians
+# of them.
 
 WITNESSES = 36
 """Number of recorded views that are compared, spread evenly over cameras and time."""
@@ -133,28 +128,23 @@ MOST_SEEDS = 8_000_000
 """Points held at once; thinning them takes about 150 bytes each."""
 
 
-class _Witness(NamedTuple):
-    """A recorded view and what it sees: depth f32[H, W], infinite in the sky."""
-
-    view: View
-    depth: NDArray[np.float32]
+_Witness = tuple[View, NDArray[np.float32]]
+"""A recorded view and what it sees: depth f32[H, W], infinite in the sky."""
 
 
 @torch.no_grad()
 def unseen_maps(
     model: SceneModel, recorded: Sequence[StoredView], virtual: Sequence[StoredView], raster: RasterConfig
 ) -> Iterator[tuple[StoredView, NDArray[np.bool_]]]:
-    """Every virtual view with bool[H, W], True where no recorded view saw the surface it shows; one at a time.
-
-    Pixels without depth count as sky, far away. Depends on the geometry the model has by now.
-    """
+    """Every virtual view with bool[H, W], True where no recorded view saw the surface it shows, by the geometry that
+    the model has by now; one at a time. Pixels without depth count as sky, far away."""
     chosen = np.unique(np.linspace(0, len(recorded) - 1, min(WITNESSES, len(recorded))).round().astype(int))
     witnesses = []
     for view in (recorded[index].view for index in chosen):
         width = min(WITNESS_WIDTH_PX, view.camera.width)
         small = view.resized(width, max(1, round(view.camera.height * width / view.camera.width)))
         render = rasterize(compose(model, view.time_s, semantics=False), small, raster)
-        witnesses.append(_Witness(small, torch.where(render.alpha > 0.5, render.depth, torch.inf)[0].cpu().numpy()))
+        witnesses.append((small, torch.where(render.alpha > 0.5, render.depth, torch.inf)[0].cpu().numpy()))
     objects = [(node.size_m, cache(node.pose_matrix)) for node in model.nodes if isinstance(node, RigidNode)]
     for stored in log.progress(virtual, len(virtual), "finding unseen surfaces"):
         yield stored, _unseen(stored, witnesses, objects)
@@ -181,18 +171,23 @@ def _unseen(stored: StoredView, witnesses: Sequence[_Witness], objects: Sequence
     carried = [(pose_at, found) for pose_at, found in inside_of if found is not None]
     seen = np.zeros(len(points), bool)
     # who sees most comes first
-    for witness in sorted(witnesses, key=lambda one: abs(one.view.time_s - time_s)):
+    for other, known in sorted(witnesses, key=lambda one: abs(one[0].time_s - time_s)):
         left = np.flatnonzero(~seen)
         place = np.full(len(points), -1)
         place[left] = np.arange(len(left))
         moved, exists = points[left], np.ones(len(left), bool)
         for pose_at, (inside, local) in carried:
-            pose, waiting = pose_at(witness.view.time_s), place[inside] >= 0
+            pose, waiting = pose_at(other.time_s), place[inside] >= 0
             here = place[inside][waiting]
             exists[here] = pose is not None
             if pose is not None:
                 moved[here] = geometry.transform_points(pose, local[waiting])
-        seen[left] = exists & _sees_or_sees_past(witness, moved)
+        (uv, z), camera = geometry.project(other, moved), other.camera
+        with np.errstate(invalid="ignore"):
+            shown = ((uv >= 0) & (uv < (camera.width, camera.height))).all(1) & (z > 0.2)
+        x, y = (np.where(shown, np.nan_to_num(uv[:, axis]), 0).astype(int) for axis in (0, 1))
+        far = known[y.clip(0, camera.height - 1), x.clip(0, camera.width - 1)]
+        seen[left] = exists & shown & (far >= z * (1 - TOLERANCE))  # it shows the point, or something behind it
     coarse = ~seen.reshape(shape)
     return np.repeat(np.repeat(coarse, STRIDE_PX, 0), STRIDE_PX, 1)[:height, :width]
 
@@ -201,11 +196,8 @@ def unseen_rows(
     model: SceneModel, unseen: Iterable[tuple[StoredView, NDArray[np.bool_]]], most: int, run_seed: int
 ) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor], float]:
     """Table rows (columns, labels; on the CPU) at the surfaces that only virtual views show, thinned to one per place,
-    at most ``most``; and the mean share of pixels that show them.
-
-    A point in the box of a dynamic object belongs to that object. Above ``MOST_SEEDS`` points, every second one goes
-    on.
-    """
+    at most ``most``; and the mean share of pixels that show them. A point in the box of a dynamic object belongs to it.
+    Above ``MOST_SEEDS`` points, every second one goes on."""
     rigid = {index: node for index, node in enumerate(model.nodes) if isinstance(node, RigidNode)}
     objects = {index: (node.size_m, cache(node.pose_matrix)) for index, node in rigid.items()}
     found: dict[int, list[StartPoints]] = {index: [] for index in range(len(model.nodes))}
@@ -277,16 +269,6 @@ def _seeds_of(
             owner[inside[0]], local[inside[0]] = index, inside[1]
     every = StartPoints(local.astype(np.float32), rgb, train_id, scale)
     return [(int(index), every[np.flatnonzero(owner == index)]) for index in np.unique(owner)]
-
-
-def _sees_or_sees_past(witness: _Witness, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    camera = witness.view.camera
-    uv, z = geometry.project(witness.view, points)
-    with np.errstate(invalid="ignore"):
-        inside = ((uv >= 0) & (uv < (camera.width, camera.height))).all(1) & (z > 0.2)
-    column = np.where(inside, np.nan_to_num(uv[:, 0]), 0).astype(int).clip(0, camera.width - 1)
-    row = np.where(inside, np.nan_to_num(uv[:, 1]), 0).astype(int).clip(0, camera.height - 1)
-    return inside & (witness.depth[row, column] >= z * (1 - TOLERANCE))
 
 
 def _in_box(

@@ -1,8 +1,5 @@
-"""The views a fit learns from: recorded frames with their LiDAR depths, and virtual observations.
-
-Everything is stored as bytes (8-bit colour and labels), in memory or in files, and becomes tensors when a step asks for
-one view. Which view a step gets is a function of (run seed, step) alone.
-"""
+"""The views a fit learns from: recorded frames with their LiDAR depths, and virtual observations. All are stored as
+bytes, in memory or in files, and become tensors when a step asks for one."""
 
 from __future__ import annotations
 
@@ -23,15 +20,15 @@ from torch import Tensor
 from mudg import native
 from mudg.base import geometry, log, seeds
 from mudg.base.errors import InputError, UsageError
+from mudg.base.memory import mapped_array
 from mudg.base.palette import ID, UNLABELLED
 from mudg.base.processes import GIB, computed_ahead
-from mudg.base.scratch import mapped_array
 from mudg.base.types import Frame, FusedCloud, ObservationKind, Scene, Sweep, Track, View
 from mudg.core.fusion import largest_beam_gap
 from mudg.core.pictures import resize_area, resize_nearest
 from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import ProjectConfig, project_sparse, visible_depth
-from mudg.core.shutter import Readout, points_as_read, readout_of
+from mudg.core.trajectory import Readout, points_as_read, readout_of
 from mudg.networks.featnets import WHOLE_PIXELS
 from mudg.scene.labels import read_label
 from mudg.scene.observations import ObservationSet, list_observation_sets, read_observations
@@ -136,21 +133,16 @@ class ViewSet:
     def choose(
         self, run_seed: int, step: int, virtual_probability: float, beside: bool = False
     ) -> tuple[StoredView, ...]:
-        """The views of a step: a virtual one with the given probability (if there are any), else the next recorded one.
-
-        Recorded views come in a fresh random order per round, so that every one is seen equally often. ``beside``: the
+        """The views of a step, a function of (run seed, step) alone: a virtual one with the given probability (if there
+        are any), else the next recorded one. Recorded views come in a fresh random order per round. ``beside``: the
         virtual view comes after the recorded one, not in its place."""
-        generator = seeds.numpy_rng(run_seed, step, "view")
-        if self.virtual and generator.random() < virtual_probability:
-            drawn = self.virtual[int(generator.integers(len(self.virtual)))]
-            return (self._recorded_of(run_seed, step), drawn) if beside else (drawn,)
-        return (self._recorded_of(run_seed, step),)
-
-    def _recorded_of(self, run_seed: int, step: int) -> StoredView:
-        """The recorded view of a step."""
         turn, place = divmod(step, len(self.recorded))
         order = seeds.numpy_rng(run_seed, turn, "recorded order").permutation(len(self.recorded))
-        return self.recorded[int(order[place])]
+        recorded, generator = self.recorded[int(order[place])], seeds.numpy_rng(run_seed, step, "view")
+        if self.virtual and generator.random() < virtual_probability:
+            drawn = self.virtual[int(generator.integers(len(self.virtual)))]
+            return (recorded, drawn) if beside else (drawn,)
+        return (recorded,)
 
 
 # ---- recorded ------------------------------------------------------------------------------------
@@ -171,10 +163,8 @@ def training_frames(scene: Scene, cameras: Sequence[str]) -> tuple[Frame, ...]:
 
 
 def classes_of(scene: Scene, frames: Sequence[Frame], virtual: Mapping[str, ObservationSet]) -> tuple[int, ...]:
-    """Train ids that occur in the labels of the frames and in virtual views (a sample of both); sky always included.
-
-    Empty when nothing is labelled.
-    """
+    """Train ids that occur in the labels of the frames and in virtual views (a sample of both), with sky; empty when
+    nothing is labelled."""
     found: set[int] = set()
     labelled = [frame for frame in frames if "semantics" in frame.labels]
     for frame in labelled[:: max(1, len(labelled) // 24)]:
@@ -193,11 +183,8 @@ LoadedViews = Generator[tuple[int, StoredView], None, None]
 def load_recorded(
     scene: Scene, frames: Sequence[Frame], classes: Sequence[int], width_px: int, with_lidar: bool
 ) -> LoadedViews:
-    """Read frames, labels and LiDAR depths, resized to ``width_px`` (0 = as recorded).
-
-    Several threads read, in the order of time, so that all cameras need a sweep at once. Frames whose time is further
-    than 0.1 s from every sweep get no LiDAR depth; how many is said once.
-    """
+    """Read frames, labels and LiDAR depths, resized to ``width_px`` (0 = as recorded), by several threads in the order
+    of time, so that all cameras need a sweep at once. Frames further than 0.1 s from every sweep get no LiDAR depth."""
     points = _SweepCache(scene)
 
     def read(frame: Frame) -> StoredView:
@@ -277,10 +264,7 @@ def load_virtual(
 
 def fused_lidar(cloud: FusedCloud, tracks: Sequence[Track]) -> Callable[[View], LidarPixels]:
     """A function view -> depths of the fused points seen there: the static ones, and those of objects where they are
-    then.
-
-    Points behind others are left out as in the diffusion model's condition (``ConditionRules``).
-    """
+    then. Points behind others are left out as in the diffusion model's condition."""
     drawn = ProjectConfig(near_m=1.0, far_m=MAX_LIDAR_M, occluder_m=0.2)
 
     def measured(view: View) -> LidarPixels:
@@ -309,14 +293,9 @@ def resized_view(view: View, width_px: int) -> View:
 # ---- LiDAR depth of a recorded view --------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _WorldSweep:
-    """World points f32[N, 3] of a sweep, their times after it f32[N] in seconds, and the largest angle between its
-    beams."""
-
-    xyz: NDArray[np.float32]
-    dt_s: NDArray[np.float32]
-    gap_deg: float
+_WorldSweep = tuple[NDArray[np.float32], NDArray[np.float32], float]
+"""World points f32[N, 3] of a sweep, their times after it f32[N] in seconds, and the largest angle between its beams in
+degrees."""
 
 
 class _SweepCache:
@@ -338,7 +317,7 @@ class _SweepCache:
             if abs(nearest.time_s - view.time_s) <= NEAREST_SWEEP_S:
                 found = self._world(nearest)
                 clouds.append(self._points_at(found, nearest, view.time_s))
-                gap_deg = max(gap_deg, found.gap_deg)
+                gap_deg = max(gap_deg, found[2])
         if not clouds:
             return None
         return lidar_pixels(view, points_as_read(self._scene, view, np.concatenate(clouds)), gap_deg)
@@ -349,7 +328,7 @@ class _SweepCache:
             if found is None:
                 points = read_points(self._scene, sweep)
                 world = geometry.transform_points(sweep.world_from_lidar, points.xyz)
-                found = _WorldSweep(world, points.dt_s, largest_beam_gap(points.xyz))
+                found = world, points.dt_s, largest_beam_gap(points.xyz)
             self._read[sweep.id] = found
             while len(self._read) > self._most:
                 self._read.popitem(last=False)
@@ -358,7 +337,7 @@ class _SweepCache:
     def _points_at(self, found: _WorldSweep, sweep: Sweep, time_s: float) -> NDArray[np.float32]:
         """World points of a sweep, the points of every tracked box carried from when they were measured to
         ``time_s``."""
-        world, dt_s = found.xyz, found.dt_s
+        world, dt_s, _ = found
         moved = world.copy()
         for track in self._scene.tracks:
             then, soon, now = track.pose_at(sweep.time_s), track.pose_at(sweep.time_s + 0.05), track.pose_at(time_s)

@@ -11,10 +11,9 @@ stopped.
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,7 +26,7 @@ from scipy import ndimage
 from mudg import native
 from mudg.base import geometry, html, log, store
 from mudg.base.devices import NETWORK_KINDS, choose_device
-from mudg.base.errors import ResourceError, UsageError
+from mudg.base.errors import UsageError
 from mudg.base.processes import one_torch_thread, run_in_processes
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Frame, Scene, Sweep
@@ -36,13 +35,11 @@ from mudg.core.pictures import class_colors, depth_colors, gray, resize_area
 from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import visible_depth
 from mudg.labels import street_net
-from mudg.labels.by_geometry import label_by_network
 from mudg.labels.depth_networks import align_to_lidar, enough_returns, kind_of, load_depth_network
-from mudg.labels.ground import driven_path
-from mudg.labels.inputs import DepthInput, DepthNetwork, LabelInput, Labeller, Labels
+from mudg.labels.evidence import driven_path
+from mudg.labels.inputs import DepthInput, DepthNetwork, LabelInput, Labeller, Labels, label_by_network
 from mudg.labels.segmenters import Segmenter
 from mudg.labels.settings import AnnotateConfig
-from mudg.networks.folders import find, title
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points, read_scene, spread
 from mudg.scene.write import SceneWriter
@@ -51,7 +48,7 @@ from mudg.scene.write import SceneWriter
 #
 # embedded: classes from the small shipped network, which reads image and `evidence.py` (`street_net.py`). network:
 # classes from a segmentation network in a folder (`segmenters.py`). Depth and dynamic objects are found in the same way
-# for both (`by_geometry.py`).
+# for both (`inputs.py`).
 
 
 def _network(weights: str, device: torch.device) -> Labeller:
@@ -89,12 +86,9 @@ def placed(config: AnnotateConfig) -> AnnotateConfig:
 
 
 def folders(config: AnnotateConfig) -> dict[str, Path]:
-    """Flag that names a network's folder -> that folder, where one is named and lies on this machine."""
-    found: dict[str, Path] = {}
-    for name, text in (("weights", config.weights), ("depth-network", config.depth_network)):
-        with contextlib.suppress(ResourceError):  # said when it is read, if it is
-            found |= {name: find(text)} if text else {}
-    return found
+    """Flag that names a network's folder -> that folder, where one is named."""
+    named = {"weights": config.weights, "depth-network": config.depth_network}
+    return {flag: Path(text) for flag, text in named.items() if text}
 
 
 def digests(config: AnnotateConfig) -> dict[str, str]:
@@ -105,8 +99,8 @@ def digests(config: AnnotateConfig) -> dict[str, str]:
             kind.
     """
     found: dict[str, str] = {}
-    if config.labeller == "network" and config.weights and (weights := find(config.weights)).is_dir():
-        found["weights"] = store.digest(weights)
+    if config.labeller == "network" and config.weights and Path(config.weights).is_dir():
+        found["weights"] = store.digest(Path(config.weights))
     if config.labeller == "embedded":
         found["weights"] = street_net.digest(config.weights or street_net.EMBEDDED)
     if config.depth_network:
@@ -114,7 +108,7 @@ def digests(config: AnnotateConfig) -> dict[str, str]:
             what, remedy = "--depth-network contradicts --no-depth", "leave out one of them"
             raise UsageError(what, where="--depth-network", remedy=remedy)
         kind_of(config.depth_network)
-        found["depth_network"] = store.digest(find(config.depth_network))
+        found["depth_network"] = store.digest(Path(config.depth_network))
     return found
 
 
@@ -149,7 +143,7 @@ def depth_origin(config: AnnotateConfig, networks: Mapping[str, str], made: Sequ
 
 def describe_folder(folder: str, digest: str) -> str:
     """Name (of one that the package does not ship) and digest of a network's folder, for the scene's notes."""
-    where = f" in folder '{title(find(folder))}'" if folder else ""
+    where = f" in folder '{Path(folder).name}'" if folder else ""
     return f"{where} (sha256 {digest[:16]})"
 
 
@@ -207,16 +201,6 @@ MAX_GAP_S = 2.0
 """Sweeps farther in time than this from an image do not help: what moves without a track has gone elsewhere."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Separated:
-    """Static points of a sweep in the world, those of each dynamic object in its frame, and the sweep's beams."""
-
-    static: NDArray[np.float32]
-    owned: dict[int, NDArray[np.float32]]
-    gap_deg: float
-    highest_rad: float
-
-
 class NearbyReturns:
     """Points of the ``sweeps`` sweeps of each LiDAR that are nearest in time to an image; sweeps are read once."""
 
@@ -230,7 +214,7 @@ class NearbyReturns:
         self._sensors: dict[str, list[Sweep]] = {}
         for sweep in scene.sweeps:
             self._sensors.setdefault(sweep.sensor, []).append(sweep)
-        self._kept: dict[str, _Separated] = {}
+        self._kept: dict[str, tuple[NDArray[np.float32], dict[int, NDArray[np.float32]], float, float]] = {}
 
     def of(self, frame: Frame) -> tuple[NDArray[np.float32], float, float]:
         """Static points and dynamic objects as they stand at the frame's time, f32[N, 3] metres in the world (none
@@ -240,23 +224,28 @@ class NearbyReturns:
         ids = {sweep.id for sweep in chosen}
         self._kept = {key: value for key, value in self._kept.items() if key in ids}
         parts, known = [np.zeros((0, 3), np.float32)], [self._separated(sweep) for sweep in chosen]
-        for sweep in known:
-            parts.append(sweep.static)
-            for index, xyz_object in sweep.owned.items():
+        for static, owned, _, _ in known:
+            parts.append(static)
+            for index, xyz_object in owned.items():
                 pose = self._dynamic_tracks[index].pose_at(time_s)
                 if pose is not None:
                     parts.append(geometry.transform_points(pose, xyz_object).astype(np.float32))
-        gap = min((sweep.gap_deg for sweep in known), default=0.6)
-        return np.concatenate(parts), gap, max((sweep.highest_rad for sweep in known), default=0.0)
+        gap = min((gap_deg for _, _, gap_deg, _ in known), default=0.6)
+        return np.concatenate(parts), gap, max((highest_rad for *_, highest_rad in known), default=0.0)
 
-    def _separated(self, sweep: Sweep) -> _Separated:
+    def _separated(self, sweep: Sweep) -> tuple[NDArray[np.float32], dict[int, NDArray[np.float32]], float, float]:
+        """Static points in the world, those of each dynamic object in its frame, largest angle between neighbouring
+        beams in degrees, and elevation of the highest beam in radians (all but a few stray returns lie below it)."""
         if sweep.id not in self._kept:
             points = read_points(self._scene, sweep)
             shots = SweepShots(sweep.time_s, sweep.world_from_lidar, points, ())
             owner, owned = separate(shots, self._dynamic_tracks, self._rules)
             world = geometry.transform_points(sweep.world_from_lidar, points.xyz).astype(np.float32)
-            gap_deg = largest_beam_gap(points.xyz)
-            self._kept[sweep.id] = _Separated(world[owner == STATIC], owned, gap_deg, _highest(sweep, world))
+            highest_rad = 0.0
+            if len(world) >= 100:
+                ray = world - sweep.world_from_lidar[:3, 3].astype(np.float32)
+                highest_rad = float(np.quantile(np.arctan2(ray[:, 2], np.hypot(ray[:, 0], ray[:, 1])), 0.998))
+            self._kept[sweep.id] = world[owner == STATIC], owned, largest_beam_gap(points.xyz), highest_rad
         return self._kept[sweep.id]
 
 
@@ -264,15 +253,6 @@ def nearest_sweeps(sweeps: Sequence[Sweep], time_s: float, count: int) -> list[S
     """The ``count`` sweeps nearest in time, none farther than ``MAX_GAP_S``, in the order of their times."""
     near = sorted((s for s in sweeps if abs(s.time_s - time_s) <= MAX_GAP_S), key=lambda s: abs(s.time_s - time_s))
     return sorted(near[:count], key=lambda s: s.time_s)
-
-
-def _highest(sweep: Sweep, world: NDArray[np.float32]) -> float:
-    """Elevation of the highest beam, radians: all but a few stray returns lie below it."""
-    if len(world) < 100:
-        return 0.0
-    ray = world - sweep.world_from_lidar[:3, 3].astype(np.float32)
-    elevation = np.arctan2(ray[:, 2], np.hypot(ray[:, 0], ray[:, 1]))
-    return float(np.quantile(elevation, 0.998))
 
 
 # annotate page ------------------------------------------------------------------------------------
@@ -382,7 +362,10 @@ def _label_frames(config: AnnotateConfig, path: Path, scene: Scene, missing: Seq
     todo = [frame.id for frame in missing if not staged_labels(staging, frame.id).is_file()]
     if done := len(missing) - len(todo):
         log.info(f"annotate: {done} frames are labelled already")
-    processes = min(config.processes or _usual_processes(config), len(todo) // _FRAMES_PER_PROCESS)
+    usual = native.default_threads()
+    if config.device != "cpu":  # a pretrained network fills the device; the shipped one waits for its evidence
+        usual = 1 if config.labeller == "network" or config.depth_network else min(usual, _SHARING)
+    processes = min(config.processes or usual, len(todo) // _FRAMES_PER_PROCESS)
     with log.task("labelling frames", len(missing), done) as bar:
         if processes <= 1:
             for _ in label_into_staging(config, scene, todo, staging):
@@ -390,20 +373,11 @@ def _label_frames(config: AnnotateConfig, path: Path, scene: Scene, missing: Seq
             return
         parts = np.array_split(np.array(todo, dtype=object), 4 * processes)
         work = [(config, path, list(part), staging) for part in parts if len(part)]
-        for _, labelled in run_in_processes(_label_in_process, work, processes):
+        for _, labelled in run_in_processes(_label_part, work, processes):
             bar.advance(labelled)
 
 
-def _usual_processes(config: AnnotateConfig) -> int:
-    """One per core; fewer where networks share a device: one with a pretrained network, which fills it, and a few with
-    the shipped one, whose evidence is gathered on the CPU meanwhile."""
-    cores = native.default_threads()
-    if config.device == "cpu":
-        return cores
-    return 1 if config.labeller == "network" or config.depth_network else min(cores, _SHARING)
-
-
-def _label_in_process(config: AnnotateConfig, path: Path, ids: list[str], staging: Path) -> int:
+def _label_part(config: AnnotateConfig, path: Path, ids: list[str], staging: Path) -> int:
     return sum(1 for _ in label_into_staging(config, read_scene(path), ids, staging))
 
 

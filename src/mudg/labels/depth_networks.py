@@ -140,7 +140,7 @@ def _load_transformers(folder: Path, device: torch.device, *, with_lidar: bool) 
 KINDS: Final[Mapping[str, Callable[[Path, torch.device, int], DepthNetwork]]] = {
     "prompt_depth_anything": lambda folder, place, _: _load_transformers(folder, place, with_lidar=True),
     "depth_anything": lambda folder, place, _: _load_transformers(folder, place, with_lidar=False),
-    "depthlab": DepthLab.load,
+    "depthlab": DepthLab,
 }
 """``model_type`` of a folder's ``config.json``, or ``kind`` of the ``model.json`` that ``mudg convert`` writes -> what
 reads the folder, given a place to compute and the denoising steps."""
@@ -152,7 +152,7 @@ def kind_of(folder: str | Path) -> str:
     Raises:
         ResourceError: no such folder, or it has no description. InputError: another kind of network.
     """
-    path = folders.find(folder)
+    path = Path(folder)
     for name, key in (("config.json", "model_type"), ("model.json", "kind")):
         if folder and (path / name).is_file():
             kind = str(folders.read_settings(path / name).get(key))
@@ -167,14 +167,12 @@ def kind_of(folder: str | Path) -> str:
 
 
 def load_depth_network(folder: str | Path, device: torch.device = CPU, steps: int = 0) -> DepthNetwork:
-    """A depth network of the table, read from its folder, or from the Hugging Face cache by its name
-    (``folders.find``); ``steps``: of denoising, 0 = as the folder says.
+    """A depth network of the table, read from its folder; ``steps``: of denoising, 0 = as the folder says.
 
     Raises:
         ResourceError: folder or package is missing. InputError: another kind of network, or not all of it.
     """
-    path = folders.find(folder)
-    return KINDS[kind_of(path)](path, device, steps)
+    return KINDS[kind_of(folder)](Path(folder), device, steps)
 
 
 # --- alignment to LiDAR, for every network --------------------------------------------------------

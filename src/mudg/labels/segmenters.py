@@ -70,17 +70,17 @@ class Segmenter:
 
     @classmethod
     def load(cls, folder: str | Path, device: torch.device = CPU) -> Segmenter:
-        """Read a network from a local folder, or from the Hugging Face cache by its name (``folders.find``).
+        """Read a network from a folder.
 
         Raises:
             ResourceError: the folder or the transformers package is missing. InputError: another kind of
             network, one that lacks weights, or none of its class names is one of ours.
         """
-        path = folders.find(folder)
+        path = Path(folder)
         if not folder or not (path / "config.json").is_file():
             expected = "a folder with config.json and model.safetensors"
             given = "give the folder of a segmentation network with Cityscapes classes as --weights"
-            remedy = f"{given}, or its name in the Hugging Face cache, or use --labeller embedded"
+            remedy = f"{given}, or use --labeller embedded"
             what, where = "the labeller's weights are missing", str(folder) or "weights"
             raise ResourceError(what, where=where, expected=expected, remedy=remedy)
         settings = folders.read_settings(path / "config.json")

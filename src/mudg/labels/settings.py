@@ -17,14 +17,13 @@ class AnnotateConfig:
     """Source of classes and sky. embedded: the small shipped network, from image, heights and boxes. network: a
     segmentation network from `weights`."""
     weights: str = ""
-    """labeller network: folder of a SegFormer or Mask2Former with Cityscapes classes in the transformers format,
-    or its name in the Hugging Face cache (owner/name or owner/name@revision). labeller embedded: folder of a network
-    trained with tools/train_segmenter.py (empty = the shipped network)."""
+    """labeller network: folder of a SegFormer or Mask2Former with Cityscapes classes in the transformers format.
+    labeller embedded: folder of a network trained with tools/train_segmenter.py (empty = the shipped network)."""
     depth: bool = True
     """Write dense depth, by default from the LiDAR points of several sweeps, filled with the image as guide."""
     depth_network: str = ""
-    """Take dense depth from a network and align it to LiDAR: folder, or name in the Hugging Face cache, of a
-    PromptDepthAnything or Depth Anything model (transformers); or folder of a DepthLab written by mudg convert."""
+    """Take dense depth from a network and align it to LiDAR: folder of a PromptDepthAnything or Depth Anything
+    model (transformers), or of a DepthLab written by mudg convert."""
     depth_steps: int = setting(default=0, ge=0)
     """DepthLab: denoising steps (0 = as in the model folder)."""
     device: DeviceName = "auto"

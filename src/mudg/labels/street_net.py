@@ -26,9 +26,18 @@ from mudg.base.config import STRICT
 from mudg.base.errors import InputError, ResourceError
 from mudg.base.palette import CLASSES, ID
 from mudg.core.pictures import resize_area
-from mudg.labels.by_geometry import GRASS, GROUND_M, find_sky, greenness_of, label_by_network
 from mudg.labels.evidence import BOX_GROUPS, GROUP_OF, PLANE_COUNT, Evidence, encode, gather
-from mudg.labels.inputs import GAP_DEG, TRAIN_ID_OF, LabelInput, Labels
+from mudg.labels.inputs import (
+    GAP_DEG,
+    GRASS,
+    GROUND_M,
+    TRAIN_ID_OF,
+    LabelInput,
+    Labels,
+    find_sky,
+    greenness_of,
+    label_by_network,
+)
 from mudg.networks.folders import CPU
 
 # street net ---------------------------------------------------------------------------------------
@@ -270,7 +279,7 @@ def settled_by_color(
     """Probabilities f32[19, H, W], with sum 1, without the classes that the colours of the image u8[H, W, 3]
     contradict.
 
-    Hardly any sky where the image does not look like it (``by_geometry.find_sky``: bright or blue, smooth), unless
+    Hardly any sky where the image does not look like it (``find_sky``: bright or blue, smooth), unless
     nothing in it does, as at night. Ground that the path reaches directly and that is not green is road rather than
     terrain.
     """

@@ -1,13 +1,6 @@
-"""Loads the C++ library that holds the hot loops (rasteriser, z-buffer, SSIM, hash grids, planes, Adam, the city's ray
-caster).
-
-The library is optional: an install on a machine without any C++ compiler works without it, slower. `status()` says in
-words which of both it is and why; `require()` raises when a caller cannot do without it.
-
-Environment: ``MUDG_THREADS`` = number of threads of the native loops (default: the processors this process may use);
-``MUDG_NATIVE=off`` leaves the library alone even if it is installed; ``MUDG_ISA`` = avx512, avx2 or portable asks for
-one instruction set instead of the best one.
-"""
+"""Loads the optional C++ library of the hot loops. ``MUDG_THREADS``: threads of its loops (default: the processors this
+process may use); ``MUDG_NATIVE=off`` leaves it alone; ``MUDG_ISA`` = avx512, avx2 or portable asks for one instruction
+set instead of the best one."""
 
 from __future__ import annotations
 

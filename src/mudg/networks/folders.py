@@ -1,5 +1,5 @@
-"""Pretrained networks in folders, as the packages transformers and diffusers write them, or in the Hugging Face cache;
-nothing is downloaded, and a folder is read completely or not at all.
+"""Pretrained networks in folders, as the packages transformers and diffusers write them: nothing is downloaded, and a
+folder is read completely or not at all.
 
 The packages are extras, imported at first use. Which class reads a folder is decided by our tables: no name in a file
 becomes an import, and code that lies in a folder never runs. Weights come from safetensors only. A weight that the
@@ -9,7 +9,6 @@ network has and the folder lacks is an error, where the packages would leave it 
 from __future__ import annotations
 
 import importlib
-import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -20,10 +19,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from mudg.base import store
+from mudg.base import store, weights
 from mudg.base.errors import InputError, ResourceError
-
-# the check that every network of a score makes of its weights -------------------------------------
 
 
 def checked_state(
@@ -32,46 +29,22 @@ def checked_state(
     where: str,
     network: str,
     ignored: Callable[[str], bool] = lambda name: name.endswith(".bn.num_batches_tracked"),
-    *,
-    owner: str = "the network",
-    remedies: tuple[str, str] = ("", ""),
-    names: Mapping[str, str] | None = None,
 ) -> dict[str, Tensor]:
-    """The wanted tensors of a file as float32.
-
-    Args:
-        wanted: name -> shape of all that the network needs. where: file name for errors. network: its name. ignored:
-            names that may be there and are not read; all other names are refused. owner: the network in words.
-            remedies: for tensors that are missing or misshaped, and for unknown ones. names: those in the file.
-
-    Raises:
-        InputError: a tensor is missing, has another shape, holds impossible values, or is unknown.
-    """
-    normed = any(name.endswith("running_var") for name in wanted)
-    for name, shape in wanted.items():
-        found, at = state.get(name), f"{where}: {(names or {}).get(name, name)}"
-        if found is None or tuple(found.shape) != shape or not found.is_floating_point():
-            got = "missing" if found is None else f"{found.dtype} {tuple(found.shape)}"
-            what = f"{network} weights are incomplete or of another network"
-            raise InputError(what, where=at, expected=str(shape), got=got, remedy=remedies[0])
-        if not bool(torch.isfinite(found).all()) or (name.endswith("running_var") and bool((found < 0).any())):
-            what = f"{network} weights hold {'impossible values' if normed else 'values that are not finite'}"
-            raise InputError(what, where=at, expected="finite numbers, variances of at least 0" if normed else "")
-    for name in state:
-        if name not in wanted and not ignored(name):
-            what, at = (
-                f"{network} weights hold a tensor that {owner} has not",
-                f"{where}: {(names or {}).get(name, name)}",
-            )
-            raise InputError(what, where=at, expected=f"{len(wanted)} tensors", remedy=remedies[1])
-    return {name: state[name].detach().float() for name in wanted}
+    """The wanted tensors of a score's network (name -> shape) as float32. ``where``: file name for errors. ``network``:
+    what to call it. ``ignored``: names that may be there and are not read. InputError: a tensor is missing, unknown,
+    has another shape, or holds impossible values."""
+    found = {name: value for name, value in state.items() if name in wanted or not ignored(name)}
+    weights.match_exactly(found, wanted, where, network)
+    weights.refuse_bad_values(found, where)
+    for name, value in found.items():
+        if name.endswith("running_var") and bool((value < 0).any()):
+            raise InputError("a variance lies below 0", where=f"{where}: {name}")
+    return {name: found[name].detach().float() for name in wanted}
 
 
 # folders ------------------------------------------------------------------------------------------
 
 _REMEDY: Final = "pip install 'mudg[models]'"
-
-
 CPU: Final = torch.device("cpu")
 MEAN: Final = (0.485, 0.456, 0.406)
 DEVIATION: Final = (0.229, 0.224, 0.225)
@@ -85,52 +58,12 @@ def normalized(rgb: NDArray[np.uint8], mean: Sequence[float], deviation: Sequenc
     return (image - offset) / scale
 
 
-_IN_HUB: Final = re.compile(r"(?P<repository>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?")
-
-
-def find(name: str | Path) -> Path:
-    """Folder of a network: ``name`` itself where it is a folder, else the copy of the repository "owner/name" or
-    "owner/name@revision" that lies in the Hugging Face cache of this machine. Nothing is downloaded.
-
-    Raises:
-        ResourceError: neither is there, or the package that knows the cache is missing.
-    """
-    text = str(name)
-    parts = _IN_HUB.fullmatch(text)
-    if Path(name).is_dir() or parts is None:
-        return Path(name)
-    try:
-        hub = package("huggingface_hub")
-    except ResourceError as error:
-        what = "no such folder, nor the package that knows the Hugging Face cache"
-        remedy = f"name a folder that exists; for names of repositories: {_REMEDY}"
-        raise ResourceError(what, where=text, remedy=remedy) from error
-    try:
-        found = hub.snapshot_download(parts["repository"], revision=parts["revision"], local_files_only=True)
-    except (OSError, ValueError) as error:
-        what = "no such folder, and no copy of such a repository in the Hugging Face cache"
-        got, expected = str(error).splitlines()[0], f"a folder, or a copy below {hub.constants.HF_HUB_CACHE}"
-        remedy = f"hf download {parts['repository']}"
-        raise ResourceError(what, where=text, got=got, expected=expected, remedy=remedy) from error
-    return Path(found)
-
-
-def title(folder: str | Path) -> str:
-    """Name of a folder in notes: "owner/name@revision" of one in the Hugging Face cache, else its own name."""
-    path = Path(folder)
-    parent = path.parent.parent.name
-    if path.parent.name == "snapshots" and parent.startswith("models--"):
-        return f"{parent.removeprefix('models--').replace('--', '/', 1)}@{path.name[:12]}"
-    return path.name
-
-
-def package(name: Literal["transformers", "diffusers", "huggingface_hub"]) -> ModuleType:
+def package(name: Literal["transformers", "diffusers"]) -> ModuleType:
     """A package that reads folders, with its progress bars off; ResourceError names the extra if it is missing."""
     try:
         found = {  # literal names: no text becomes an import
             "transformers": lambda: importlib.import_module("transformers"),
             "diffusers": lambda: importlib.import_module("diffusers"),
-            "huggingface_hub": lambda: importlib.import_module("huggingface_hub"),
         }[name]()
     except ImportError as error:
         where = "pretrained network"

@@ -116,22 +116,13 @@ def _units() -> Iterator[_Cube]:
 
 
 class I3DFeatures(nn.Module):
-    """The network, always in evaluation mode.
-
-    Args:
-        state: the tensors of ``tensor_shapes``, in either layout; ``num_batches_tracked`` is left alone, anything else
-            is refused.
-        where: file name for errors.
-
-    Raises:
-        InputError: a tensor is missing, has another shape, holds impossible values, or is unknown.
-    """
+    """The network, always in evaluation mode, from the tensors of ``tensor_shapes`` in either layout; counts of batches
+    are left alone. ``where``: file name for errors. InputError: a tensor is missing, has another shape, holds
+    impossible values, or is unknown."""
 
     def __init__(self, state: Mapping[str, Tensor], where: str = "I3D weights") -> None:
         super().__init__()
-        found, names = {_renamed(n): value for n, value in state.items()}, {_renamed(n): n for n in state}
-        owner = "FVD's network"
-        for name, value in checked_state(found, tensor_shapes(), where, "I3D", owner=owner, names=names).items():
+        for name, value in checked_state(with_known_names(state), tensor_shapes(), where, "I3D").items():
             self.register_buffer(name.replace(".", "/"), value)
 
     def forward(self, clips: Tensor) -> Tensor:
@@ -154,14 +145,12 @@ class I3DFeatures(nn.Module):
             elif isinstance(step, _Pool):
                 x = _maxima(x, step)
             else:
-                x = self._mixed(step, x)
+                of = {branch: lambda y, unit=unit: self._convolved(unit, y) for branch, unit in step.units().items()}
+                pooled = _maxima(x, _Pool((3, 3, 3), (1, 1, 1)))
+                parts = of["b0"](x), of["b1b"](of["b1a"](x)), of["b2b"](of["b2a"](x)), of["b3b"](pooled)
+                x = torch.cat(parts, 1)
         weight, bias = self.get_buffer("logits/conv3d/weight"), self.get_buffer("logits/conv3d/bias")
         return F.conv3d(F.avg_pool3d(x, (2, 7, 7), 1), weight, bias).mean((2, 3, 4))
-
-    def _mixed(self, block: _Mixed, x: Tensor) -> Tensor:
-        of = {branch: lambda y, unit=unit: self._convolved(unit, y) for branch, unit in block.units().items()}
-        pooled = _maxima(x, _Pool((3, 3, 3), (1, 1, 1)))
-        return torch.cat([of["b0"](x), of["b1b"](of["b1a"](x)), of["b2b"](of["b2a"](x)), of["b3b"](pooled)], 1)
 
     def _convolved(self, unit: _Cube, x: Tensor) -> Tensor:
         path = unit.name.replace(".", "/")
@@ -185,23 +174,13 @@ def _maxima(x: Tensor, pool: _Pool) -> Tensor:
 
 
 def with_known_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Tensors under the names of ``tensor_shapes``, from either layout; counts of batches are left out.
-
-    Names in neither layout are matched by their order, if shapes agree one by one; else they are left as they are.
-    """
-    given = {name: value for name, value in state.items() if not name.endswith("num_batches_tracked")}
-    found = {_renamed(name): value for name, value in given.items()}
-    wanted = tensor_shapes()
-    if found.keys() & wanted.keys() or [tuple(v.shape) for v in given.values()] != list(wanted.values()):
-        return found
-    return dict(zip(wanted, given.values(), strict=True))
-
-
-def _renamed(name: str) -> str:
-    """A name of the first layout in the second."""
-    for old, new in _OTHER_NAMES:
-        name = name.replace(old, new)
-    return name
+    """Tensors under the names of ``tensor_shapes``, from either layout; counts of batches are left out."""
+    found = {}
+    for name, value in state.items():
+        for old, new in _OTHER_NAMES:
+            name = name.replace(old, new)
+        found |= {} if name.endswith("num_batches_tracked") else {name: value}
+    return found
 
 
 def prepared_frame(rgb: NDArray[np.uint8], rule: VideoRule) -> Tensor:

@@ -76,11 +76,6 @@ def _block_a(pool: int) -> tuple[_Branch, ...]:
     )
 
 
-def _block_b() -> tuple[_Branch, ...]:
-    double = (*_chain("branch3x3dbl", (64, 1), (96, 3)), _unit("branch3x3dbl_3", 96, 3, 2))
-    return (_unit("branch3x3", 384, 3, 2),), double, (_MAXIMUM_HALF,)
-
-
 def _block_c(width: int) -> tuple[_Branch, ...]:
     flat, tall = (1, 7), (7, 1)
     return (
@@ -89,11 +84,6 @@ def _block_c(width: int) -> tuple[_Branch, ...]:
         _chain("branch7x7dbl", (width, 1), (width, tall), (width, flat), (width, tall), (192, flat)),
         (_AVERAGE, _unit("branch_pool", 192)),
     )
-
-
-def _block_d() -> tuple[_Branch, ...]:
-    long = (*_chain("branch7x7x3", (192, 1), (192, (1, 7)), (192, (7, 1))), _unit("branch7x7x3_4", 192, 3, 2))
-    return (_unit("branch3x3_1", 192), _unit("branch3x3_2", 320, 3, 2)), long, (_MAXIMUM_HALF,)
 
 
 def _block_e(pool: str) -> tuple[_Branch, ...]:
@@ -120,11 +110,19 @@ _STEM: Final[tuple[_Unit | str, ...]] = (
 _BLOCKS: Final[dict[str, tuple[_Branch, ...]]] = {
     "Mixed_5b": _block_a(32),
     **dict.fromkeys(("Mixed_5c", "Mixed_5d"), _block_a(64)),
-    "Mixed_6a": _block_b(),
+    "Mixed_6a": (
+        (_unit("branch3x3", 384, 3, 2),),
+        (*_chain("branch3x3dbl", (64, 1), (96, 3)), _unit("branch3x3dbl_3", 96, 3, 2)),
+        (_MAXIMUM_HALF,),
+    ),
     "Mixed_6b": _block_c(128),
     **dict.fromkeys(("Mixed_6c", "Mixed_6d"), _block_c(160)),
     "Mixed_6e": _block_c(192),
-    "Mixed_7a": _block_d(),
+    "Mixed_7a": (
+        (_unit("branch3x3_1", 192), _unit("branch3x3_2", 320, 3, 2)),
+        (*_chain("branch7x7x3", (192, 1), (192, (1, 7)), (192, (7, 1))), _unit("branch7x7x3_4", 192, 3, 2)),
+        (_MAXIMUM_HALF,),
+    ),
     "Mixed_7b": _block_e(_AVERAGE),
     "Mixed_7c": _block_e(_MAXIMUM),
 }
@@ -165,24 +163,15 @@ def _units() -> Iterator[tuple[str, int, _Unit]]:
 
 
 class InceptionFeatures(nn.Module):
-    """The network, always in evaluation mode.
-
-    Args:
-        state: the tensors of ``tensor_shapes``. ``num_batches_tracked`` entries are left alone; anything else is
-            refused.
-        where: file name for errors.
-
-    Raises:
-        InputError: a tensor is missing, has another shape, holds values that are not finite or a variance below 0, or
-            is unknown.
-    """
+    """The network, always in evaluation mode, from the tensors of ``tensor_shapes``; counts of batches are left alone.
+    ``where``: file name for errors. InputError: a tensor is missing, has another shape, holds values that are not
+    finite or a variance below 0, or is unknown."""
 
     def __init__(self, state: Mapping[str, Tensor], where: str = "Inception weights") -> None:
         super().__init__()
         self._units = {name: unit for name, _, unit in _units()}
-        complete = "use pt_inception-2015-12-05-6726825d.pth or a copy of it as safetensors"
-        words = {"owner": "FID's network", "remedies": (complete, "torchvision's Inception-v3 is another network")}
-        for name, value in checked_state(state, tensor_shapes(), where, "Inception", **words).items():
+        network = "FID's Inception (pt_inception-2015-12-05-6726825d.pth; torchvision's is another network)"
+        for name, value in checked_state(state, tensor_shapes(), where, network).items():
             self.register_buffer(name.replace(".", "/"), value)
 
     def forward(self, images: Tensor) -> Tensor:

@@ -14,8 +14,7 @@ from scipy.spatial import KDTree
 from mudg.base import geometry
 from mudg.base.types import EgoPath, Scene, Sweep, SweepPoints, Track
 from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, separate
-from mudg.core.returns import Returns
-from mudg.core.rows import Rows
+from mudg.core.returns import Returns, Rows
 from mudg.scene.read import read_points, sweeps_beside
 
 Floats = NDArray[np.float64]

@@ -23,7 +23,6 @@ from mudg.scene.read import load_scene, read_image, read_points, spread, sweeps_
 
 # how well the LiDAR fits each camera of a scene, by edges; see ``core/calibration.py`` ------------
 
-
 IMAGES_PER_CAMERA = 6
 MAX_GAP_S = 0.06
 
@@ -68,18 +67,12 @@ def describe(name: str, alignment: EdgeAlignment) -> str:
 
 def to_json(alignment: EdgeAlignment) -> dict[str, Any]:
     """Plain values for JSON."""
-    return {
-        "verdict": alignment.verdict,
-        "score": round(alignment.score, 3),
-        "best_turn_deg": list(alignment.best_turn_deg),
-        "contrast": round(alignment.contrast, 3),
-        "sigmas": round(alignment.sigmas, 2),
-        "depth_edges": alignment.jumps,
-    }
+    values = {"verdict": alignment.verdict, "score": round(alignment.score, 3)}
+    values |= {"best_turn_deg": list(alignment.best_turn_deg), "contrast": round(alignment.contrast, 3)}
+    return {**values, "sigmas": round(alignment.sigmas, 2), "depth_edges": alignment.jumps}
 
 
 # check --------------------------------------------------------------------------------------------
-
 
 Level = Literal["error", "warning", "note"]
 _EXAMPLES: Final = 3
@@ -158,9 +151,8 @@ def check_scene(path: Path | str) -> list[Finding]:
     records = (*scene.frames, *scene.sweeps)
     for record in log.progress(records, len(records), "checking files"):
         findings.extend(collected(_check_file(scene, record), str(path)))
-        if isinstance(record, Frame):
-            for name in record.labels:
-                findings.extend(collected(_check_label(scene, record, name), str(path)))
+        for name in record.labels if isinstance(record, Frame) else ():
+            findings.extend(collected(_check_label(scene, record, name), str(path)))
     return worst_first(findings)
 
 
@@ -326,7 +318,10 @@ def _check_tracks(scene: Scene) -> Findings:
             yield _warning(where, f"its box measures {max(track.size_m):.0f} m")
         steps = np.diff(track.times_s)
         if len(steps):
-            gaps = np.where(_moves_between_keys(track), steps, 0.0)
+            poses = track.world_from_object  # what stands needs no keys in between
+            step_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+            cosine = (np.einsum("nij,nij->n", poses[:-1, :3, :3], poses[1:, :3, :3]) - 1) / 2
+            gaps = np.where((step_m > MIN_STEP_M) | (cosine < np.cos(np.deg2rad(MIN_TURN_DEG))), steps, 0.0)
             if gaps.max() > MAX_TRACK_GAP_S:
                 unseen = f"it is not seen for {gaps.max():.1f} s from {track.times_s[int(gaps.argmax())]:.1f} s on"
                 yield _warning(where, f"{unseen}; its path across the gap is a guess: split the track")
@@ -337,14 +332,6 @@ def _check_tracks(scene: Scene) -> Findings:
         if tilt > 30:
             axes = "object axes are x forward, y left, z up"
             yield _warning(where, f"its z axis is tilted by {tilt:.0f} degrees; {axes}")
-
-
-def _moves_between_keys(track: Track) -> NDArray[np.bool_]:
-    """Whether the box is elsewhere at the next key, bool[T - 1]: what stands needs no keys in between."""
-    poses = track.world_from_object
-    step_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    cosine = (np.einsum("nij,nij->n", poses[:-1, :3, :3], poses[1:, :3, :3]) - 1) / 2
-    return (step_m > MIN_STEP_M) | (cosine < np.cos(np.deg2rad(MIN_TURN_DEG)))
 
 
 def _check_course(track: Track, where: str) -> Findings:
@@ -422,12 +409,12 @@ def check_points(scene: Scene, sweep: Sweep, points: SweepPoints) -> Findings:
     beside = [f for f in scene.frames if abs(f.view.time_s - sweep.time_s) <= SAME_MOMENT_S]
     if beside:
         world = geometry.transform_points(sweep.world_from_lidar, points.xyz)
-        if not any(_sees(frame, world) for frame in beside):
+
+        def sees(frame: Frame) -> bool:
+            uv, z = geometry.project(frame.view, world)
+            size = frame.view.camera.width, frame.view.camera.height
+            with np.errstate(invalid="ignore"):
+                return bool(((z > 0.1) & (uv >= 0).all(1) & (uv < size).all(1)).any())
+
+        if not any(map(sees, beside)):
             yield _warning(where, "none of its points falls into the images taken at its time; check the calibration")
-
-
-def _sees(frame: Frame, xyz_world: NDArray[np.float32]) -> bool:
-    uv, z = geometry.project(frame.view, xyz_world)
-    camera = frame.view.camera
-    with np.errstate(invalid="ignore"):
-        return bool(((z > 0.1) & (uv >= 0).all(1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)).any())

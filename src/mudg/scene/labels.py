@@ -97,7 +97,7 @@ def encode_label(name: str, array: NDArray[Any], camera: Camera, where: str) -> 
 
 def _decode_label(name: str, content: bytes, where: str, camera: Camera) -> NDArray[Any]:
     if name in _PNG_LABELS:
-        array = _decode_grey(content, where)
+        array = decode_grey(content, where)
         if name == "semantics":
             _check_class_ids(array, where)
         else:
@@ -137,13 +137,16 @@ def _check_class_ids(array: NDArray[Any], where: str) -> None:
         raise InputError(what, where=where, expected=expected, got=str(wrong))
 
 
-def _decode_grey(content: bytes, where: str) -> NDArray[np.uint8]:
+def decode_grey(content: bytes, where: str, bits: tuple[int, ...] = (8,)) -> NDArray[Any]:
+    """A PNG of one channel of 8 or 16 ``bits``, u8 or u16 [H, W]. Raises InputError: another one, or damaged."""
+    modes = ("L", "P", "1") * (8 in bits) + ("I;16", "I") * (16 in bits)
     try:
         with Image.open(io.BytesIO(content), formats=("PNG",)) as image:
-            if image.mode not in ("L", "P", "1") or max(image.size) > MAX_IMAGE_SIDE_PX:
-                got = f"mode {image.mode}, {image.size}"
-                raise InputError("label image is not 8-bit grey", where=where, expected="mode L", got=got)
-            return np.array(image.convert("L") if image.mode == "1" else image, np.uint8)
+            if image.mode not in modes or max(image.size) > MAX_IMAGE_SIDE_PX:
+                got, expected = f"mode {image.mode}, {image.size}", f"{' or '.join(map(str, bits))} bits"
+                raise InputError(f"label image is not {bits[0]}-bit grey", where=where, expected=expected, got=got)
+            array = np.array(image.convert("L") if image.mode == "1" else image)
+            return array.astype(np.uint8 if image.mode in ("L", "P", "1") else np.uint16)
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError, EOFError) as error:
         raise InputError("label image cannot be decoded (is it cut off?)", where=where, got=str(error)) from error
 

@@ -409,7 +409,12 @@ def scene_to_json_text(scene: Scene) -> str:
     lines = [f" {json.dumps(key)}: {_dumps(value)}," for key, value in head.items()]
     lines.append(' "cameras": {\n  ' + ",\n  ".join(cameras) + "\n },")
     lines.append(' "frames": [' + _record_lines(_frame_to_json(frame) for frame in scene.frames) + "],")
-    lines.append(' "sweeps": [' + _record_lines(_sweep_to_json(sweep) for sweep in scene.sweeps) + "],")
+    sweeps = (
+        {"id": one.id, "sensor": one.sensor, "time_s": one.time_s}
+        | {"world_from_lidar": _poses_to_json(one.world_from_lidar[None])[0], "points": one.points.path}
+        for one in scene.sweeps
+    )
+    lines.append(' "sweeps": [' + _record_lines(sweeps) + "],")
     lines.append(' "split": ' + _dumps(dict(scene.split)) + ",")
     lines.append(' "ego": ' + _dumps(ego))
     return "{\n" + "\n".join(lines) + "\n}\n"
@@ -448,12 +453,6 @@ def _frame_to_json(frame: Frame) -> dict[str, Any]:
         "image": frame.image.path,
         "labels": {name: ref.path for name, ref in frame.labels.items()},
     }
-
-
-def _sweep_to_json(sweep: Sweep) -> dict[str, Any]:
-    pose = _poses_to_json(sweep.world_from_lidar[None])[0]
-    head = {"id": sweep.id, "sensor": sweep.sensor, "time_s": sweep.time_s}
-    return {**head, "world_from_lidar": pose, "points": sweep.points.path}
 
 
 def _record_lines(records: Iterable[dict[str, Any]]) -> str:

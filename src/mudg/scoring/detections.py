@@ -1,8 +1,5 @@
-"""NTA-IoU and NTL-IoU from what detectors made of the images, read from files: boxes as COCO results, lanes as masks.
-
-No detector is part of the program. Images are named ``METHOD/TRAJECTORY/000003``, as in the folders of views;
-``truth/TRAJECTORY/...`` and ``recorded/CAMERA/...`` name true and recorded images, which give the anchors that stand
-beside every value.
+"""NTA-IoU and NTL-IoU from what detectors made of the images: boxes as COCO results, lanes as masks. Images are named
+``METHOD/TRAJECTORY/000003``; ``truth/TRAJECTORY/...`` and ``recorded/CAMERA/...`` give the anchors beside every value.
 """
 
 from __future__ import annotations
@@ -37,15 +34,6 @@ RECORDED: Final = "recorded"
 _BOXES: Final = "a list of records with image_id, category_id, bbox [x, y, width, height] and score"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Detection:
-    """A detector's box in pixels of 480 x 320, its class and confidence in [0, 1]."""
-
-    box: street_scores.ImageBox
-    category: int
-    score: float
-
-
 @dataclass(frozen=True)
 class ViewImages:
     """Images of one method on one trajectory. ``key``: first part of their names. ``numbers``: of the images that
@@ -60,44 +48,36 @@ class ViewImages:
         return [f"{self.key}/{number:06d}" for number in self.numbers]
 
 
-def read_detections(path: Path) -> dict[str, list[Detection]]:
-    """Boxes by image name, without those of a confidence of at most 0.5: COCO's result form, a list whose boxes are in
-    pixels of images resized to 480 x 320, as the published score does it. InputError: anything else."""
+def read_detections(path: Path) -> dict[str, list[tuple[street_scores.ImageBox, int]]]:
+    """Boxes in pixels of 480 x 320 and their classes by image name (``METHOD/TRAJECTORY/000003``, without a folder
+    ``rgb`` and an ending), without those of a confidence of at most 0.5: COCO's result form, for images resized to 480
+    x 320 as the published score does it. InputError: anything else."""
     content = store.read_json(path)
     if not isinstance(content, list):
         raise InputError("a file of boxes holds no list", where=str(path), expected=_BOXES, got=type(content).__name__)
-    found: dict[str, list[Detection]] = {}
+    found: dict[str, list[tuple[street_scores.ImageBox, int]]] = {}
     for number, record in enumerate(content):
-        name, detection = _parsed(record, f"{path}: record {number}")
-        kept = found.setdefault(name, [])
-        if detection.score > street_scores.NTA_CONFIDENCE:
-            kept.append(detection)
+        where, got = f"{path}: record {number}", repr(record)[:120]
+        try:
+            name, category, score = str(record["image_id"]), int(record["category_id"]), float(record.get("score", 1.0))
+            x, y, width, height = (float(v) for v in record["bbox"])
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise InputError("a detected box is malformed", where=where, expected=_BOXES, got=got) from error
+        if not all(map(math.isfinite, (x, y, width, height, score))) or width < 0 or height < 0 or not 0 <= score <= 1:
+            expected = "finite numbers, sizes of at least 0, a score in 0..1"
+            raise InputError("a detected box is impossible", where=where, expected=expected, got=got)
+        name = name.replace("\\", "/").replace("/rgb/", "/")
+        kept = found.setdefault(re.sub(r"\.(png|jpe?g)$", "", name, flags=re.IGNORECASE), [])
+        if score > street_scores.NTA_CONFIDENCE:
+            kept.append((np.array([x, y, x + width, y + height]), category))
     return found
 
 
-def _parsed(record: Any, where: str) -> tuple[str, Detection]:
-    try:
-        name, category, score = str(record["image_id"]), int(record["category_id"]), float(record.get("score", 1.0))
-        x, y, width, height = (float(v) for v in record["bbox"])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError("a detected box is malformed", where=where, expected=_BOXES, got=repr(record)[:120]) from error
-    if not all(map(math.isfinite, (x, y, width, height, score))) or width < 0 or height < 0 or not 0 <= score <= 1:
-        expected = "finite numbers, sizes of at least 0, a score in 0..1"
-        raise InputError("a detected box is impossible", where=where, expected=expected, got=repr(record)[:120])
-    return image_name(name), Detection(np.array([x, y, x + width, y + height]), category, score)
-
-
-def image_name(given: str) -> str:
-    """``METHOD/TRAJECTORY/000003`` of a file name that may have a folder ``rgb`` and an ending."""
-    return re.sub(r"\.(png|jpe?g)$", "", given.replace("\\", "/").replace("/rgb/", "/"), flags=re.IGNORECASE)
-
-
 class BoxDetections:
-    """NTA-IoU of methods. ``scene``: whose tracked boxes are the truth. ``path``: file of boxes. ``as_published``: true
-    boxes also of corners behind the camera."""
+    """NTA-IoU of methods. ``scene``: whose tracked boxes are the truth. ``path``: file of boxes."""
 
-    def __init__(self, scene: Scene, path: Path, as_published: bool) -> None:
-        self._scene, self._as_published = scene, as_published
+    def __init__(self, scene: Scene, path: Path) -> None:
+        self._scene = scene
         self._found = read_detections(path)
         self.sha256 = store.sha256_file(path)
         self._counts: dict[str, dict[str, int]] = {}
@@ -108,25 +88,24 @@ class BoxDetections:
             return score_tables.NO_DETECTIONS
         values: dict[str, list[float]] = {"value": [], "car_and_bus": []}
         for name, view in zip(images.names(), images.views, strict=True):
-            truths = [box for _, box in street_scores.nta_truths(view, self._tracks_at(view), self._as_published)]
+            truths = [box for _, box in street_scores.nta_truths(view, self._tracks_at(view))]
             own = self._found.get(name, [])
-            values["value"] += street_scores.nta_iou(truths, [d.box for d in own])
-            values["car_and_bus"] += street_scores.nta_iou(truths, [d.box for d in own if d.category in CAR_AND_BUS])
+            values["value"] += street_scores.nta_iou(truths, [box for box, _ in own])
+            values["car_and_bus"] += street_scores.nta_iou(truths, [box for box, of in own if of in CAR_AND_BUS])
         if not values["value"]:
             return score_tables.NO_TRUTH
         return {"truths": len(values["value"]), **{k: round(sum(v) / len(v), 6) for k, v in values.items()}}
 
     def record(self) -> dict[str, Any]:
         """How the numbers were made, for metrics.json."""
-        published, sweeps = "as published: corners behind the camera are not cut off", bool(self._scene.sweeps)
-        counted = "counted in the sweeps taken with the view"
+        sweeps, counted = bool(self._scene.sweeps), "counted in the sweeps taken with the view"
         return {
             "file_sha256": self.sha256,
             "confidence_above": street_scores.NTA_CONFIDENCE,
             "reach_px": street_scores.NTA_REACH_PX,
             "size": [street_scores.NTA_WIDTH_PX, street_scores.NTA_HEIGHT_PX],
             "classes": "all; beside it COCO's car and bus alone (2 and 5)",
-            "boxes": published if self._as_published else "cut at the near plane",
+            "boxes": "cut at the near plane",
             "fewest_points": street_scores.NTA_FEWEST_POINTS if sweeps else None,
             "points": counted if sweeps else "no sweeps: boxes of any number count",
         }
@@ -180,16 +159,6 @@ class LaneDetections:
             lanes.append(float((found & true).sum() / union) if union else 0.0)
         mean = lambda numbers: round(sum(numbers) / len(numbers), 6)
         return {"frames": len(values), "value": mean(values), "lanes": mean(lanes)}
-
-    def against(self, images: ViewImages, true: ViewImages) -> float | None:
-        """The second convention: masks of the images against the detector's own masks of the true images; None where
-        those are missing."""
-        names = zip(images.names(), true.names(), strict=True)
-        pairs = [[self._folder / f"{name}.png" for name in pair] for pair in names]
-        if not pairs or not all(path.is_file() for pair in pairs for path in pair):
-            return None
-        masks = [[street_scores.at_lane_size(read_mask(path)) for path in pair] for pair in pairs]
-        return round(sum(street_scores.ntl_iou(a, b) for a, b in masks) / len(masks), 6)
 
     def record(self) -> dict[str, Any]:
         """How the numbers were made, for metrics.json."""

@@ -27,31 +27,22 @@ from mudg.base.processes import computed_ahead, one_torch_thread
 from mudg.base.records import understood
 from mudg.base.run_folder import RunDir
 from mudg.base.types import FusedCloud, Observation, Scene, View
-from mudg.core import metrics, project, view_metrics
+from mudg.base.weights import read_checkpoint
+from mudg.core import metrics, project
 from mudg.core.losses import LPIPS_EPSILON
 from mudg.core.metrics import ViewFacts
 from mudg.core.pictures import error_image, resize_nearest, resize_rgb, to_bytes
 from mudg.diffusion import model_files as mdm_files
 from mudg.editing.settings import ScoreConfig
-from mudg.gaussians.perception import lpips_network
-from mudg.networks.featnets import WHOLE_PIXELS, CodecFeatures, LpipsTrunk, PerceptualDistance
+from mudg.networks.featnets import WHOLE_PIXELS, CodecFeatures, LpipsFeatures, LpipsTrunk, PerceptualDistance
 from mudg.scene.clouds import read_fused
 from mudg.scene.observations import ObservationWriter
 from mudg.scene.read import read_scene
 from mudg.scoring import tables as score_tables
-from mudg.scoring.facts import (
-    Baseline,
-    FactMaker,
-    PairDistance,
-    Reference,
-    ScoredTrajectory,
-    known_of,
-    trajectories_of,
-    vehicles_of,
-)
+from mudg.scoring import truth as scored_truth
 from mudg.scoring.sets import BASELINE, anchors_of, set_scores_of
 from mudg.scoring.sweeps import sweep_scores
-from mudg.scoring.truth import ViewTruth, stored_truth, truth_of
+from mudg.scoring.truth import Baseline, PairDistance, Reference, ScoredTrajectory, ViewTruth
 
 BASELINE_DRAWING: Final = project.ProjectConfig(static_splat_px=2.5, object_splat_px=4.0, occluder_m=0.3)
 TRUTH: Final = "=truth"
@@ -78,16 +69,16 @@ def write_scores(
     baseline; without them there is none. ``truth``: folder of ``DrawTruth`` for this scene, to be read instead of
     drawing the truth again. InputError: nothing to score, or methods disagree about a trajectory's views."""
     recorded, out = read_scene(scene), work.path
-    trajectories = trajectories_of(config, recorded, methods)
+    trajectories = scored_truth.trajectories_of(config, recorded, methods)
     reference = Reference(
-        truth=truth_of(recorded) if truth is None else stored_truth(truth),
+        truth=scored_truth.truth_of(recorded) if truth is None else scored_truth.stored_truth(truth),
         baseline=baseline_of(recorded, read_fused(fused)) if fused is not None and config.baseline else None,
         held_out=frozenset(f.id for f in recorded.frames_in("test") or recorded.frames),
         error_pictures=config.error_pictures,
         distances=_distances(config),
         distance_views=config.perceptual_views,
-        facts=FactMaker(recorded),
-        vehicles=vehicles_of(recorded),
+        facts=scored_truth.FactMaker(recorded),
+        vehicles=scored_truth.vehicles_of(recorded),
     )
     sets = set_scores_of(config, recorded, out)  # before the work: the weights may be unusable
     results: list[dict[str, Any]] = []
@@ -102,7 +93,9 @@ def write_scores(
         for name, row in metrics.METRICS.items()
     }
     made = {"depth_limit_m": DEPTH_LIMIT_M, "anchors": anchors_of(results, trajectories)}
-    made |= {"lpips": _lpips_record(config), **sets.records()}
+    digests = {row: store.sha256_file(Path(own)) for f, (row, _) in LPIPS_FILES.items() if (own := getattr(config, f))}
+    facts = {"version": "0.1", "input": config.lpips_input, "epsilon": LPIPS_EPSILON, "weights_sha256": digests}
+    made |= {"lpips": facts if digests else {}, **sets.records()}
     records, exact = [trajectory.record() for trajectory in trajectories], reference.truth.exact
     if sweeps := sweep_scores(recorded, methods):
         made["sweeps"] = sweeps
@@ -122,27 +115,16 @@ def _distances(config: ScoreConfig) -> dict[str, PairDistance]:
         found["perceptual"] = PerceptualDistance(CodecFeatures(mdm_files.load("embedded").codec), device=device)
     for flag, (row, trunk) in LPIPS_FILES.items():
         if getattr(config, flag):
-            network = lpips_network(getattr(config, flag), trunk, config.lpips_input)
+            weights = getattr(config, flag)
+            network = LpipsFeatures(read_checkpoint(Path(weights)), weights, trunk, config.lpips_input)
             found[row] = PerceptualDistance(network, network.channel_weights, device)
     return found
-
-
-def _lpips_record(config: ScoreConfig) -> dict[str, Any]:
-    """How LPIPS was made: its input, epsilon and the digests of its weights by row."""
-    files = {row: Path(path) for flag, (row, _) in LPIPS_FILES.items() if (path := getattr(config, flag))}
-    if not files:
-        return {}
-    digests = {row: store.sha256_file(path) for row, path in files.items()}
-    return {"version": "0.1", "input": config.lpips_input, "epsilon": LPIPS_EPSILON, "weights_sha256": digests}
 
 
 def summary_table(out: Path) -> str:
     """The main numbers of a finished score folder as plain text for a terminal."""
     with understood("scores", str(Path(out) / "metrics.json")):
         return score_tables.plain(store.read_json(Path(out) / "metrics.json"))
-
-
-# ---- the baseline ----
 
 
 def baseline_of(scene: Scene, cloud: FusedCloud) -> Baseline:
@@ -156,10 +138,8 @@ def baseline_of(scene: Scene, cloud: FusedCloud) -> Baseline:
 
 
 def nearest_fill(cloud: FusedCloud, world_from_object: Mapping[str, NDArray[np.float64]], view: View) -> Observation:
-    """Draw a cloud and fill what no point covers with the nearest covered pixel's colour, depth and class.
-
-    A view that sees no point at all is black, without depth and class.
-    """
+    """Draw a cloud and fill what no point covers with the nearest covered pixel's colour, depth and class. A view that
+    sees no point at all is black, without depth and class."""
     drawn = project.project_cloud(cloud, world_from_object, view, BASELINE_DRAWING)
     height, width = view.camera.height, view.camera.width
     index = drawn.index.numpy()
@@ -179,9 +159,6 @@ def nearest_fill(cloud: FusedCloud, world_from_object: Mapping[str, NDArray[np.f
     return Observation(view, rgb, depth, semantics, drawn.valid.float(), mask, "virtual", BASELINE)
 
 
-# ---- one trajectory ----
-
-
 @dataclass(frozen=True)
 class MeasuredView:
     """Truth, facts and methods' views at one place, and by method what the wanted metrics measure there."""
@@ -198,8 +175,8 @@ def _score(
     """Score all methods on one trajectory; writes its truth, its baseline and its error picture."""
     names = [*([BASELINE] if reference.baseline is not None else []), *trajectory.sets]
     motion, exact_motion = metrics.ExactMotion(), metrics.ExactMotion(reference.vehicles)
-    build = lambda: metrics.build_all(reference.distances, motion, view_metrics.build_facts(exact_motion))
-    sums = {name: build() for name in names} | {TRUTH: view_metrics.build_facts(exact_motion)}
+    build = lambda: metrics.build_all(reference.distances, motion, metrics.build_facts(exact_motion))
+    sums = {name: build() for name in names} | {TRUTH: metrics.build_facts(exact_motion)}
     counted = trajectory.counted(reference.held_out)
     wanted = _wanted(trajectory, reference, counted)
     truth_has: set[str] = set()
@@ -228,7 +205,7 @@ def _score(
             if fills is not None:
                 fills.add(made.seen[BASELINE])
             if number in counted:
-                truth_has |= known_of(made.facts)
+                truth_has |= scored_truth.known_of(made.facts)
             if made.truth is not None:
                 if truths is not None:
                     truths.add(made.truth.seen)
@@ -236,7 +213,9 @@ def _score(
                     scored += 1
                     truth_has |= _contents(made.truth, exact)
                 if reference.error_pictures and number == every // 2:
-                    _write_error_picture(out / "errors" / f"{trajectory.name}.png", made.seen, made.truth.seen)
+                    picture = _error_picture(made.seen, made.truth.seen)
+                    path = out / "errors" / f"{trajectory.name}.png"
+                    store.write_image(path, picture, optimize=False, compress_level=1)
             for name, values in made.measured.items():
                 for metric, value in values.items():
                     sums[name][metric].add(value)
@@ -248,7 +227,7 @@ def _score(
         classes = of["miou"]
         counted = isinstance(classes, metrics.Segmentation) and int(classes.counts.sum())
         iou = {n: round(value, 4) for n, value in metrics.iou_of(classes.counts).items()} if counted else {}
-        numbers = {"values": _values(of, truth_has), "iou": iou, "details": view_metrics.details(of)}
+        numbers = {"values": _values(of, truth_has), "iou": iou}
         where = {"method": name, "trajectory": trajectory.name, "views": scored}
         results.append({**where, **numbers, "truth": dict(anchors)})
     return results
@@ -264,8 +243,7 @@ def _wanted(trajectory: ScoredTrajectory, reference: Reference, counted: Sequenc
     every_frame = {"temporal_flickering"} | ({"flicker", "warp_error"} if reference.truth.exact else set())
     needs_weights = reference.distances.keys()  # "flicker" and "temporal_flickering" want all views, in order
     usual = {name for name, row in metrics.METRICS.items() if row.build is not None}
-    usual |= {*view_metrics.FACTS, *view_metrics.PARTS}
-    usual -= {*needs_weights, "flicker", "temporal_flickering"}
+    usual = (usual | {*metrics.FACTS}) - {*needs_weights, *metrics.EVERY_VIEW}
     return [
         every_frame | (usual if n in counted else set()) | (needs_weights if n in sampled else set())
         for n in range(len(trajectory.views))
@@ -282,7 +260,7 @@ def _measured(
     if reference.baseline is not None:
         seen = {BASELINE: reference.baseline(view), **seen}
     asked = {name for of in wanted.values() for name in of}
-    if asked <= {"flicker", *view_metrics.EVERY_VIEW}:  # a view that does not count: only its neighbours need it
+    if asked <= {*metrics.EVERY_VIEW}:  # a view that does not count: only its neighbours need it
         facts = ViewFacts(instance=None if truth is None else truth.instance)
     else:
         facts = reference.facts.of(view, truth)
@@ -328,7 +306,7 @@ def pair_of(
 ) -> metrics.Pair:
     """Bring a method's view to the truth's size; where it gives no depth, it counts as the depth limit (80 m).
     ``view``: of both; without it, the truth's. ``facts``: what is known of the view beside the truth."""
-    true = None if truth is None else truth.seen
+    true, facts = None if truth is None else truth.seen, facts or ViewFacts()
     view = view or (seen.view if true is None else true.view)
     height, width = view.camera.height, view.camera.width
     depth: Tensor | None = None
@@ -347,10 +325,9 @@ def pair_of(
     return metrics.Pair(*made, *truths, mask=true.mask, moving=truth.moving, view=true.view, facts=facts)
 
 
-def _write_error_picture(path: Path, seen: Mapping[str, Observation], true: Observation) -> None:
+def _error_picture(seen: Mapping[str, Observation], true: Observation) -> NDArray[np.uint8]:
     """Truth and the methods beside each other, their colour errors below."""
     height, width = true.view.camera.height, true.view.camera.width
     images = [true.rgb, *(resize_rgb(observation.rgb, height, width) for observation in seen.values())]
     errors = [np.zeros((height, width, 3), np.uint8), *(error_image(rgb, true.rgb) for rgb in images[1:])]
-    picture = np.vstack([np.hstack([to_bytes(rgb) for rgb in images]), np.hstack(errors)])
-    store.write_image(path, picture, optimize=False, compress_level=1)
+    return np.vstack([np.hstack([to_bytes(rgb) for rgb in images]), np.hstack(errors)])

@@ -1,13 +1,6 @@
-"""Distances of whole sets of views: FID, KID, FVD, FD-DINOv2, CMMD and CLIP scores; and the detectors and anchors that
-stand beside them.
-
-The reference is the recorded video of the same camera, as in published tables, so there is a number off the recorded
-path of a driving log, too, where no other metric has a truth. Sets are small, and FID of small sets is mostly bias:
-every trajectory also gets a floor, what the truth itself would score.
-
-Features are kept in the folder of the scores, in a file whose name is the hash of weights, rule and pixels: an
-interrupted run does not compute a set again.
-"""
+"""Distances of whole sets of views from the recorded video of the same camera (FID, KID, FVD); and the detectors and
+anchors that stand beside them. Sets are small, and FID of small sets is mostly bias: every trajectory also gets a
+floor, what the truth itself would score."""
 
 from __future__ import annotations
 
@@ -26,74 +19,64 @@ from torch import Tensor
 from mudg.base import log, seeds, store
 from mudg.base.devices import choose_device
 from mudg.base.errors import InputError
-from mudg.base.types import Frame, Scene, View
+from mudg.base.types import Scene
 from mudg.base.weights import read_checkpoint
 from mudg.core import feature_distances
-from mudg.core.feature_distances import cmmd_distance, frechet_distance
+from mudg.core.feature_distances import frechet_distance
 from mudg.core.pictures import resize_rgb, to_bytes
 from mudg.editing.settings import ScoreConfig
-from mudg.networks import clip_image, dinov2, i3d, inception
+from mudg.networks import i3d, inception
 from mudg.networks.featnets import LpipsFeatures, LpipsTrunk, lpips_shapes
 from mudg.scene.observations import ObservationSet, read_observations
 from mudg.scene.read import read_image
 from mudg.scoring import detections
 from mudg.scoring import tables as score_tables
 from mudg.scoring.detections import BoxDetections, LaneDetections, ViewImages
-from mudg.scoring.facts import Reference, ScoredTrajectory
 from mudg.scoring.tables import SET_SIZES
-from mudg.scoring.truth import SAME_TIME_S
+from mudg.scoring.truth import Reference, ScoredTrajectory
 
 # -- weights ---------------------------------------------------------------------------------------
 #
-# Of the networks of the scores: a published file -> a folder with ``weights.safetensors`` and its origin.
+# A published file -> a folder with ``weights.safetensors`` and its origin.
 
 WEIGHTS_FILE: Final = "weights.safetensors"
 DESCRIPTION_FILE: Final = "model.json"
 KIND: Final = "score network"
-_LISTED: Final = 8
+
+Tensors = Mapping[str, Tensor]
+Network = tuple[str, Callable[[Tensors, str], object], Callable[[Tensors], dict[str, Tensor]]]
 
 
-@dataclass(frozen=True)
-class ScoreNetwork:
-    """A network of the scores: what its files are called when they are used, and how its tensors are found in a
-    published file. ``flag``: of ``mudg score``. ``check``: tensors -> nothing, or an InputError. ``named``: tensors of
-    a file -> those of the network under the names that are written. ``published``: SHA-256 of published files -> their
-    names."""
-
-    flag: str
-    check: Callable[[Mapping[str, Tensor], str], object]
-    named: Callable[[Mapping[str, Tensor]], dict[str, Tensor]]
-    published: Mapping[str, str]
-
-
-def _lpips(trunk: LpipsTrunk, flag: str) -> ScoreNetwork:
+def _lpips(trunk: LpipsTrunk, flag: str) -> Network:
     named = lambda found: {name: found[name] for name in lpips_shapes(trunk) if name in found}
-    return ScoreNetwork(flag, lambda state, where: LpipsFeatures(state, where, trunk), named, {})
+    return flag, lambda state, where: LpipsFeatures(state, where, trunk), named
 
 
 _without_counts = lambda state: {name: own for name, own in state.items() if not name.endswith("num_batches_tracked")}
-_I3D_SHA256: Final = "bec6519f66ea534e953026b4ae2c65553c17bf105611c746d904657e5860a5e2"
-_FID_FILES: Final = {inception.KNOWN_SHA256: "pt_inception-2015-12-05-6726825d.pth"}
 
-NETWORKS: Final[Mapping[str, ScoreNetwork]] = {
-    "inception": ScoreNetwork("--fid-weights", inception.InceptionFeatures, _without_counts, _FID_FILES),
-    "i3d": ScoreNetwork("--fvd-weights", i3d.I3DFeatures, i3d.with_known_names, {_I3D_SHA256: "i3d_torchscript.pt"}),
-    "dinov2": ScoreNetwork("--dino-weights", dinov2.DinoFeatures, dict, {}),
-    "clip": ScoreNetwork("--clip-weights", clip_image.ClipImageFeatures, clip_image.with_openai_names, {}),
+NETWORKS: Final[Mapping[str, Network]] = {
+    "inception": ("--fid-weights", inception.InceptionFeatures, _without_counts),
+    "i3d": ("--fvd-weights", i3d.I3DFeatures, i3d.with_known_names),
     "lpips": _lpips("alex", "--lpips-weights"),
     "lpips-vgg": _lpips("vgg", "--lpips-vgg-weights"),
 }
-"""Networks by the name that ``mudg convert --network`` takes."""
+"""By the name that ``mudg convert --network`` takes: the flag of ``mudg score``; what checks tensors (InputError); and
+what finds them in a published file, under the names that are written."""
+PUBLISHED: Final[Mapping[str, str]] = {
+    inception.KNOWN_SHA256: "pt_inception-2015-12-05-6726825d.pth",
+    "bec6519f66ea534e953026b4ae2c65553c17bf105611c746d904657e5860a5e2": "i3d_torchscript.pt",
+}
+"""SHA-256 of published files -> their names."""
 
 
 def convert_weights(network: str, checkpoint: Path, to: Path) -> None:
     """Write the folder ``to``: ``weights.safetensors`` in float32, and ``model.json`` with its origin. InputError: the
     file is missing, damaged, or holds another network; nothing is written."""
-    kind, found = NETWORKS[network], read_checkpoint(checkpoint)
-    tensors = kind.named(found)
-    kind.check(tensors, str(checkpoint))
+    flag, check, named = NETWORKS[network]
+    tensors = named(read_checkpoint(checkpoint))
+    check(tensors, str(checkpoint))
     sha256 = store.sha256_file(checkpoint)
-    known = kind.published.get(sha256)
+    known = PUBLISHED.get(sha256)
     with store.atomic_directory(to) as partial:
         written = {name: value.detach().float() for name, value in tensors.items()}
         store.write_safetensors(partial / WEIGHTS_FILE, written)
@@ -102,17 +85,9 @@ def convert_weights(network: str, checkpoint: Path, to: Path) -> None:
         description = {"schema": 1, "kind": KIND, "network": network, "files": files, "source": source}
         store.write_json(partial / DESCRIPTION_FILE, description)
         store.sync_tree(partial)
-    # names that changed, where one tensor became one
-    places = {value.data_ptr(): name for name, value in found.items()}
-    pairs = ((places.get(value.data_ptr(), ours), ours) for ours, value in tensors.items())
-    renamed = [(theirs, ours) for theirs, ours in pairs if theirs != ours]
-    for theirs, ours in renamed[:_LISTED]:
-        log.info(f"convert: {theirs} -> {ours}")
-    more = f" ({len(renamed) - _LISTED} more names changed)" if len(renamed) > _LISTED else ""
-    other = "not a file whose hash is known" if kind.published else "no hash is on record"
-    origin = f"the published {known}" if known else other
-    log.info(f"convert: {len(tensors)} tensors{more}; SHA-256 of {checkpoint.name}: {sha256} ({origin})")
-    log.info(f"convert: use it with mudg score {kind.flag} {to / WEIGHTS_FILE}")
+    origin = f"the published {known}" if known else "not a file whose hash is known"
+    log.info(f"convert: {len(tensors)} tensors; SHA-256 of {checkpoint.name}: {sha256} ({origin})")
+    log.info(f"convert: use it with mudg score {flag} {to / WEIGHTS_FILE}")
 
 
 def source_sha256(weights: Path) -> str:
@@ -185,10 +160,9 @@ class TrajectorySets:
 
 @dataclass
 class EmbeddingFiles:
-    """Features of sets of images by a network, kept in a folder: what went through the same network before is read.
-    ``network``: images ``[n, 3, h, w]`` -> ``[n, width]``. ``prepare``: an image u8[H, W, 3] as the network wants it.
-    ``width``: of the features. ``key``: weights and rules, by which kept files are found. ``folder``: where they lie.
-    ``device``: of the network."""
+    """Features of sets of images by a network, kept in a folder: what went through the same network before is read, by
+    the hash of ``key`` (weights and rules) and pixels. ``network``: images ``[n, 3, h, w]`` -> ``[n, width]``.
+    ``prepare``: an image u8[H, W, 3] as the network wants it."""
 
     network: Callable[[Tensor], Tensor]
     prepare: Callable[[NDArray[np.uint8]], Tensor]
@@ -233,9 +207,8 @@ class EmbeddingFiles:
 
 
 class FeatureFiles(EmbeddingFiles):
-    """Features f32[n, 2048] of sets of images by FID's network, kept in a folder. ``weights``: file with the network's
-    weights. ``rule``: how images get its size. ``folder``: where features are kept. ``device``: of the network.
-    InputError: the file is missing, damaged, or holds another network."""
+    """Features f32[n, 2048] of sets of images by FID's network, kept in a folder. ``weights``: file of the network's;
+    ``rule``: how images get its size. InputError: the file is missing, damaged, or holds another network."""
 
     def __init__(self, weights: Path, rule: inception.ResizeRule, folder: Path, device: torch.device) -> None:
         state, sha256 = read_checkpoint(weights), store.sha256_file(weights)
@@ -248,22 +221,12 @@ class FeatureFiles(EmbeddingFiles):
 
 
 EVERY_SECOND: Final = (lambda rows: (rows[::2], rows[1::2]), "every second recorded frame against the others")
-Further = Callable[[Rows, Rows, Sequence[tuple[int, int]]], Mapping[str, float | str]]
-"""From features of all views of a video and of the recorded frames, and pairs of both at the same time, to numbers by
-metric, or why there is none."""
-
-
-def set_entry(generated: Rows, reference: Rows, **distances: Callable[[Rows, Rows], float]) -> Entry:
-    """Distances of two sets of features ``[n, d]`` by metric, and their sizes."""
-    values = {name: round(distance(generated, reference), 6) for name, distance in distances.items()}
-    return {"values": values, "n": len(generated), "n_reference": len(reference)}
 
 
 class SetComparison:
     """A distance of sets of images for every trajectory of a scene, whose recorded frames are the reference. ``files``:
     how images become features. ``compare``: two sets of features to their numbers. ``facts``: how these are made.
-    ``halves``: two parts of the reference, whose distance is the floor where no truth is known, and what they are.
-    ``further``: what else the features tell of a video, if anything."""
+    ``halves``: two parts of the reference, whose distance is the floor where no truth is known, and what they are."""
 
     def __init__(
         self,
@@ -272,19 +235,14 @@ class SetComparison:
         compare: Callable[[Rows, Rows], Entry],
         facts: Mapping[str, Any],
         halves: tuple[Callable[[Rows], tuple[Rows, Rows]], str] = EVERY_SECOND,
-        further: tuple[str, Further] | None = None,
     ) -> None:
-        self._scene, self._files, self._compare, self._facts = scene, files, compare, facts
-        self._halves, self._further = halves, further
+        self._scene, self._files, self._compare, self._facts, self._halves = scene, files, compare, facts, halves
         self._recorded: dict[tuple[str, int, int], tuple[str, Rows]] = {}
         self._floors, self._sets = list[dict[str, Any]](), list[dict[str, str]]()
 
-    def of(
-        self, sets: TrajectorySets, counted: Sequence[int] | None = None, views: Sequence[View] = ()
-    ) -> dict[str, Entry | str]:
-        """Numbers by method, or why there are none; the floor of the trajectory is noted for ``record``. ``counted``:
-        which of the images, of all ``views``, enter the distance (None: all). InputError: methods have different
-        numbers of images."""
+    def of(self, sets: TrajectorySets) -> dict[str, Entry | str]:
+        """Numbers by method, or why there are none; the floor of the trajectory is noted for ``record``. InputError:
+        methods have different numbers of images."""
         counts = {method: images.count for method, images in sets.methods.items()}
         if len(set(counts.values())) > 1:
             what, expected = "FID of sets of different size cannot be compared", "the same views for all methods"
@@ -293,33 +251,24 @@ class SetComparison:
         frames = self._scene.frames_of(sets.camera) if sets.camera in self._scene.cameras else ()
         recorded = ImageSet(len(frames), lambda number: read_image(self._scene, frames[number]))
         recorded = recorded.resized(sets.width, sets.height)
-        sizes = [self._files.rows(count) if counted is None else len(counted) for count in counts.values()]
-        few = min((*sizes, self._files.rows(recorded.count))) < FEWEST
-        missing = score_tables.NO_TRUTH if not recorded.count else score_tables.TOO_FEW if few else ""
-        if missing and self._further is None:
-            return dict.fromkeys(counts, missing)
+        if not recorded.count:
+            return dict.fromkeys(counts, score_tables.NO_TRUTH)
+        if min(self._files.rows(count) for count in (*counts.values(), recorded.count)) < FEWEST:
+            return dict.fromkeys(counts, score_tables.TOO_FEW)
         key = (sets.camera, sets.width, sets.height)
         if key not in self._recorded:
             self._recorded[key] = self._files.named(recorded)
         (name, reference), found = self._recorded[key], dict[str, Entry | str]()
-        chosen = lambda rows: rows if counted is None else rows[list(counted)]
         for method, images in sets.methods.items():
             own, rows = self._files.named(images.resized(sets.width, sets.height))
-            if self._further is None:
-                # which files were compared, so that sets of several logs can be pooled
-                self._sets.append({"trajectory": sets.name, "method": method, "made": own, "reference": name})
-                found[method] = self._compare(rows, reference)
-                continue
-            metric, further = self._further
-            entry = {"values": {metric: missing}} if missing else self._compare(chosen(rows), reference)
-            values = further(rows, reference, _same_times(counted or (), views, frames))
-            entry["values"] |= {k: v if isinstance(v, str) else round(v, 6) for k, v in values.items()}
-            found[method] = entry
+            # which files were compared, so that sets of several logs can be pooled
+            self._sets.append({"trajectory": sets.name, "method": method, "made": own, "reference": name})
+            found[method] = self._compare(rows, reference)
         split, how = self._halves
         pair = split(reference)
         if sets.truth is not None:
-            pair = chosen(self._files.of(sets.truth.resized(sets.width, sets.height))), reference
             how = "true images of the same views"
+            pair = self._files.of(sets.truth.resized(sets.width, sets.height)), reference
         if min(map(len, pair)) >= FEWEST:
             entry = self._compare(*pair)
             self._floors.append({"trajectory": sets.name, "how": how, **entry.pop("values"), **entry})
@@ -327,23 +276,7 @@ class SetComparison:
 
     def record(self) -> dict[str, Any]:
         """How the numbers were made, and the floors, for metrics.json."""
-        return {**self._facts, "floors": self._floors, **({} if self._further else {"sets": self._sets})}
-
-
-def _same_times(counted: Sequence[int], views: Sequence[View], frames: Sequence[Frame]) -> list[tuple[int, int]]:
-    """Pairs of counted views and recorded frames at the same time."""
-    times, pairs = np.array([frame.view.time_s for frame in frames]), []
-    for place in counted if len(times) else ():
-        nearest = int(np.argmin(np.abs(times - views[place].time_s)))
-        if abs(times[nearest] - views[place].time_s) <= SAME_TIME_S:
-            pairs.append((place, nearest))
-    return pairs
-
-
-def distributions_of(config: ScoreConfig, scene: Scene, out: Path) -> SetComparison:
-    """What computes FID and KID."""
-    device, folder = choose_device(config.device, "networks of the scores"), out / FEATURES_FOLDER
-    return distributions(scene, FeatureFiles(Path(config.fid_weights), config.fid_resize, folder, device))
+        return {**self._facts, "floors": self._floors, "sets": self._sets}
 
 
 def distributions(scene: Scene, files: FeatureFiles) -> SetComparison:
@@ -390,9 +323,7 @@ HOP_FRAMES: Final = 8
 
 
 class ClipFiles(EmbeddingFiles):
-    """Features f32[clips, 400] of the clips of a video by FVD's network, kept in a folder. ``weights``: file with the
-    network's weights. ``rule``: how frames get its size. ``folder``: where features are kept. ``device``: of the
-    network. InputError: the file is missing, damaged, or holds another network."""
+    """Features f32[clips, 400] of the clips of a video by FVD's network, kept in a folder; see ``FeatureFiles``."""
 
     def __init__(self, weights: Path, rule: i3d.VideoRule, folder: Path, device: torch.device) -> None:
         state, self.sha256 = read_checkpoint(weights), store.sha256_file(weights)
@@ -422,14 +353,13 @@ def clip_count(frames: int) -> int:
 
 
 def video_entry(generated: Rows, reference: Rows) -> Entry:
-    """FVD of two sets of features ``[n, d]``."""
-    return set_entry(generated, reference, fvd=frechet_distance)
+    """FVD of two sets of features ``[n, d]``, and their sizes."""
+    fvd = round(frechet_distance(generated, reference), 6)
+    return {"values": {"fvd": fvd}, "n": len(generated), "n_reference": len(reference)}
 
 
-def videos_of(config: ScoreConfig, scene: Scene, out: Path) -> SetComparison:
+def videos(scene: Scene, files: ClipFiles) -> SetComparison:
     """What computes FVD; a trajectory's sets hold all views of every method, in order of time."""
-    device = choose_device(config.device, "networks of the scores")
-    files = ClipFiles(Path(config.fvd_weights), config.fvd_resize, out / FEATURES_FOLDER, device)
     made = {
         "network": "I3D, Kinetics-400, scores before the softmax, 400 values",
         "weights_sha256": files.sha256,
@@ -445,85 +375,10 @@ def videos_of(config: ScoreConfig, scene: Scene, out: Path) -> SetComparison:
     return SetComparison(scene, files, video_entry, made, (halves, how))
 
 
-# -- embeddings ------------------------------------------------------------------------------------
-#
-# Scores of images through one embedding each: FD-DINOv2 and consistency with DINOv2, CMMD, CLIP-F and CLIP-V with CLIP.
-# Distances of sets compare the counted views of a trajectory with the recorded frames of the same camera, as FID does.
-# CLIP-F and consistency follow the video, so all views count.
-
-
-def _units(rows: Rows) -> NDArray[np.float64]:
-    values = rows.astype(np.float64)
-    return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12)
-
-
-def subject_consistency(rows: NDArray[np.floating]) -> float | None:
-    """Mean over frames from the second on of (max(0, cosine with the one before) + max(0, cosine with the first)) / 2,
-    as VBench's subject consistency does it; None with fewer than two frames ``[n, d]``."""
-    if len(rows) < 2:
-        return None
-    units = _units(np.asarray(rows, np.float32))
-    before, first = (units[1:] * units[:-1]).sum(1), units[1:] @ units[0]
-    return float(((np.maximum(before, 0) + np.maximum(first, 0)) / 2).mean())
-
-
-def _clip_values(rows: Rows, reference: Rows, pairs: Sequence[tuple[int, int]]) -> dict[str, float | str]:
-    """CLIP-F and CLIP-V."""
-    units, sources = _units(rows), _units(reference)
-    steps, same = (units[1:] * units[:-1]).sum(1), [float(units[a] @ sources[b]) for a, b in pairs]
-    return {
-        "clip_f": float(steps.mean()) if len(steps) else score_tables.TOO_FEW,
-        "clip_v": sum(same) / len(same) if same else score_tables.NO_TRUTH,
-    }
-
-
-def dino_of(config: ScoreConfig, scene: Scene, out: Path) -> SetComparison:
-    """What computes FD-DINOv2 and the consistency of the video."""
-    path, device = Path(config.dino_weights), choose_device(config.device, "networks of the scores")
-    network = dinov2.DinoFeatures(read_checkpoint(path), str(path)).to(device)
-    sha256 = store.sha256_file(path)
-    files = EmbeddingFiles(network, dinov2.prepared, network.width, f"DINOv2 {sha256}", out / FEATURES_FOLDER, device)
-    made = {
-        "network": f"DINOv2 {network.name}, class token, {network.width} values",
-        "weights_sha256": sha256,
-        "resize": "dgm-eval: Pillow's bicubic on 8 bits to 224x224",
-        "positions": "bicubic by the factor (16 + 0.1) / 37",
-        "reference": "recorded frames of the same camera",
-        "covariance": "n - 1",
-    }
-
-    def further(rows: Rows, _reference: Rows, _pairs: Sequence[tuple[int, int]]) -> dict[str, float | str]:
-        steady = subject_consistency(rows)
-        return {"subject_consistency": score_tables.TOO_FEW if steady is None else steady}
-
-    compare = functools.partial(set_entry, fd_dinov2=frechet_distance)
-    return SetComparison(scene, files, compare, made, further=("fd_dinov2", further))
-
-
-def clip_of(config: ScoreConfig, scene: Scene, out: Path) -> SetComparison:
-    """What computes CMMD, CLIP-F and CLIP-V."""
-    path, device = Path(config.clip_weights), choose_device(config.device, "networks of the scores")
-    network = clip_image.ClipImageFeatures(read_checkpoint(path), str(path)).to(device)
-    sha256 = store.sha256_file(path)
-    prepare = functools.partial(clip_image.prepared, side=network.side)
-    files = EmbeddingFiles(network, prepare, network.out, f"CLIP {sha256}", out / FEATURES_FOLDER, device)
-    made = {
-        "network": f"CLIP {network.name}, projected, {network.out} values",
-        "weights_sha256": sha256,
-        "resize": "bicubic without antialiasing, squashed",
-        "kernel": "Gaussian, sigma 10, biased, times 1000",
-        "reference": "recorded frames of the same camera",
-    }
-    compare = functools.partial(set_entry, cmmd=cmmd_distance)
-    return SetComparison(scene, files, compare, made, further=("cmmd", _clip_values))
-
-
 # -- all that is computed of whole sets ------------------------------------------------------------
 
 BASELINE: Final = "nearest_fill"
 Scored = Sequence[dict[str, Any]]
-ENTRIES: Final = {"distributions": "distribution", "videos": "video"}
-"""Entry of metrics.json that says how numbers were made -> that of a result with their sizes, where it differs."""
 
 
 @dataclass(frozen=True)
@@ -552,8 +407,12 @@ class SetScores:
         counted, every = trajectory.counted(reference.held_out), range(len(trajectory.views))
         for name, comparison in self.comparisons.items():
             images = _sets_of(trajectory, reference, out, counted if name == "distributions" else every)
-            of_video = () if name in ENTRIES else (counted, trajectory.views)
-            _add_named(rows, ENTRIES.get(name, name), comparison.of(images, *of_video))
+            entry, found = name.removesuffix("s"), comparison.of(images)
+            for row in rows:
+                of = found[row["method"]]
+                row["values"] |= dict.fromkeys(SET_SIZES[entry], of) if isinstance(of, str) else dict(of["values"])
+                if not isinstance(of, str):
+                    row[entry] = {name: value for name, value in of.items() if name != "values"}
         for metric, (entry, source) in self.detected.items():
             _add_detected(rows, metric, entry, source, trajectory, counted, reference)
 
@@ -568,16 +427,17 @@ class SetScores:
 def set_scores_of(config: ScoreConfig, scene: Scene, out: Path) -> SetScores:
     """What the given weights and files allow to compute. InputError: a file is missing, damaged, or holds another
     network, or the log has no lane lines."""
-    makers = {
-        "distributions": (config.fid_weights, distributions_of),
-        "videos": (config.fvd_weights, videos_of),
-        "dinov2": (config.dino_weights, dino_of),
-        "clip": (config.clip_weights, clip_of),
-    }
-    comparisons = {name: make(config, scene, out) for name, (weights, make) in makers.items() if weights}
+    comparisons: dict[str, SetComparison] = {}
+    folder, fid, fvd = out / FEATURES_FOLDER, config.fid_weights, config.fvd_weights
+    device = choose_device(config.device, "networks of the scores") if fid or fvd else torch.device("cpu")
+    if fid:
+        files = FeatureFiles(Path(fid), config.fid_resize, folder, device)
+        comparisons["distributions"] = distributions(scene, files)
+    if fvd:
+        comparisons["videos"] = videos(scene, ClipFiles(Path(fvd), config.fvd_resize, folder, device))
     detected: dict[str, tuple[str, BoxDetections | LaneDetections]] = {}
     if config.detections:
-        detected["nta_iou"] = ("nta", BoxDetections(scene, Path(config.detections), config.as_published))
+        detected["nta_iou"] = ("nta", BoxDetections(scene, Path(config.detections)))
     if config.lanes:
         detected["ntl_iou"] = ("ntl", LaneDetections(scene, Path(config.lanes)))
     return SetScores(comparisons, detected)
@@ -631,15 +491,6 @@ def _sets_of(trajectory: ScoredTrajectory, reference: Reference, out: Path, coun
     return TrajectorySets(trajectory.name, trajectory.camera, camera.width, camera.height, methods, truth)
 
 
-def _add_named(rows: Scored, entry: str, found: Mapping[str, dict[str, Any] | str]) -> None:
-    """Values of several metrics by method, and what stands beside them, into the results of one trajectory."""
-    for row in rows:
-        of = found[row["method"]]
-        row["values"] |= dict(of["values"]) if not isinstance(of, str) else dict.fromkeys(SET_SIZES[entry], of)
-        if not isinstance(of, str) and "n" in of:
-            row[entry] = {name: value for name, value in of.items() if name != "values"}
-
-
 def _add_detected(
     rows: Scored,
     metric: str,
@@ -667,5 +518,3 @@ def _add_detected(
         if isinstance(value, str):
             continue
         row[entry] = {k: v for k, v in value.items() if k != "value"}
-        if isinstance(source, LaneDetections):
-            row[entry]["against_detector"] = source.against(images, there["truth"])

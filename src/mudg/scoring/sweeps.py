@@ -1,18 +1,11 @@
-"""Simulated LiDAR sweeps against recorded and exact ones.
-
-Truth is the range of every beam: on the recorded path, of the beams that the held-out sweep fired; in a generated city
-beside it, exact and without noise. Rows besides the methods, all without the held-out sweeps:
-
-* ``constant``: a method's surfaces with the rules that need no learning: every beam that meets something returns, and
-  intensity is half the cosine of incidence.
-* ``nearest``: the nearest recorded sweep, moved by poses and boxes.
-* ``fused``: the sweeps around it, moved likewise, projected into the beams, the first surface kept.
-"""
+"""Simulated LiDAR sweeps against recorded and exact ones. Truth is the range of every beam: on the recorded path, of
+the beams that the held-out sweep fired; in a generated city beside it, exact and without noise. The row ``nearest`` is
+the nearest recorded sweep that was not held out, moved by poses and boxes."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -22,21 +15,16 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from mudg.base.errors import InputError
-from mudg.base.types import Scene, Sweep
+from mudg.base.types import Scene
 from mudg.city.world import CityWorld
 from mudg.scene.beams import Beams, beams_of, held_out, moving_tracks, placed, returns_of, training_sweeps, with_silent
-from mudg.scene.sweep_sets import SimulatedSweep, SweepSet, read_sweep_sets
+from mudg.scene.observations import SimulatedSweep, SweepSet, read_sweep_sets
 
 Floats = NDArray[np.float64]
 MATCH_RAD: Final = float(np.radians(0.4))
 """A moved point answers a beam within this angle."""
 SLICES: Final = 8
-FUSED: Final = 8
-"""Sweeps that are fused, the nearest in time."""
-CANDIDATES: Final = 12
-SAME_SURFACE: Final = 0.03
-SAME_SURFACE_M: Final = 0.1
-CONSTANT_INTENSITY: Final = 0.5
+NEAREST: Final = "nearest"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +77,7 @@ def sweep_scores(scene: Scene, methods: Mapping[str, Path]) -> list[dict[str, An
     if not sets:
         return []
     world = None if scene.source.recipe is None else CityWorld.from_source(scene.source)
-    others, rows = OtherSweeps(scene), list[dict[str, Any]]()
+    nearest, rows = NearestSweep(scene), list[dict[str, Any]]()
     trajectories = {name: one for found in sets.values() for name, one in found.items()}
     for trajectory, example in sorted(trajectories.items(), key=lambda item: (item[1].shift_m, item[0])):
         sums, count = defaultdict[str, SweepScores](SweepScores), 0
@@ -99,14 +87,11 @@ def sweep_scores(scene: Scene, methods: Mapping[str, Path]) -> list[dict[str, An
                 arrays, returned = one.arrays(sweep), Measured(*np.full((2, len(beams)), np.nan))
                 beam = arrays["beam"]
                 returned.range_m[beam], returned.intensity[beam] = arrays["range_m"][beam], arrays["intensity"]
-                plain = Measured(arrays["range_m"].astype(np.float64), CONSTANT_INTENSITY * arrays["facing"])
-                rows_of = {method: returned, f"{method}: constant": plain}
+                sums[method].add(beams.directions, returned, true)
                 if number == 0:
                     count += 1
-                    rows_of |= others.answers(example.sensor, beams)
-                for name, made in rows_of.items():
-                    sums[name].add(beams.directions, made, true)
-        order = sorted(sums, key=lambda name: name in ("nearest", "fused"))
+                    sums[NEAREST].add(beams.directions, nearest.answer(example.sensor, beams), true)
+        order = sorted(sums, key=lambda name: name == NEAREST)
         head = {"trajectory": trajectory, "shift_m": example.shift_m, "sweeps": count}
         rows += [{"method": name, **head, "values": sums[name].values()} for name in order]
     return rows
@@ -146,27 +131,20 @@ def _exact(world: CityWorld, beams: Beams) -> Measured:
     return Measured(*world.ranges(places, directions, beams.start_s + beams.share * (beams.end_s - beams.start_s)))
 
 
-# other sweeps, moved ------------------------------------------------------------------------------
-
-
-class OtherSweeps:
-    """Recorded sweeps that answer for others: the nearest one, and several fused."""
+class NearestSweep:
+    """The recorded sweep that answers for others: the nearest in time, moved."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         self._tracks = {track.id: track for track in moving_tracks(scene)}
         self._sweeps = training_sweeps(scene)
 
-    def answers(self, sensor: str, beams: Beams) -> dict[str, Measured]:
-        """By name of the row. A sweep at the beams' own time does not answer."""
+    def answer(self, sensor: str, beams: Beams) -> Measured:
+        """What it measures along beams. A sweep at the beams' own time does not answer."""
         middle = beams.time_s(0.5)
-        own = [sweep for sweep in self._sweeps if sweep.sensor == sensor]
-        near = sorted(own, key=lambda sweep: (abs(sweep.time_s - middle), sweep.time_s))
-        near = [sweep for sweep in near if abs(sweep.time_s - middle) > 1e-3]
-        return {"nearest": self._answer(near[:1], beams, 1), "fused": self._answer(near[:FUSED], beams, CANDIDATES)}
-
-    def _answer(self, sweeps: Sequence[Sweep], beams: Beams, candidates: int) -> Measured:
-        parts = [own for sweep in sweeps for own in returns_of(self._scene, sweep).items()]
+        others = [s for s in self._sweeps if s.sensor == sensor and abs(s.time_s - middle) > 1e-3]
+        near = sorted(others, key=lambda sweep: (abs(sweep.time_s - middle), sweep.time_s))
+        parts = [own for sweep in near[:1] for own in returns_of(self._scene, sweep).items()]
         intensity = np.concatenate([*(part.intensity for _, part in parts), np.zeros(0)])
         found = Measured(np.full(len(beams), np.nan), np.full(len(beams), np.nan))
         for share, own in beams.parts(SLICES):
@@ -177,27 +155,17 @@ class OtherSweeps:
                     poses[name] = at
             xyz, numbers = placed(parts, poses, pose[:3, 3])
             local = np.stack([xyz[:, 0] * a + xyz[:, 1] * b + xyz[:, 2] * c for a, b, c in pose[:3, :3].T], 1)
-            row = first_points(beams.directions[own], local, candidates)
+            row = nearest_points(beams.directions[own], local)
             hit = row >= 0
             found.range_m[own[hit]] = np.linalg.norm(local[row[hit]], axis=1)
             found.intensity[own[hit]] = intensity[numbers[row[hit]]]
         return found
 
 
-def first_points(beams: Floats, xyz: Floats, candidates: int) -> NDArray[np.int64]:
-    """The point that answers each beam, i64[B]; -1: none is near. Of ``candidates`` points around a beam those of the
-    first surface count, and of them the one that is nearest in angle."""
+def nearest_points(beams: Floats, xyz: Floats) -> NDArray[np.int64]:
+    """The point that answers each beam, the nearest in angle, i64[B]; -1: none is near."""
     if not len(xyz) or not len(beams):
         return np.full(len(beams), -1)
-    away = np.linalg.norm(xyz, axis=1)
-    count = min(candidates, len(xyz))
-    found = KDTree(xyz / away[:, None]).query(beams, count, distance_upper_bound=MATCH_RAD, workers=-1)
-    gaps, rows = (np.asarray(block).reshape(len(beams), count) for block in found)
-    known = np.isfinite(gaps)
-    depth = np.where(known, away[np.where(known, rows, 0)], np.inf)
-    first = depth.min(1)
-    with np.errstate(invalid="ignore"):
-        front = known & (depth <= (first * (1 + SAME_SURFACE) + SAME_SURFACE_M)[:, None])
-    best = np.where(front, gaps, np.inf).argmin(1)
-    at = np.arange(len(beams))
-    return np.where(front[at, best], rows[at, best], -1).astype(np.int64)
+    units = xyz / np.linalg.norm(xyz, axis=1)[:, None]
+    gaps, rows = KDTree(units).query(beams, distance_upper_bound=MATCH_RAD, workers=-1)
+    return np.where(np.isfinite(gaps), rows, -1).astype(np.int64)

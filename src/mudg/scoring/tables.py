@@ -1,4 +1,4 @@
-"""Scores as a document (metrics.json), as Markdown and as plain text for a terminal. Plain values only; no torch."""
+"""Scores as a document (metrics.json), as Markdown and as plain text for a terminal. No torch."""
 
 from __future__ import annotations
 
@@ -23,18 +23,15 @@ WEIGHT_FLAGS: Final = {
         ("--lpips-vgg-weights", "lpips_vgg"),
         ("--fid-weights", "fid kid"),
         ("--fvd-weights", "fvd"),
-        ("--dino-weights", "fd_dinov2 subject_consistency"),
-        ("--clip-weights", "cmmd clip_f clip_v"),
         ("--detections", "nta_iou"),
         ("--lanes", "ntl_iou"),
     )
     for metric in metrics.split()
 }
 """Metric -> the flag of ``mudg score`` that names the weights or files it needs."""
-SET_SIZES: Final = {"distribution": ("fid", "kid"), "video": ("fvd",), "dinov2": ("fd_dinov2",), "clip": ("cmmd",)}
+SET_SIZES: Final = {"distribution": ("fid", "kid"), "video": ("fvd",)}
 """Entry of a result with the sizes of its sets -> their metrics."""
-_MADE: Final = {"distribution": "distributions", "video": "videos"}
-SET_METRICS: Final = {metric: _MADE.get(entry, entry) for entry, metrics in SET_SIZES.items() for metric in metrics}
+SET_METRICS: Final = {metric: f"{entry}s" for entry, metrics in SET_SIZES.items() for metric in metrics}
 """Metric of sets of images or clips -> the entry of metrics.json that says how it was made."""
 FLOOR: Final = "Floor: the truth itself"
 TITLES: Final[dict[str, str]] = {
@@ -53,7 +50,7 @@ LIDAR_COLUMNS: Final[Mapping[str, tuple[str, str, int]]] = {
     "intensity": ("intensity error", "", 3),
 }
 """Column -> title, unit, digits."""
-LIDAR_TITLES: Final = {"nearest": "nearest sweep, moved", "fused": "8 sweeps, fused"}
+LIDAR_TITLES: Final = {"nearest": "nearest sweep, moved"}
 LIDAR_RULES: Final = (
     "LiDAR: a beam is right where it returns as in the truth (F1). Errors of range (median) and intensity (mean) are "
     "those of beams that return in both; chamfer is the mean of both directions.",
@@ -61,10 +58,10 @@ LIDAR_RULES: Final = (
     "sensor's rows and columns. No row uses the held-out sweeps, but the clouds that the fit started from hold them.",
 )
 _DIGITS: Final = {
-    **dict.fromkeys(("fid", "fvd", "fd_dinov2"), 1),
+    **dict.fromkeys(("fid", "fvd"), 1),
     **dict.fromkeys(("psnr", "psnr_movers", "flicker", "rmse_m"), 2),
     **dict.fromkeys(("lidar_rmse_m", "lidar_psnr", "lane_psnr", "ntl_iou"), 2),
-    **dict.fromkeys(("kid", "warp_error", "temporal_flickering", "clip_f", "clip_v", "subject_consistency"), 4),
+    **dict.fromkeys(("kid", "warp_error", "temporal_flickering"), 4),
 }
 """Digits of metrics that do not have 3."""
 
@@ -91,11 +88,10 @@ def document(
     rows: Mapping[str, Mapping[str, Any]],
     facts: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Everything ``metrics.json`` holds. ``scene``: what was scored. ``exact``: whether truth exists at any view.
-    ``trajectories``: as JSON values. ``methods``: in the order of the tables. ``results``: one entry per method and
-    trajectory. ``rows``: title, unit, better and needs of each metric. ``facts``: how the numbers were made:
-    ``depth_limit_m``, beyond which depths do not count; ``anchors``; and by the entries of ``SET_METRICS``,
-    ``detections`` and ``lpips`` what is known of their metrics; entries that are missing were not computed."""
+    """Everything ``metrics.json`` holds. ``exact``: whether truth exists at any view. ``methods``: in the order of the
+    tables. ``results``: one entry per method and trajectory. ``rows``: title, unit, better and needs of each metric.
+    ``facts``: how the numbers were made: ``depth_limit_m``, ``anchors``, and by metric or entry of ``SET_METRICS`` what
+    is known of those that were computed."""
     held_out, limit = len(scene.frames_in("test")), f"{facts['depth_limit_m']:g} m"
     off = "A recorded log has no ground truth off its path: shifted views are shown, not scored."
     no_split = "No frame was held out: on the recorded path the frames that were learned from are scored."
@@ -152,11 +148,6 @@ def _further_rules(facts: Mapping[str, Any]) -> list[str]:
     if facts.get("lpips"):
         how = "in -1..1" if facts["lpips"]["input"] == "correct" else "unscaled, in 0..1"
         rules.append(f"LPIPS gets its colours {how}.")
-    if facts.get("dinov2"):
-        rules.append(f"FD-DINOv2 is made with {facts['dinov2']['network']}; read it beside the floor.")
-    if facts.get("clip"):
-        pairs = "CLIP-F (neighbouring views) and CLIP-V (recorded frame of the same time)"
-        rules.append(f"CMMD, {pairs} are made with {facts['clip']['network']}.")
     detections = facts.get("detections", {})
     if of := detections.get("nta_iou"):
         of = f"true boxes {of['boxes']}; classes: {of['classes']}; points: {of['points']}"
@@ -235,11 +226,9 @@ def floors_by_distance(document: Mapping[str, Any]) -> dict[float, dict[str, flo
 def plain(document: Mapping[str, Any]) -> str:
     """The main numbers for a terminal: one block per distance, best values marked with a star."""
     values_of = values_by_distance(document)
-    distances = sorted({d for _, d in values_of})
     names = (*TERMINAL_METRICS, *(name for name, entry in SET_METRICS.items() if entry in document))
-    floors = floors_by_distance(document)
-    lines = []
-    for distance in distances:
+    floors, lines = floors_by_distance(document), []
+    for distance in sorted({d for _, d in values_of}):
         of_methods = {m["name"]: values_of.get((m["name"], distance), {}) for m in document["methods"]}
         for wanted in (names, WITHOUT_TRUTH):
             columns = [m for m in document["metrics"] if m["name"] in wanted]
@@ -248,29 +237,25 @@ def plain(document: Mapping[str, Any]) -> str:
         else:
             lines += [f"{distance_title(document, distance)}: nothing to score against (no truth)", ""]
             continue
-        lines.append(distance_title(document, distance))
-        heads = [f"{m['title']}{' ' + m['unit'] if m['unit'] else ''}" for m in columns]
-        widths = [max(14, len(head) + 2) for head in heads]
-        lines.append("  " + " " * 28 + "".join(f"{head:>{width}}" for head, width in zip(heads, widths, strict=True)))
+        rows = [["", *(f"{m['title']} {m['unit']}".strip() + " " for m in columns)]]
         for method in document["methods"]:
-            cells = []
-            for metric, width in zip(columns, widths, strict=True):
+            rows.append([method["title"]])
+            for metric in columns:
                 across = {name: of.get(metric["name"]) for name, of in of_methods.items()}
                 star = "*" if method["name"] in best_of(metric["better"], across, metric["name"]) else " "
-                cells.append(f"{number_text(metric['name'], across[method['name']]) + star:>{width}}")
-            lines.append(f"  {method['title']:<28}" + "".join(cells))
+                rows[-1].append(number_text(metric["name"], across[method["name"]]) + star)
         if distance in floors:
-            found = [number_text(c["name"], floors[distance].get(c["name"])) + " " for c in columns]
-            cells = [f"{text:>{width}}" for text, width in zip(found, widths, strict=True)]
-            lines.append(f"  {FLOOR:<28}" + "".join(cells))
-        lines.append("")
+            rows.append([FLOOR, *(number_text(c["name"], floors[distance].get(c["name"])) + " " for c in columns)])
+        lines += [distance_title(document, distance), *_aligned(rows), ""]
     for title, heads, rows in _lidar_tables(document):
-        widths = [len(head) + 3 for head in heads[1:]]
-        texts = ([title, *heads[1:]], *rows)
-        for first, *cells in texts:
-            lines.append(f"  {first:<32}" + "".join(f"{c:>{w}}" for c, w in zip(cells, widths, strict=True)))
-        lines.append("")
+        lines += [*_aligned([[title, *heads[1:]], *rows]), ""]
     return plain_lines(lines).rstrip()
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table whose first column stands left, the others right."""
+    widths = [max(map(len, column)) + 2 for column in zip(*rows, strict=True)]
+    return ["  " + f"{row[0]:<{widths[0]}}" + "".join(f"{c:>{w}}" for c, w in zip(row[1:], widths[1:])) for row in rows]
 
 
 def markdown(document: Mapping[str, Any]) -> str:

@@ -1,8 +1,6 @@
-"""A vehicle that drives in a scene: how it moves, where the road is, who else is on it, and what it runs into and sees.
-
-The world is that of the log (metres, z up); the vehicle's frame is the log's: x forward,
-y left, z up, its origin taken for the middle of the rear axle.
-"""
+"""A vehicle that drives in a scene: how it moves, where the road is, who else is on it, what it runs into and sees. The
+world is that of the log (metres, z up); the vehicle's frame is the log's: x forward, y left, z up, its origin taken for
+the middle of the rear axle."""
 
 from __future__ import annotations
 
@@ -16,11 +14,11 @@ from numpy.typing import NDArray
 
 from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
-from mudg.base.types import Camera
+from mudg.base.types import Camera, View
 from mudg.gaussians.model import compose
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.views import resized_view
-from mudg.scene.road import Road
+from mudg.scene.motion import Road
 from mudg.sim.optics import Pinhole
 from mudg.sim.session import CameraReply, CameraRequest, Instant, Layer, Session
 
@@ -275,8 +273,6 @@ class Drive:
         return SURROUNDINGS if self._solid_inside() >= FEWEST_SOLID else ""
 
     def _solid_inside(self) -> int:
-        if not len(self.solid):
-            return 0
         x, y, z = geometry.transform_points(geometry.invert(self.pose), self.solid).T
         rear = MARGIN_M - self.car.overhang_m
         inside = (x > rear) & (x < rear + self.car.length_m - 2 * MARGIN_M)
@@ -309,16 +305,12 @@ class Cockpit:
             remedy = "give the folder of a run, or scene="
             raise InputError("driving needs the log of a fit, which tells the road", remedy=remedy)
         self.session, self.ego, self.layers = session, session.scene.ego, tuple(layers)
-        self.cameras: dict[str, Camera] = {}
-        self.mounts: dict[str, NDArray[np.float64]] = {}
+        known, self.mounts, self.cameras = session.mounts(), dict[str, Matrix](), dict[str, Camera]()
         for name in ((cameras,) if isinstance(cameras, str) else tuple(cameras)) or tuple(session.cameras)[:1]:
-            frames = session.scene.frames_of(name) if name in session.cameras else ()
-            known = [(frame.view, self.ego.pose_at(frame.view.time_s)) for frame in frames]
-            view, ego = next(((view, pose) for view, pose in known if pose is not None), (None, None))
-            if view is None or ego is None:
+            if name not in known:
                 raise UsageError("no such camera", where="cameras", expected=", ".join(session.cameras), got=name[:60])
-            self.mounts[name] = geometry.invert(ego) @ view.world_from_cam
-            self.cameras[name] = resized_view(view, width_px).camera
+            self.mounts[name] = known[name]
+            self.cameras[name] = resized_view(View(session.cameras[name], known[name], 0.0), width_px).camera
         self.road = Road(self.ego.world_from_ego)
         self.actors = {}
         for node in session.model.nodes:

@@ -1,12 +1,6 @@
-"""A simulated LiDAR: beams into a fitted scene and into what the log's own sweeps measured.
-
-A sweep is cut into slices of its firing order. Each slice is drawn at the pose and time of its middle, so that a
-turning sensor on a moving vehicle measures what it would have measured; its beams are then placed by their own poses.
-
-With a log, a beam meets the surface that the log's sweeps measured (``sim/returns.py``), with the intensity measured
-there, or is lost as beams were lost there. Where they measured nothing, and without a log, beams meet the Gaussians,
-sampled from pinhole views.
-"""
+"""A simulated LiDAR. Each slice of a sweep is drawn at the pose and time of its middle, then its beams are placed by
+their own poses. With a log, a beam meets the surface that the log's sweeps measured, with its intensity, or is lost as
+beams were lost there (``sim/returns.py``); where they measured nothing, and without a log, it meets the Gaussians."""
 
 from __future__ import annotations
 
@@ -30,8 +24,8 @@ from mudg.core.weather.air import SOFT, sweep_in_weather
 from mudg.editing.script import EditScript
 from mudg.editing.settings import RenderConfig
 from mudg.scene.beams import Beams, beams_of, with_silent
+from mudg.scene.observations import SWEEPS_INDEX, SimulatedSweep, SweepSet, write_index
 from mudg.scene.read import read_scene
-from mudg.scene.sweep_sets import INDEX, SimulatedSweep, SweepSet, write_index
 from mudg.sim.optics import faces_of, nearest, surface
 from mudg.sim.returns import LogReturns
 from mudg.sim.session import Instant, Session
@@ -310,7 +304,7 @@ def _carried(points: NDArray[np.float32], share: Floats, start: Instant, end: In
 
 # -- sweeps of a whole log: ``mudg render --lidar`` ---
 #
-# OUT/lidar/<sensor>_recorded/, OUT/lidar/<sensor>_shift+3.0/   see ``scene/sweep_sets.py``
+# OUT/lidar/<sensor>_recorded/, OUT/lidar/<sensor>_shift+3.0/   see ``scene/observations.py``
 Place = tuple[BeamTable, Instant, Instant]
 
 
@@ -381,7 +375,7 @@ def write_sweeps(config: RenderConfig, scene: Path, session: Session, out: Path)
                 poses = (start.world_from_sensor, end.world_from_sensor, start.time_s, end.time_s)
                 records.append(SimulatedSweep(sweep.id, wanted.beams is None, *poses, file.name))
                 bar.advance()
-            if not (folder / INDEX).is_file():
+            if not (folder / SWEEPS_INDEX).is_file():
                 write_index(SweepSet(folder, name, wanted.sensor, shift_m, tuple(records)))
             names.append(name)
     return names

@@ -1,8 +1,6 @@
-"""Lenses of simulated cameras: the ray of every pixel, and pinhole faces from which any of them is resampled.
-
-Axes are those of a camera: x right, y down, z forward; the centre of the top-left pixel is (0.5, 0.5). Rays have length
-1; NaN where the lens sees nothing.
-"""
+"""Lenses of simulated cameras: the ray of every pixel, and pinhole faces from which any of them is resampled. Axes are
+those of a camera (x right, y down, z forward); the centre of the top-left pixel is (0.5, 0.5). Rays have length 1; NaN
+where the lens sees nothing."""
 
 from __future__ import annotations
 
@@ -67,8 +65,7 @@ class Pinhole:
 
     def rays(self) -> Floats:
         """f64[H, W, 3]."""
-        x, y = (self.columns() - self.cx) / self.fx, (self.rows() - self.cy) / self.fy
-        distorted = np.stack(np.broadcast_arrays(x[None, :], y[:, None]), -1)
+        distorted = np.stack(_plane(self), -1)
         plain, step = distorted.copy(), np.full(distorted.shape[:2], np.inf)
         if self.camera is None:
             for _ in range(NEWTON_STEPS):  # fixed point of x = (distorted - tangential(x)) / radial(x)
@@ -92,14 +89,6 @@ class Pinhole:
         dy = p[0] * (r2 + 2 * y * y) + 2 * p[1] * x * y + r2 * (s[2] + s[3] * r2)
         return radial, np.stack([dx, dy], -1)
 
-    def columns(self) -> Floats:
-        """Horizontal pixel centres f64[W]."""
-        return np.arange(self.width) + 0.5
-
-    def rows(self) -> Floats:
-        """Vertical pixel centres f64[H]."""
-        return np.arange(self.height) + 0.5
-
 
 @dataclass(frozen=True, slots=True)
 class Fisheye:
@@ -121,8 +110,7 @@ class Fisheye:
 
     def rays(self) -> Floats:
         """f64[H, W, 3]."""
-        columns, rows = np.arange(self.width) + 0.5, np.arange(self.height) + 0.5
-        x, y = np.broadcast_arrays(((columns - self.cx) / self.fx)[None, :], ((rows - self.cy) / self.fy)[:, None])
+        x, y = _plane(self)
         coefficients = [0.0, 1.0]
         for k in self.radial:
             coefficients += [0.0, k]
@@ -176,6 +164,13 @@ class FTheta:
 
 
 Optics = Pinhole | Fisheye | FTheta
+
+
+def _plane(lens: Pinhole | Fisheye) -> tuple[Floats, Floats]:
+    """Pixel centres in focal lengths from the principal point, to the right and down, each f64[H, W]."""
+    x, y = (np.arange(lens.width) + 0.5 - lens.cx) / lens.fx, (np.arange(lens.height) + 0.5 - lens.cy) / lens.fy
+    right, down = np.broadcast_arrays(x[None, :], y[:, None])
+    return right, down
 
 
 def check_optics(optics: Optics, positive: Sequence[float], numbers: Sequence[float]) -> None:
@@ -275,13 +270,22 @@ def rays_per_radian(rays: Floats) -> float:
     return 1.0 / float(np.median(steps)) if len(steps) else 100.0
 
 
-def bilinear(image: NDArray[np.float32], uv: Floats) -> NDArray[np.float32]:
-    """Values of an image f32[C, H, W] at pixels f64[n, 2], f32[C, n]; pixels beyond its border count as the border."""
-    height, width = image.shape[-2:]
+Corners = tuple[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]], Floats, Floats]
+
+
+def _corners(uv: Floats, height: int, width: int) -> Corners:
+    """Rows and columns (top, below, left, right) of the four pixels around places f64[n, 2], and how far right and down
+    of the first each lies; what is beyond the border counts as the border."""
     x, y = np.clip(uv[:, 0] - 0.5, 0, width - 1), np.clip(uv[:, 1] - 0.5, 0, height - 1)
     left, top = np.minimum(x.astype(np.int64), max(width - 2, 0)), np.minimum(y.astype(np.int64), max(height - 2, 0))
     right, below = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
-    u, v = (x - left).astype(np.float32), (y - top).astype(np.float32)
+    return (top, below, left, right), x - left, y - top
+
+
+def bilinear(image: NDArray[np.float32], uv: Floats) -> NDArray[np.float32]:
+    """Values of an image f32[C, H, W] at pixels f64[n, 2], f32[C, n]; pixels beyond its border count as the border."""
+    (top, below, left, right), u, v = _corners(uv, *image.shape[-2:])
+    u, v = u.astype(np.float32), v.astype(np.float32)
     upper = image[:, top, left] * (1 - u) + image[:, top, right] * u
     lower = image[:, below, left] * (1 - u) + image[:, below, right] * u
     return upper * (1 - v) + lower * v
@@ -298,11 +302,7 @@ def surface(depth: NDArray[np.float32], uv: Floats, camera: Camera) -> tuple[Flo
     """Depth f64[n] at places between the pixels of f32[H, W], and how squarely the surface there faces the camera, the
     cosine f32[n]. Where the four pixels around a place show one surface, its inverse depth is interpolated, which is
     exact on planes; at edges the nearest pixel counts, so that no beam hangs between two surfaces."""
-    height, width = depth.shape
-    x, y = np.clip(uv[:, 0] - 0.5, 0, width - 1), np.clip(uv[:, 1] - 0.5, 0, height - 1)
-    left, top = np.minimum(x.astype(np.int64), max(width - 2, 0)), np.minimum(y.astype(np.int64), max(height - 2, 0))
-    right, below = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
-    u, v = x - left, y - top
+    (top, below, left, right), u, v = _corners(uv, *depth.shape)
     with np.errstate(divide="ignore", invalid="ignore"):
         corners = 1 / np.stack([depth[top, left], depth[top, right], depth[below, left], depth[below, right]]).astype(
             float

@@ -1,9 +1,6 @@
-"""Drivers for a closed loop: what they see, and three that decide by it.
-
-A pilot gets a `DriverView` at every step and answers with `Controls`. `RoutePilot` knows the road by its route and
-keeps its distance to whoever it sees ahead; `EdgePilot` pulls over to the edge of the road that it sees; `PlanPilot`
-drives along the plans of a policy.
-"""
+"""Drivers for a closed loop, which answer a `DriverView` with `Controls` at every step: `RoutePilot` knows the road by
+its route and keeps its distance to whoever it sees ahead; `EdgePilot` pulls over to the edge of the road that it sees;
+`PlanPilot` drives along the plans of a policy, such as `Policy`."""
 
 from __future__ import annotations
 

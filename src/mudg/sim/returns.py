@@ -1,12 +1,6 @@
 """What a log's own sweeps tell a simulated LiDAR: where surfaces are, how bright they return, and which beams are lost.
-
-Beams meet the sweeps that were taken nearest to them in place and time, those of held-out frames left out: poses drift,
-and edges seen from elsewhere lie elsewhere. Every rigid part of the world has its own nearest sweeps
-(``scene/beams.py``). What these did not measure others answer, and where none did, the Gaussians (``sim/lidar.py``).
-Beams that were lost are part of the cloud (``core/returns.py``). Whether a beam returns is a logistic regression of the
-loss around it, of that in this direction of the sensor, of range, incidence, and how well the returns around cover it,
-learnt from sweeps that are met without themselves.
-"""
+Every rigid part of the world is met in the sweeps that were taken nearest to it in place and time (``scene/beams.py``),
+then in others; held-out frames are left out. Lost beams are part of the cloud (``core/returns.py``)."""
 
 from __future__ import annotations
 
@@ -20,8 +14,8 @@ from scipy.spatial import KDTree
 from mudg.base import geometry, log
 from mudg.base.errors import UsageError
 from mudg.base.types import Scene, Sweep
-from mudg.core.returns import Met, Returns, first_surface
-from mudg.core.rows import Rows
+from mudg.core.returns import Met, Returns, Rows, first_surface
+from mudg.editing.apply import spread
 from mudg.scene.beams import WORLD, Beams, beams_of, moving_tracks, placed, returns_of, training_sweeps, with_silent
 
 Floats = NDArray[np.float64]
@@ -99,9 +93,9 @@ class LogReturns:
         self._read: dict[str, tuple[Beams, dict[str, Returns]]] = {}
         self._rows: Rows | None = None
         self._seen_from: dict[str, Floats] = {}
-        tested = _evenly(self.sweeps[1:-1], MOST_TESTED) if len(sweeps) >= 4 else ()
+        tested = spread(self.sweeps[1:-1], MOST_TESTED) if len(sweeps) >= 4 else ()
         others = [sweep for sweep in self.sweeps if sweep not in tested]
-        self.looks = Looks([self.measured(sweep)[0] for sweep in _evenly(others, MOST_LOOKS)])
+        self.looks = Looks([self.measured(sweep)[0] for sweep in spread(others, MOST_LOOKS)])
         self.weights = _regression(*_samples(tested, self)) if tested else None
         """Of ``features``; None: too little to learn from, and a beam returns where it meets something."""
 
@@ -146,7 +140,7 @@ class LogReturns:
                 order = (k for k in np.argsort(apart, kind="stable") if np.isfinite(apart[k]))
                 sweeps = [self.sweeps[k] for k in order if self.sweeps[k] is not without]
                 near += [(number, sweep, TRUST**k) for k, sweep in enumerate(sweeps[:NEAREST])]
-                far += [(number, sweep, 1.0) for sweep in _evenly(sweeps[NEAREST:], NEAREST)]
+                far += [(number, sweep, 1.0) for sweep in spread(sweeps[NEAREST:], NEAREST)]
         return near, far
 
     def _places(self, name: str) -> Floats:
@@ -200,7 +194,7 @@ class LogReturns:
         return np.nan_to_num(np.stack(columns, 1))
 
     def returns(self, beams: Floats, met: Met) -> NDArray[np.bool_]:
-        """Which beams return."""
+        """Which beams return: by a logistic regression of `features`, learnt from sweeps met without themselves."""
         seen = np.isfinite(met.range_m)
         return seen if self.weights is None else seen & (self.features(beams, met) @ self.weights > 0)
 
@@ -232,11 +226,6 @@ def learn_returns(scene: Scene, sensor: str = "", gone: Gone | None = None) -> L
         return None
     log.info(f"LiDAR: surfaces, intensity and lost beams from {len(sweeps)} sweeps of {sweeps[0].sensor}")
     return LogReturns(scene, sweeps, gone)
-
-
-def _evenly(sweeps: Sequence[Sweep], most: int) -> tuple[Sweep, ...]:
-    at = np.unique(np.linspace(0, len(sweeps) - 1, min(most, len(sweeps))).round().astype(int))
-    return tuple(sweeps[k] for k in at)
 
 
 def _samples(sweeps: Sequence[Sweep], returns: LogReturns) -> tuple[Floats, NDArray[np.bool_]]:

@@ -1,9 +1,6 @@
-"""``mudg serve``: a session behind gRPC, as AlpaSim and NuRec call a renderer.
-
-The world is AlpaSim's local frame, the vehicle's rig the log's vehicle frame; microseconds are those of the scene's
-clock. Objects that a request does not list are absent, as these simulators expect. Names that the reconstruction has no
-Gaussians of (parked vehicles) are passed over: they are part of the background.
-"""
+"""``mudg serve``: a session behind gRPC, as AlpaSim and NuRec call a renderer. The world is AlpaSim's local frame, the
+vehicle's rig the log's vehicle frame; microseconds are those of the scene's clock. Objects that a request does not list
+are absent; names without Gaussians of their own (parked vehicles) are passed over: they are background."""
 
 from __future__ import annotations
 
@@ -24,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mudg.base import geometry, log
+from mudg.base import log
 from mudg.base.errors import MudgError, ResourceError
 from mudg.base.versions import version
 from mudg.sim import wire
@@ -87,16 +84,10 @@ class Renderer:
     def get_available_cameras(self, request: Any) -> Any:
         """The log's cameras and where they are mounted."""
         self._check_scene(request)
-        made, scene = self.types.AvailableCamerasReturn(), self.session.scene
-        if scene is None:
-            return made
-        for name, camera in self.session.cameras.items():
-            view = next(frame.view for frame in scene.frames if frame.view.camera.name == name)
-            ego = self.session.ego_pose(view.time_s)
-            if ego is None:
-                continue
-            one = made.available_cameras.add(logical_id=name)
-            one.rig_to_camera.CopyFrom(pose_of(geometry.invert(ego) @ view.world_from_cam))
+        made = self.types.AvailableCamerasReturn()
+        for name, mount in self.session.mounts().items():
+            camera, one = self.session.cameras[name], made.available_cameras.add(logical_id=name)
+            one.rig_to_camera.CopyFrom(pose_of(mount))
             spec = one.intrinsics
             spec.logical_id, spec.shutter_type = name, 5
             spec.resolution_h, spec.resolution_w = camera.height, camera.width

@@ -1,9 +1,6 @@
-"""One reconstruction that answers sensor requests. No files are written, no clock runs: a reply depends on its request
-alone, so a simulator may step, rewind and ask for anything in any order; equal requests get equal bytes.
-
-The world is that of the log: metres, z up. Objects are those that the fit has Gaussians of; parked vehicles belong to
-the background unless an edit script takes them out.
-"""
+"""One reconstruction that answers sensor requests. A reply depends on its request alone (no clock, no files): equal
+requests get equal bytes, in any order. The world is that of the log: metres, z up. Objects are those that the fit has
+Gaussians of; parked vehicles belong to the background unless an edit script takes them out."""
 
 from __future__ import annotations
 
@@ -241,6 +238,16 @@ class Session:
     def cameras(self) -> dict[str, Camera]:
         """Cameras of the log, by name; none without a log."""
         return {} if self.scene is None else dict(self.scene.cameras)
+
+    def mounts(self) -> dict[str, Matrix]:
+        """Poses vehicle-from-camera f64[4, 4] of the log's cameras, by their first frames of which the log knows the
+        vehicle's pose."""
+        found: dict[str, Matrix] = {}
+        for frame in () if self.scene is None else self.scene.frames:
+            ego = self.ego_pose(frame.view.time_s)
+            if frame.view.camera.name not in found and ego is not None:
+                found[frame.view.camera.name] = geometry.invert(ego) @ frame.view.world_from_cam
+        return found
 
     @property
     def time_range_s(self) -> tuple[float, float]:

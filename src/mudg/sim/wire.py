@@ -1,8 +1,6 @@
-"""Messages of AlpaSim's SensorsimService and EgodriverService on the wire: names, numbers and types of their fields, as
-the public interface has them (alpasim_grpc v0, NVIDIA, Apache-2.0). Only these facts are taken; the messages are built
-from the table below when a service is first used, in a pool of their own, so that a client's generated classes may live
-beside them.
-"""
+"""Messages of AlpaSim's SensorsimService and EgodriverService: names, numbers and types of their fields, as the public
+interface has them (alpasim_grpc v0, NVIDIA, Apache-2.0). The messages are built from the table below when a service is
+first used, in a pool of their own, so that a client's generated classes may live beside them."""
 
 from __future__ import annotations
 

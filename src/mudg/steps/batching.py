@@ -19,7 +19,7 @@ from mudg.base import log, store
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.plain_yaml import parse_yaml
 from mudg.base.run_folder import refuse_overlap
-from mudg.fleet import engines, status
+from mudg.fleet import engines
 from mudg.fleet.plan import (
     CITY,
     COMMAND,
@@ -32,7 +32,7 @@ from mudg.fleet.plan import (
     refuse_address,
     shard_of,
 )
-from mudg.fleet.records import BatchFolder, Ended, slurm_tasks_left
+from mudg.fleet.records import BatchFolder, Ended, read_status, slurm_tasks_left, text_of
 from mudg.fleet.settings import BatchConfig
 from mudg.fleet.work import DONE, STOPPED, Job, Stop, is_open
 from mudg.steps.settings import PresetName, RunConfig, run_preset
@@ -155,8 +155,8 @@ def _with_absolute_paths(values: Any) -> Any:
 
 def show_status(out: str) -> dict[str, Any]:
     """How far a batch is, what has failed and what it took."""
-    state = status.read_status(BatchFolder(Path(out)))
-    return {**state, "text": status.text_of(state)}
+    state = read_status(BatchFolder(Path(out)))
+    return {**state, "text": text_of(state)}
 
 
 def settings_of(preset: PresetName, config: Path | None, given: Sequence[str]) -> RunConfig:

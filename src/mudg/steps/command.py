@@ -16,7 +16,7 @@ from typing import Any, Literal, NoReturn, get_args, get_origin
 
 from mudg.base import config as configuration
 from mudg.base.errors import UsageError, nearest
-from mudg.steps.step import Option, Step, flag_name, flag_of, is_many, options, positions, present, usage
+from mudg.steps.step import Option, Step, flag_name, flag_of, is_many, options, present, usage
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ def parse(cls: type[Step], words: Sequence[str]) -> tuple[Step, Common]:
     for option in listed.values():
         _add(parser, option)
     parser.add_argument("words", nargs="*")
-    found, unknown = parser.parse_known_intermixed_args(_second_named(cls, _plain_flags(words)))
+    found, unknown = parser.parse_known_intermixed_args(_plain_flags(words))
     if unknown:
         _refuse_unknown(cls, unknown[0], listed)
     given: dict[str, Any] = {name: value for name, value in vars(found).items() if name in listed}
@@ -99,17 +99,6 @@ def _plain_flags(words: Iterable[str]) -> list[str]:
     return plain
 
 
-def _second_named(cls: type[Step], words: list[str]) -> list[str]:
-    """The second of two words before all flags as the input it stands for: ``render SCENE FIT`` as ``render SCENE
-    --model FIT``."""
-    second = next((name for name in positions(cls) if flag_of(cls, name).position == "second"), None)
-    if second is None or len(words) < 2 or any(word.startswith("-") for word in words[:2]):
-        return words
-    flag = flag_name(second)
-    given = any(word == flag or word.startswith(f"{flag}=") for word in words)
-    return words if given else [words[0], flag, *words[1:]]
-
-
 def _refuse_unknown(cls: type[Step], word: str, listed: dict[str, Option]) -> NoReturn:
     flag = word.partition("=")[0]
     known = [flag_name(name) for name in listed]
@@ -121,25 +110,20 @@ def _refuse_unknown(cls: type[Step], word: str, listed: dict[str, Option]) -> No
 
 def _value(kind: Any, value: Any) -> Any:
     """The words of a flag as the plain value that its type is checked against."""
-    kind = kind if value == "None" or value == ["None"] else present(kind)
-    if value == ["None"] and type(None) in get_args(kind):
+    if value in ("None", ["None"]) and type(None) in get_args(kind):
         return None
+    kind = present(kind)
+    if isinstance(value, list) and get_origin(kind) is tuple:
+        return tuple(_value(get_args(kind)[0], word) for word in value)
     if isinstance(value, list):
-        if get_origin(kind) is tuple:
-            inner = get_args(kind)[0]
-            return tuple(_value(inner, word) for word in value)
         pairs = [word.partition("=") for word in value]
         for name, equals, folder in pairs:
             if not equals or not name or not folder:
                 got = "=".join(filter(None, (name, folder)))
                 raise UsageError("a value is not a name and a folder", expected="NAME=FOLDER", got=got)
         return {name: folder for name, _, folder in pairs}
-    if isinstance(value, str):
-        if value == "None" and type(None) in get_args(kind):
-            return None
-        choices = [choice for choice in get_args(kind) if get_origin(kind) is Literal and not isinstance(choice, str)]
-        return next((choice for choice in choices if str(choice) == value), value)
-    return value
+    choices = get_args(kind) if get_origin(kind) is Literal else ()
+    return next((choice for choice in choices if str(choice) == value), value)
 
 
 def words_of(step: Step) -> list[str]:

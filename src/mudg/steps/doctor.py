@@ -6,14 +6,15 @@ import os
 import platform
 import shutil
 import sys
+from collections import Counter
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from mudg.base.errors import plain_lines
-from mudg.base.plugins import origin, plugins
-from mudg.base.versions import installed, version
+from mudg.base.memory import free_bytes, in_words
+from mudg.base.versions import installed, origin, plugins, version
 from mudg.steps.step import Flag, Step
 
 if TYPE_CHECKING:
@@ -49,25 +50,91 @@ _OPTIONAL: Mapping[str, tuple[str, str]] = {
 def report_machine() -> dict[str, Any]:
     """Machine, Python, torch, native library, packages, video encoders and weights as plain values; ``text`` is the
     same for people; ``ready``: everything needed is here."""
-    problems: list[str] = []
+    from mudg import native
+
+    packages = {name: installed(name) or "missing" for name in _CORE}
+    missing = [name for name, found in packages.items() if found == "missing"]
+    rows_of_torch, encoders, weights = _torch(), _encoders(), _weights()
+    problems = [
+        *([f"packages are missing: {', '.join(missing)}; reinstall mudg with pip"] if missing else []),
+        *(
+            []
+            if len(rows_of_torch) > 1
+            else ["torch cannot be imported; reinstall with pip install 'torch>=2.10,<2.14'"]
+        ),
+        *([] if native.library() is not None else [f"the native library is not in use: {native.REMEDY}"]),
+        *([] if encoders else ["PyAV has no H.264 encoder: reports will show pictures instead of videos"]),
+        *([] if weights else ["no diffusion model is shipped with this build: train one with mudg learn"]),
+    ]
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     sections: dict[str, dict[str, str]] = {
-        "machine": _machine(),
+        "machine": {
+            "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+            "processors": f"{usable} usable of {os.cpu_count()}",
+            "memory": f"{in_words(free_bytes())} free",
+            "free disk here": in_words(shutil.disk_usage(Path.cwd()).free),
+        },
         "python": {"version": platform.python_version(), "executable": sys.executable, "mudg": version()},
-        "torch": _torch(problems),
-        "native library": _native(problems),
-        "packages": _packages(problems),
-        "optional packages": _optional(),
+        "torch": rows_of_torch,
+        "native library": {"status": native.status().removeprefix("native library: ")},
+        "packages": packages,
+        "optional packages": {
+            name: installed(name) or f"not installed ({use}; {how})" for name, (use, how) in _OPTIONAL.items()
+        },
         "plugins": {f"importer {name}": origin(point) for name, point in plugins().items()},
-        "video": _video(problems),
-        "weights": _weights(problems),
+        "video": {"encoders": ", ".join(encoders) or "none"},
+        "weights": weights,
     }
+    if installed("gsplat") and len(rows_of_torch) > 1:
+        from mudg.core.raster import gsplat_cuda
+
+        sections["optional packages"]["gsplat"] += f"; {gsplat_cuda.status()}"
     lines = []
     for title, rows in sections.items():
         lines += [title] if rows else []
         lines += [f"  {name:<18} {value}" for name, value in rows.items()]
-    lines.append("")
-    lines += [f"problem: {problem}" for problem in problems] or ["everything that the default run needs is here"]
+    lines += [
+        "",
+        *([f"problem: {problem}" for problem in problems] or ["everything that the default run needs is here"]),
+    ]
     return {**sections, "problems": problems, "ready": not problems, "text": plain_lines(lines)}
+
+
+def _torch() -> dict[str, str]:
+    """Version, threads, and a row for every device that `--device` takes, or why it is not here."""
+    try:
+        import torch
+    except ImportError:
+        return {"version": "missing"}
+    from mudg.base import devices
+
+    rows = {"version": torch.__version__, "threads": str(torch.get_num_threads())}
+    rows["--device auto"] = devices.usual_device()
+    for kind, problem_of in devices.PROBLEMS.items():
+        for number in range(max(torch.cuda.device_count(), 1) if kind == "cuda" else 1):
+            problem = problem_of(number)
+            here = torch.device(kind) if kind == "cpu" else torch.device(kind, number)
+            name = kind if problem or kind != "cuda" else f"{kind}:{number}"
+            rows[f"--device {name}"] = f"no: {problem}" if problem else devices.described(here)
+    return rows
+
+
+def _encoders() -> list[str]:
+    """Encoders of H.264 that PyAV has."""
+    if find_spec("av") is None:
+        return []
+    from mudg.formats.exporters.video import video_encoders
+
+    return video_encoders()
+
+
+def _weights() -> dict[str, str]:
+    """Models that are shipped, and their size."""
+    files = (Path(__file__).resolve().parents[1] / "assets").rglob("*.safetensors")
+    sizes: Counter[str] = Counter()
+    for file in files:
+        sizes[file.parent.name] += file.stat().st_size
+    return {name: f"shipped with mudg, {in_words(size)}" for name, size in sorted(sizes.items())}
 
 
 def report_scene(scene: Path) -> dict[str, Any]:
@@ -119,93 +186,3 @@ def _alignment(path: Path) -> tuple[dict[str, Any], list[str], list[Finding]]:
     doubtful = [name for name, one in found.items() if one.verdict == "doubtful"]
     doubts = [Finding("warning", f"camera {name}", words[name].partition(": ")[2]) for name in doubtful]
     return records, [text for name, text in words.items() if name not in doubtful], doubts
-
-
-def _machine() -> dict[str, str]:
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    rows = {"system": f"{platform.system()} {platform.release()} {platform.machine()}"}
-    rows["processors"] = f"{usable} usable of {os.cpu_count()}"
-    if {"SC_PHYS_PAGES", "SC_PAGE_SIZE"} <= {*getattr(os, "sysconf_names", {})}:
-        rows["memory"] = f"{os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') / 2**30:.1f} GiB"
-    rows["free disk here"] = f"{shutil.disk_usage(Path.cwd()).free / 2**30:.1f} GiB"
-    return rows
-
-
-def _torch(problems: list[str]) -> dict[str, str]:
-    try:
-        import torch
-    except ImportError as error:
-        problems.append(f"torch cannot be imported: {error}; reinstall with pip install 'torch>=2.10,<2.14'")
-        return {"version": "missing"}
-    return {"version": torch.__version__, "threads": str(torch.get_num_threads()), **_devices()}
-
-
-def _devices() -> dict[str, str]:
-    """A row for every device that `--device` takes, and for each kind that is not here the reason."""
-    import torch
-
-    from mudg.base import devices
-
-    rows: dict[str, str] = {"--device auto": f"{devices.usual_device()}"}
-    for kind, problem_of in devices.PROBLEMS.items():
-        count = torch.cuda.device_count() if kind == "cuda" else 1
-        for number in range(max(count, 1)):
-            problem = problem_of(number)
-            here = torch.device(kind) if kind == "cpu" else torch.device(kind, number)
-            name = kind if problem or kind != "cuda" else f"{kind}:{number}"
-            rows[f"--device {name}"] = f"no: {problem}" if problem else devices.described(here)
-    return rows
-
-
-def _native(problems: list[str]) -> dict[str, str]:
-    from mudg import native
-
-    if native.library() is None:
-        problems.append("the native library is not in use: " + native.REMEDY)
-    return {"status": native.status().removeprefix("native library: ")}
-
-
-def _packages(problems: list[str]) -> dict[str, str]:
-    rows = {name: installed(name) or "missing" for name in _CORE}
-    missing = [name for name, found in rows.items() if found == "missing"]
-    if missing:
-        problems.append(f"packages are missing: {', '.join(missing)}; reinstall mudg with pip")
-    if find_spec("torchvision") is not None:
-        rows["torchvision"] = "present but never used; where its build does not fit torch, uninstall it"
-    return rows
-
-
-def _optional() -> dict[str, str]:
-    rows = {
-        name: found if (found := installed(name)) else f"not installed ({use}; {how})"
-        for name, (use, how) in _OPTIONAL.items()
-    }
-    if installed("gsplat") and find_spec("torch") is not None:
-        from mudg.core.raster import gsplat_cuda
-
-        rows["gsplat"] += f"; {gsplat_cuda.status()}"
-    return rows
-
-
-def _video(problems: list[str]) -> dict[str, str]:
-    if find_spec("av") is None:
-        return {"encoders": "unknown (av is missing)"}
-    from mudg.formats.exporters.video import video_encoders
-
-    found = video_encoders()
-    if not found:
-        problems.append("PyAV has no H.264 encoder: reports will show pictures instead of videos")
-    return {"encoders": ", ".join(found) or "none"}
-
-
-def _weights(problems: list[str]) -> dict[str, str]:
-    folder = Path(__file__).resolve().parents[1] / "assets"
-    models = sorted({p.parent for p in folder.rglob("*.safetensors")})
-    rows = {}
-    for model in models:
-        size = sum(p.stat().st_size for p in model.rglob("*.safetensors")) / 2**20
-        rows[model.name] = f"shipped with mudg, {size:.1f} MiB"
-    if not models:
-        problems.append("no diffusion model is shipped with this build: train one with mudg learn")
-        rows["diffusion model"] = "none found"
-    return rows

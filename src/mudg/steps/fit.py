@@ -39,8 +39,7 @@ class Fit(Watched):
     scene: Annotated[Path, SCENE]
     """Scene directory written by ingest or annotate, or folder of mudg run."""
     fused: Annotated[Path | None, Flag("FOLDER", "second", "fused")] = None
-    """Point clouds written by fuse; required by every method but emernerf. The folder may also stand after SCENE
-    without the flag."""
+    """Point clouds written by fuse; required by every method but emernerf."""
     observations: Annotated[tuple[Path, ...], Flag("FOLDER ...", "", "views")] = ()
     """Virtual views written by synthesize, in one folder or several; required by method mudg_s."""
     start_from: Annotated[Path | None, Flag("FOLDER", "", "start_from")] = None
@@ -130,5 +129,5 @@ class Fit(Watched):
             inputs |= self.digests(named)
         inputs |= self.digests({"lpips_weights": self.settings.virtual.lpips_weights})
         drawing_device(self.settings.device, "fit", self.settings.raster)  # refused before anything is written
-        given = fit.FitInputs(self.scene, cast("Path", self.fused), virtual, begun)
-        return partial(fit.write_fit, self.settings, given)
+        given = self.settings, self.scene, cast("Path", self.fused)
+        return partial(fit.write_fit, *given, virtual=virtual, start=begun)

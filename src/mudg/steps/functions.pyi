@@ -29,9 +29,9 @@ def annotate(
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         config: YAML file of settings, read before those given here.
         labeller: Source of classes and sky. embedded: the small shipped network, from image, heights and boxes. network: a segmentation network from `weights`.
-        weights: labeller network: folder of a SegFormer or Mask2Former with Cityscapes classes in the transformers format, or its name in the Hugging Face cache (owner/name or owner/name@revision). labeller embedded: folder of a network trained with tools/train_segmenter.py (empty = the shipped network).
+        weights: labeller network: folder of a SegFormer or Mask2Former with Cityscapes classes in the transformers format. labeller embedded: folder of a network trained with tools/train_segmenter.py (empty = the shipped network).
         depth: Write dense depth, by default from the LiDAR points of several sweeps, filled with the image as guide.
-        depth_network: Take dense depth from a network and align it to LiDAR: folder, or name in the Hugging Face cache, of a PromptDepthAnything or Depth Anything model (transformers); or folder of a DepthLab written by mudg convert.
+        depth_network: Take dense depth from a network and align it to LiDAR: folder of a PromptDepthAnything or Depth Anything model (transformers), or of a DepthLab written by mudg convert.
         depth_steps: DepthLab: denoising steps (0 = as in the model folder).
         device: Device of the networks of labeller and `depth_network`: auto (CUDA if there is one), cpu, cuda, cuda:N, mps.
         sweeps: Number of sweeps per LiDAR, nearest in time, whose points are merged for dense depth.
@@ -50,19 +50,13 @@ def bench(
     preset: Literal['fast', 'default', 'quality', 'paper'] = 'default',
     config: str | Path | None = None,
     model: str = 'embedded',
-    cities: Literal['reported', 'development'] = 'reported',
-    count: int = 6,
-    steps: tuple[int, ...] = (1, 2, 8),
-    eta: float | None = None,
     precision: Literal['auto', 'float32', 'bfloat16', 'float16'] = 'auto',
-    threads: int = 1,
     seed: int = 0,
     list: Literal['development', 'reported'] = 'development',
     logs: int = 8,
     methods: tuple[str, ...] = ('nearest_fill', 'gs3d', 'street_gaussians', 'mudg_r', 'mudg_s'),
     iterations: int = 1000,
     guided_share: float = 1.5,
-    variant: tuple[str, ...] = (),
     processes: int = 0,
     videos: bool = True,
     table: Literal['mudg1', 'mudg2', 'mudg3', 'recondreamer', 'drivedreamer4d', 'streetcrafter', 'freesim', 'recam', 'spvc', 'panda', 'dist'] = 'mudg1',
@@ -70,48 +64,40 @@ def bench(
     shown: tuple[str, ...] = (),
     resolution: str = '',
     frames: str = '',
-    edit_iterations: int = 300,
     device: str = 'auto',
     fuse: Mapping[str, Any] = ...,
     synthesize: Mapping[str, Any] = ...,
     fit: Mapping[str, Any] = ...,
     score: Mapping[str, Any] = ...,
 ) -> Any:
-    """Run a benchmark: mdm, edit, shift or loop against exact truth, real on real logs, paper for tables of papers.
+    """Run a benchmark: shift or loop against exact truth, real on real logs, paper for tables of papers.
 
     Args:
-        name: Benchmark to run: mdm (diffusion model), edit (edits of fitted scenes), shift (complete methods off the recorded path), loop (drives in fitted scenes), real (complete methods on real logs) or paper (a table of a paper).
+        name: Benchmark to run: shift (complete methods off the recorded path), loop (drives in fitted scenes), real (complete methods on real logs) or paper (a table of a paper).
         sources: real, paper: folders of dataset logs, or scenes made by ingest. paper also takes city:reported or city:development, a list of generated cities.
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
-        preset: shift, real, loop, paper: settings of clouds, generated views and fits to start from, as for mudg run (docs/presets.md). paper: the published set-up, with a published-type model.
+        preset: Settings of clouds, generated views and fits to start from, as for mudg run (docs/presets.md). paper: the published set-up, with a published-type model.
         config: YAML file of settings, read before those given here.
         model: Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn or convert.
-        cities: mdm, edit: list of cities. Choose settings on development; report results on reported, on which nothing was chosen.
-        count: mdm, edit: number of cities taken from the list, 1 to 6. mdm: each gives four clips: shifted by 2, 3 and 4 m, and on the recorded path.
-        steps: mdm: numbers of denoising steps to compare; each is measured on its own.
-        eta: mdm: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given: 1). shift, real and paper have `--synthesize.eta`, and likewise steps.
-        precision: Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere. float16: published-type models on CUDA devices (shift, real, paper).
-        threads: mdm, edit: number of torch threads.
+        precision: Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere. float16: published-type models on CUDA devices.
         seed: Seed of all random numbers; the same seed gives the same result.
         list: shift, loop: list of logs. Choose settings on development; report results on reported, on which nothing was chosen.
         logs: shift, loop; paper with a list of cities: number of logs taken from the list, 1 to 8 (the development list has 4).
-        methods: shift, real, loop: methods to compare: those of the default (loop: street_gaussians and mudg_s); pvg, s3gaussian, bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on until it has as many steps as mudg_s, without generated views. shift: also mudg_f, renders of mudg_s that the diffusion model repairs. paper: any of these of shift but mudg_f; with the default, all of them.
-        iterations: shift, real, loop, paper: optimisation steps of every fit without virtual views.
-        guided_share: shift, real, loop, paper: steps of fits under virtual views, as a multiple of the others'.
-        variant: shift, real: add rows for mudg_s with other settings of fit, each as NAME=FIELD:VALUE,FIELD:VALUE, where FIELD is a setting such as virtual.color_weight. Both of its fits have them.
-        processes: shift, real, loop, paper: number of logs (real: also ways of hiding frames) processed at the same time, with one thread each (0 = one per core). Results do not depend on it.
+        methods: Methods to compare: those of the default (loop: street_gaussians and mudg_s); pvg, s3gaussian, bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on until it has as many steps as mudg_s, without generated views. shift: also mudg_f, renders of mudg_s that the diffusion model repairs. paper: any of these of shift but mudg_f; with the default, all of them.
+        iterations: Optimisation steps of every fit without virtual views.
+        guided_share: Steps of fits under virtual views, as a multiple of the others'.
+        processes: Number of logs (real: also ways of hiding frames) processed at the same time, with one thread each (0 = one per core). Results do not depend on it.
         videos: shift, paper: also write videos of all methods side by side.
         table: paper: the table to fill (docs/paper_tables.md).
         protocols: real: protocols, out of the four of the default. Instead of gap also gap-1, gap-3 and gap-5 alone.
         shown: real: cameras that the methods see in protocol camera; the first one gives the views beside the recorded path (empty = front, or the first camera).
         resolution: real, paper: image size of logs that are imported, as for ingest (empty = as recorded; paper: as the table says). paper with a list of cities: WIDTHxHEIGHT (empty = 384x256).
         frames: real, paper: frames of logs that are imported, FIRST:END without END itself, as for ingest (empty = all; paper: as the table says). paper with a list of cities: 0:END (empty = 0:24).
-        edit_iterations: edit: optimisation steps of every fit.
         device: Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N.
-        fuse: shift, real, paper: how the clouds of every log are made.
-        synthesize: shift, real, paper: how views are generated. Model, number format, seed and device are the benchmark's own flags; where views are generated is the benchmark's matter (real: `--synthesize.shifts-m` for the views that fits learn from).
-        fit: shift, real, paper: how scenes are fitted. Method, steps, seed and device are the benchmark's own flags.
+        fuse: How the clouds of every log are made.
+        synthesize: How views are generated. Model, number format, seed and device are the benchmark's own flags; where views are generated is the benchmark's matter (real: `--synthesize.shifts-m` for the views that fits learn from).
+        fit: How scenes are fitted. Method, steps, seed and device are the benchmark's own flags.
         score: paper: how every row is scored; files of weights are given here.
     """
     ...
@@ -122,7 +108,7 @@ def convert(
     to: str | Path,
     overwrite: bool = False,
     config: str | Path | None = None,
-    network: Literal['diffusion', 'inception', 'i3d', 'dinov2', 'clip', 'lpips', 'lpips-vgg'] = 'diffusion',
+    network: Literal['diffusion', 'inception', 'i3d', 'lpips', 'lpips-vgg'] = 'diffusion',
     resolution: Literal['auto', '320x512', '576x1024'] = 'auto',
     dtype: Literal['keep', 'float32', 'float16', 'bfloat16'] = 'keep',
     memory_gb: float = 0.0,
@@ -211,8 +197,8 @@ def demo(
         out: Folder to write. Repeat the same command to resume an interrupted demo.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         preset: Settings to start from. fast: smaller images, fewer frames and iterations. default: minutes on two cores. quality: 30,000 iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type model (docs/presets.md).
-        fast: The same as --preset fast, 3 m to each side: one to two minutes on 2 cores.
-        seed: Seed of the city and of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config).
+        fast: The same as --preset fast: images of a log 480 pixels wide, 3 m to each side. One to two minutes on 2 cores for the city, or 16 frames of one camera.
+        seed: Seed of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config).
         shifts_m: Lateral shifts in metres, positive to the left (not given: 2, 3 and 4 m to both sides; --fast: 3 m). They apply to synthesize, render and score.
         config: YAML file of settings, read before those given here.
         device: Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N. A step whose own device is set, as by --fit.device, keeps that one.
@@ -349,7 +335,7 @@ def fit(
 
     Args:
         scene: Scene directory written by ingest or annotate, or folder of mudg run.
-        fused: Point clouds written by fuse; required by every method but emernerf. The folder may also stand after SCENE without the flag.
+        fused: Point clouds written by fuse; required by every method but emernerf.
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         tensorboard: Also write the numbers of log.jsonl to OUT/tensorboard, for TensorBoard (needs `pip install 'mudg[track]'`).
@@ -434,7 +420,7 @@ def import_asset(
         label: Class of the object, e.g. car or pedestrian.
         length_m: Scale the object so that its box has this length (not given: the file is in metres).
         yaw_deg: Turn what the file holds by this angle about the vertical, counter-clockwise from above, so that an object looks, or a street leads, along x.
-        origin_m: With --kind scene: the place in the file that becomes the origin, after --axes and before --yaw-deg (not given: the file's own origin, or the middle of Gaussians that lie more than 16 km away). As a background of an edit script, a street begins there.
+        origin_m: With --kind scene: the place in the file that becomes the origin, after --axes and before --yaw-deg (not given: the file's own origin, or the middle of Gaussians that lie more than 16 km away).
         axes: Where x, y and z of the file point. file: as the file says, else as viewer. viewer: as programs expect of its format. world: x forward, y left, z up, as of export --axes world. Or three letters of L, R, U, D, F, B: RDF is x right, y down, z forward.
     """
     ...
@@ -579,7 +565,7 @@ def render(
 
     Args:
         scene: Scene directory that the Gaussian scene was fitted to, or folder of mudg run.
-        model: Gaussian scene written by fit, or edit. It may also follow SCENE without the flag (not given: that of the run at SCENE).
+        model: Gaussian scene written by fit, or edit (not given: that of the run at SCENE).
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         edits: Edit script (docs/edit.md) to carry out before rendering.
@@ -644,7 +630,7 @@ def run(
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         preset: Settings to start from. fast: smaller images, fewer frames and iterations. default: minutes on two cores. quality: 30,000 iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type model (docs/presets.md).
-        fast: The same as --preset fast: images of a log 480 pixels wide, 3 m to each side. One to two minutes on 2 cores for 16 frames of one camera.
+        fast: The same as --preset fast: images of a log 480 pixels wide, 3 m to each side. One to two minutes on 2 cores for the city, or 16 frames of one camera.
         seed: Seed of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config).
         cameras: Cameras for which shifted trajectories are made (not given: the first camera).
         shifts_m: Lateral shifts in metres, positive to the left (not given: 2, 3 and 4 m to both sides; --fast: 3 m). They apply to synthesize, render and score.
@@ -679,11 +665,8 @@ def score(
     fid_resize: Literal['pytorch-fid', 'tf1', 'clean', 'tm', 'neurad'] = 'pytorch-fid',
     fvd_weights: str = '',
     fvd_resize: Literal['videogpt', 'google', 'stylegan-v'] = 'videogpt',
-    dino_weights: str = '',
-    clip_weights: str = '',
     detections: str = '',
     lanes: str = '',
-    as_published: bool = False,
     error_pictures: bool = True,
     device: str = 'auto',
 ) -> Any:
@@ -691,7 +674,7 @@ def score(
 
     Args:
         scene: Scene directory that the views belong to, or folder of mudg run.
-        views: Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render. They may also stand after SCENE without the flag.
+        views: Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render.
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         fused: Point clouds written by fuse. They are needed for the baseline without learning (not given: no baseline).
@@ -706,13 +689,10 @@ def score(
         fid_resize: How FID's network gets its 299 x 299 pixels: as pytorch-fid, torch-fidelity (tf1), clean-fid (clean), torchmetrics (tm) or neurad-studio (neurad) do it. Numbers of different rules cannot be compared.
         fvd_weights: File with the weights of FVD's I3D network (Kinetics-400), as safetensors, a state dict or the TorchScript archive. FVD then compares clips of 16 views with those of the recorded video of the same camera (empty = not computed).
         fvd_resize: How FVD's network gets its 224 x 224 pixels: shorter side and crop (videogpt), or squashed (google, stylegan-v).
-        dino_weights: File with the weights of DINOv2, ViT-S/14 or ViT-L/14 (`dinov2_vits14_pretrain.pth`, `dinov2_vitl14_pretrain.pth`, or their tensors as safetensors). FD-DINOv2 and the consistency of a video are then computed (empty = not computed).
-        clip_weights: File with the image tower of CLIP ViT-L/14 at 336 pixels (`model.safetensors` of openai/clip-vit-large-patch14-336, or OpenAI's names). CMMD, CLIP-F and CLIP-V are then computed (empty = not computed).
         detections: File with boxes that a detector found in the views, as COCO results. NTA-IoU is then computed (empty = not computed).
         lanes: Folder with lane masks that a detector made of the views, METHOD/TRAJECTORY/000000.png. NTL-IoU is then computed (empty = not computed). Generated cities only: prepared logs have no lane lines.
-        as_published: NTA-IoU: project true boxes as the published score does, corners behind the camera included, instead of cutting them at the near plane.
         error_pictures: Write an image of the colour error at the middle view of every trajectory.
-        device: Device of the networks behind perceptual distance, LPIPS, FID, FVD, DINOv2 and CLIP: auto (CUDA if there is one), cpu, cuda, cuda:N. All other metrics run on the CPU.
+        device: Device of the networks behind perceptual distance, LPIPS, FID and FVD: auto (CUDA if there is one), cpu, cuda, cuda:N. All other metrics run on the CPU.
     """
     ...
 
@@ -749,7 +729,7 @@ def synthesize(
 
     Args:
         scene: Scene directory written by ingest or annotate, or folder of mudg run.
-        fused: Point clouds written by fuse. The folder may also follow SCENE without the flag (not given: those of the run at SCENE).
+        fused: Point clouds written by fuse (not given: those of the run at SCENE).
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         fitted: Gaussian scene written by fit, without virtual views. Its renders become part of the diffusion model's input. For models that were trained with renders.

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from mudg.base.errors import InputError, UsageError, similar_path
 from mudg.base.layout import SCENE_FILES
-from mudg.base.plugins import plugins
+from mudg.base.versions import plugins
 from mudg.steps.engine import Make, Output
 from mudg.steps.step import SCENE, Flag, usage
 

@@ -7,6 +7,7 @@ OUT/report.html  OUT/viewer.html  OUT/run.yaml (settings)  OUT/run.json (state, 
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -15,10 +16,10 @@ from typing import Any
 from mudg.base import config as configuration
 from mudg.base import log, store
 from mudg.base.errors import InputError, IntegrityError, MudgError, UsageError, similar_path
-from mudg.base.memory import Meter, Usage, folder_bytes, in_words
+from mudg.base.memory import Usage, folder_bytes, in_words
 from mudg.base.records import ForeignRecord, Number, parse_record
 from mudg.base.run_folder import is_temporary, locked, refuse_overlap
-from mudg.base.versions import environment, version
+from mudg.base.versions import environment
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.gaussians.settings import FitConfig
 from mudg.steps.engine import Output
@@ -91,24 +92,25 @@ def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: boo
         scene = _prepare_scene(config, source, out, ledger, overwrite)
         for name, step in steps_of(config, scene, out, overwrite).items():
             ledger.timed(name, step.out, step.run)
-        # what the page is made of: the scores (which name the views), the settings and the program
-        made_of = (store.sha256_file(out / name) for name in (f"score/{store.MANIFEST}", "run.yaml"))
-        key = " ".join([*made_of, version()])
-        if not ledger.has_report(key):
+        names = sorted(path.parent.relative_to(out).as_posix() for path in out.rglob(store.MANIFEST))
+        digests = {name: store.sha256_file(out / name / store.MANIFEST) for name in names if ".part" not in name}
+        reels = None
+        if digests != ledger.digests or not page.is_file():
+            store.remove(page)
+            ledger.digests = digests
             ledger.timed("viewer", out / "viewer.html", lambda: _write_viewer(out))
-        reels = None if ledger.has_report(key) else ledger.timed("report", page, lambda: run_report.film(out))
+            reels = ledger.timed("report", page, lambda: run_report.film(out))
     except KeyboardInterrupt:
         ledger.save("interrupted")
         raise
     except MudgError:
         ledger.save("failed")
         raise
-    names = sorted(path.parent.relative_to(out).as_posix() for path in out.rglob(store.MANIFEST))
-    ledger.digests = {name: store.sha256_file(out / name / store.MANIFEST) for name in names if ".part" not in name}
     ledger.save("complete")
     if reels is not None:  # written last, when the seconds of all steps are known
         run_report.write_page(out, reels)
-        ledger.remember_report(key)
+        ledger.steps["report"]["written_bytes"] = folder_bytes(page)
+        ledger.save("complete")
     text = _closing_text(out, str(source), page, ledger)
     return {"report": page, "metrics": out / "score" / "metrics.json", "seconds": ledger.seconds(), "text": text}
 
@@ -254,18 +256,18 @@ class _LedgerRecord(ForeignRecord):
 
     asked: dict[str, Any]
     steps: dict[str, _StepRecord] = {}
-    report: dict[str, str] = {}
+    digests: dict[str, str] = {}
 
 
 class _Ledger:
     """OUT/run.json: what was asked, and how long each step took over all continuations."""
 
     def __init__(self, out: Path, asked: Mapping[str, Any], before: Mapping[str, Any]) -> None:
-        self._out = out
-        self._asked = dict(asked)
-        self._steps: dict[str, dict[str, Any]] = dict(before.get("steps", {}))
-        self._report = dict(before.get("report", {}))
-        self.digests: dict[str, str] = {}
+        self._out, self._asked = out, dict(asked)
+        self.steps: dict[str, dict[str, Any]] = dict(before.get("steps", {}))
+        same_program = before.get("environment") == environment()
+        self.digests: dict[str, str] = dict(before.get("digests", {})) if same_program else {}
+        """Of the results that the report was made of."""
 
     @classmethod
     def open(cls, out: Path, config: RunConfig, source: str, overwrite: bool) -> _Ledger:
@@ -316,60 +318,45 @@ class _Ledger:
         what = "the output folder holds files that do not belong to this run"
         return UsageError(what, where=str(out), remedy="choose an empty --out")
 
-    def has_report(self, key: str) -> bool:
-        """Whether report.html was made of just this and is unchanged."""
-        page, known = self._out / "report.html", self._report
-        return known.get("key") == key and page.is_file() and known.get("sha256") == store.sha256_file(page)
-
-    def remember_report(self, key: str) -> None:
-        """Note what the page was made of, and its size: it is written after its step was noted."""
-        page = self._out / "report.html"
-        self._report = {"key": key, "sha256": store.sha256_file(page)}
-        self._steps["report"]["written_bytes"] = folder_bytes(page)
-        self.save("complete")
-
     def _standing(self, name: str) -> str:
         """A step on a labelled scene, which of how many it is, and about how long the rest takes, by what the finished
         ones took."""
         if name not in PERCENT_OF_A_RUN:
             return name
         standing = f"{name}, step {list(PERCENT_OF_A_RUN).index(name) + 1} of {len(PERCENT_OF_A_RUN)}"
-        done = [step for step in PERCENT_OF_A_RUN if self._steps.get(step, {}).get("state") == "complete"]
+        done = [step for step in PERCENT_OF_A_RUN if self.steps.get(step, {}).get("state") == "complete"]
         share, spent = sum(PERCENT_OF_A_RUN[step] for step in done) / 100, self.seconds()
         left_min = sum(spent[step] for step in done) * (1 / max(share, FORECAST_FROM) - 1) / 60
         return f"{standing}, about {left_min:.0f} min left" if share >= FORECAST_FROM and left_min >= 1 else standing
 
     def timed(self, name: str, result: Path, run: Callable[[], Any]) -> Any:
-        """Do one step, which makes a folder or file, and add its seconds, also when it is interrupted; a reused result
-        adds none. The next step begins with the memory that this one took given back."""
+        """Do one step, which makes a folder or file, and note what it took: of a folder, what its own record says. The
+        next step begins with the memory that this one took given back."""
         from mudg.core.raster.cpu import release_memory
 
-        known = self._steps.get(name, {})
-        finished = known.get("state") == "complete" and result.exists()
-        meter, state = Meter(), "interrupted"
         log.info(f"== {self._standing(name)}")
+        began_s, self.steps[name] = time.monotonic(), {"state": "interrupted"}
         try:
             made = run()
             release_memory()
-            state = "complete"
+            self.steps[name] = {"state": "complete"}
+            return made
         finally:
-            spent, earlier = meter.stop(), Usage.of_record(known)
-            if not (finished and state == "complete" and spent.seconds < earlier.seconds):
-                spent = spent if finished else earlier.then(spent)
-                self._steps[name] = {"state": state, **spent.record(), "written_bytes": folder_bytes(result)}
+            done = self.steps[name]["state"] == "complete"
+            taken = store.json_object(result / store.RUN_STATE) if done else {}
+            spent = Usage.of_record({"seconds": time.monotonic() - began_s, **taken})
+            self.steps[name] |= {**spent.record(), "written_bytes": folder_bytes(result)}
             self.save("running")
-        return made
 
     def seconds(self) -> dict[str, float]:
         """Seconds per step, in order."""
-        return {name: float(entry["seconds"]) for name, entry in self._steps.items()}
+        return {name: float(entry["seconds"]) for name, entry in self.steps.items()}
 
     def rows(self) -> dict[str, tuple[Usage, int]]:
         """What was taken and bytes written per step, in order."""
-        return {name: (Usage.of_record(of), int(of.get("written_bytes", 0))) for name, of in self._steps.items()}
+        return {name: (Usage.of_record(of), int(of.get("written_bytes", 0))) for name, of in self.steps.items()}
 
     def save(self, state: str) -> None:
         """Write OUT/run.json."""
-        record = {"schema": 1, "state": state, "asked": self._asked, "steps": self._steps, "digests": self.digests}
-        record |= {"report": self._report, "environment": environment()}
-        store.write_json(self._out / "run.json", store.with_check(record))
+        record = {"schema": 1, "state": state, "asked": self._asked, "steps": self.steps, "digests": self.digests}
+        store.write_json(self._out / "run.json", store.with_check({**record, "environment": environment()}))

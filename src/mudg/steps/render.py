@@ -1,4 +1,4 @@
-"""Verbs that draw and judge: ``mudg render``, ``score``."""
+"""Verbs that draw, judge and show: ``mudg render``, ``score``, ``view``, ``page``, ``report``, ``serve``."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Self, cast
 from mudg.base.errors import UsageError
 from mudg.base.layout import LAYER_FILES, OBSERVATION_FILES, SWEEP_FILES, below
 from mudg.steps.engine import Make, Output, script_of
-from mudg.steps.step import FILE_YAML, SCENE, Flag
+from mudg.steps.step import FILE_YAML, RUN, SCENE, Flag, Step
 
 if TYPE_CHECKING:
     from mudg.base.run_folder import RunDir
     from mudg.editing.settings import RenderConfig, ScoreConfig
+    from mudg.sim.settings import ServeConfig
+    from mudg.viewer.settings import PageConfig, ViewConfig
 
 
 class RenderViews(Output):
@@ -36,8 +38,7 @@ class RenderViews(Output):
     scene: Annotated[Path, Flag("SCENE", "first", "scene")]
     """Scene directory that the Gaussian scene was fitted to, or folder of mudg run."""
     model: Annotated[Path | None, Flag("FOLDER", "second", "model")] = None
-    """Gaussian scene written by fit, or edit. It may also follow SCENE without the flag (not given: that of the run at
-    SCENE)."""
+    """Gaussian scene written by fit, or edit (not given: that of the run at SCENE)."""
     edits: Annotated[Path | None, FILE_YAML] = None
     """Edit script (docs/edit.md) to carry out before rendering."""
     fused: Annotated[Path | None, Flag("FOLDER", "", "fused")] = None
@@ -77,7 +78,7 @@ class RenderViews(Output):
         views = partial(render.write_views, self.settings, self.scene, model, edited, path=self.path, fused=self.fused)
         if not self.settings.lidar and not self.settings.layers:
             return views
-        from mudg.datasets import layers
+        from mudg.datasets.write import write_layers
         from mudg.scene.read import read_scene
         from mudg.sim import lidar as sweeps
 
@@ -87,7 +88,7 @@ class RenderViews(Output):
         def make(work: RunDir) -> dict[str, Any]:
             summary, drawn = views(work), (self.settings, self.scene, model, script)
             if self.settings.layers:
-                summary["layers"] = layers.write_layers(*drawn, self.path, work.path)
+                summary["layers"] = write_layers(*drawn, self.path, work.path)
             if self.settings.lidar:
                 summary["lidar"] = sweeps.simulate_log(*drawn, work.path)
             return summary
@@ -95,10 +96,7 @@ class RenderViews(Output):
         return make
 
 
-_FILES = (
-    *("lpips_weights", "lpips_vgg_weights", "fid_weights", "fvd_weights", "dino_weights"),
-    *("clip_weights", "detections", "lanes"),
-)
+_FILES = (*("lpips_weights", "lpips_vgg_weights", "fid_weights", "fvd_weights", "detections", "lanes"),)
 """Settings that name files and folders to read."""
 
 
@@ -119,8 +117,7 @@ class Score(Output):
     fused: Annotated[Path | None, Flag("FOLDER", "", "fused")] = None
     """Point clouds written by fuse. They are needed for the baseline without learning (not given: no baseline)."""
     views: Annotated[Mapping[str, Path], Flag("NAME=FOLDER ...", "second", "views")]
-    """Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render. They may also
-    stand after SCENE without the flag."""
+    """Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render."""
     settings: ScoreConfig
     truth: Annotated[Path | None, Flag(hidden=True)] = None
     """Folder of `DrawTruth` for the scene, read instead of drawing the truth again."""
@@ -170,3 +167,96 @@ class DrawTruth(Output):
 
         score_truth.write_truth(self.scene, self.trajectories, work.path)
         return {"trajectories": [path.name for path in self.trajectories]}
+
+
+class ViewScene(Step):
+    """Show a fitted scene in a browser, with exact frames from the rasterizer."""
+
+    verb_name = "view"
+    examples = (
+        "mudg view runs/kitti",
+        "mudg view runs/a runs/b",
+        "mudg view runs/mudg_s --scene scenes/city --port 8080",
+    )
+    source: Annotated[Path, RUN]
+    """Folder of a finished mudg run, or Gaussian scene written by fit."""
+    compare: Annotated[Path | None, Flag("[RUN2]", "first")] = None
+    """A second run or fit of the same log, to compare with. The same run: its two fits."""
+    scene: Annotated[Path | None, Flag("FOLDER", "", "scene")] = None
+    """Scene directory that a Gaussian scene was fitted to. A run has its own."""
+    edits: Annotated[Path | None, FILE_YAML] = None
+    """Edit script (docs/edit.md) that the page begins with."""
+    edits_out: Annotated[Path | None, FILE_YAML] = None
+    """Where edits made on the page are saved (without it: edits.yaml beside RUN, or in the current folder)."""
+    settings: ViewConfig
+
+    def act(self) -> dict[str, Any]:
+        from mudg.viewer import view
+
+        places = {"scene": self.scene, "edits": self.edits, "edits_out": self.edits_out}
+        return view.run_view(self.settings, self.source, self.compare, **places)
+
+
+class Page(Step):
+    """Write a fitted scene as one HTML page: fly through it, any layer, any time, without a network."""
+
+    result = "page"
+    examples = (
+        "mudg page runs/kitti --out kitti.html",
+        "mudg page runs/kitti --compare runs/kitti --out both.html",
+        "mudg page runs/mudg_s --scene scenes/city --out city.html",
+    )
+    source: Annotated[Path, RUN]
+    """Folder of a finished mudg run, or Gaussian scene written by fit."""
+    out: Annotated[Path, Flag("FILE.html")]
+    """Page to write: one file. Above 32 MB, a folder FILE_page beside it, for a web server."""
+    scene: Annotated[Path | None, Flag("FOLDER", "", "scene")] = None
+    """Scene directory that a Gaussian scene was fitted to. A run has its own."""
+    compare: Annotated[Path | None, Flag("RUN2")] = None
+    """A second run or fit of the same log, to compare with. The same run: its two fits."""
+    overwrite: bool = False
+    """Replace the page if it exists."""
+    settings: PageConfig
+
+    def act(self) -> dict[str, Any]:
+        from mudg.viewer import view
+
+        return view.run_page(
+            self.settings, self.source, self.out, scene=self.scene, compare=self.compare, overwrite=self.overwrite
+        )
+
+
+class Report(Step):
+    """Write one page over many finished runs: pictures, links, and a table of all scores to sort and filter."""
+
+    result = "page"
+    examples = ("mudg report runs/kitti runs/city --out runs.html", "mudg report runs --out runs.html")
+    runs: Annotated[tuple[Path, ...], Flag("RUN ...", "rest")]
+    """Folders of mudg run, score, bench or batch; of any other folder, the folders in it."""
+    out: Annotated[Path, Flag("FILE.html")]
+    """Page to write."""
+    overwrite: bool = False
+    """Replace the page if it exists."""
+
+    def act(self) -> dict[str, Any]:
+        from mudg.viewer import gallery
+
+        return gallery.run(self.runs, self.out, overwrite=self.overwrite)
+
+
+class Serve(Step):
+    """Serve a fitted scene to driving simulators over gRPC, as a renderer of cameras and LiDAR."""
+
+    examples = ("mudg serve runs/kitti --port 50051", "mudg serve runs/kitti --edits cut_in.yaml")
+    source: Annotated[Path, RUN]
+    """Folder of a finished mudg run, or Gaussian scene written by fit."""
+    scene: Annotated[Path | None, Flag("FOLDER", "", "scene")] = None
+    """Scene directory that a Gaussian scene was fitted to. A run has its own."""
+    edits: Annotated[Path | None, FILE_YAML] = None
+    """Edit script (docs/edit.md) to carry out before."""
+    settings: ServeConfig
+
+    def act(self) -> dict[str, Any]:
+        from mudg.sim import server
+
+        return server.serve(self.settings, self.source, self.edits, self.scene)

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, Final, Literal, get_args
 
-from mudg.base.config import changed, setting, settings
+from mudg.base.config import changed, nested, setting, settings
 from mudg.base.devices import DeviceName
 from mudg.base.errors import UsageError
 from mudg.diffusion.settings import SynthesizeConfig
@@ -138,7 +138,7 @@ def run_preset(name: PresetName = "default") -> RunConfig:
     if name not in PRESETS:
         raise UsageError("no such preset", where="--preset", expected=", ".join(get_args(PresetName)), got=repr(name))
     own = {"ingest.city.seed": DEMO_CITY, "synthesize.cameras": (), "render.cameras": ()}
-    return _with(RunConfig(), {**own, **PRESETS[name]})
+    return _with(RunConfig(), nested({**own, **PRESETS[name]}))
 
 
 def chosen_preset(name: PresetName | None, fast: bool) -> PresetName:
@@ -150,13 +150,6 @@ def chosen_preset(name: PresetName | None, fast: bool) -> PresetName:
 
 
 def _with(config: Any, values: Mapping[str, Any]) -> Any:
-    """A configuration with other values, by dotted names."""
-    groups: dict[str, dict[str, Any]] = {}
-    own: dict[str, Any] = {}
-    for key, value in values.items():
-        group, _, rest = key.partition(".")
-        if rest:
-            groups.setdefault(group, {})[rest] = value
-        else:
-            own[key] = value
-    return changed(config, own | {name: _with(getattr(config, name), inner) for name, inner in groups.items()})
+    """A configuration with other values, in groups."""
+    inner = {name: value for name, value in values.items() if isinstance(value, Mapping)}
+    return changed(config, {**values, **{name: _with(getattr(config, name), value) for name, value in inner.items()}})

@@ -28,8 +28,8 @@ class Flag:
 
     Args:
         metavar: what stands for the value in the help. FILE.yaml: an edit script.
-        position: "first": a word without a flag. "second": its word may also follow the first one without the flag.
-            "rest": all further words.
+        position: "first": a word without a flag. "rest": all further words. "second": a flag; in Python, the second
+            argument, which needs no name.
         part: the part of a run that the field reads ("scene", "fused", "model", "fitted", "start_from", "views"): the
             folder of a run is taken for it.
         hidden: only other steps set it; the command line and the function do not have it.
@@ -112,17 +112,17 @@ class Step:
     def from_words(cls, words: Sequence[str], given: Mapping[str, Any]) -> dict[str, Any]:
         """Values of fields, and of settings, by the words without a flag. given: values of fields by flags. UsageError:
         a word is missing or too many."""
-        left, values, names = list(words), dict[str, Any](), positions(cls)
-        for name in names:
-            kind, field = hint_of(cls, name), cls.__dataclass_fields__[name]
-            rest = flag_of(cls, name).position == "rest"
-            if not left:
-                if field.default is MISSING and flag_of(cls, name).position in ("first", "rest"):
-                    raise UsageError(f"no {flag_of(cls, name).metavar.strip('[]')} was given", expected=usage(cls))
-            elif rest and is_many(kind):
-                values[name], left = left, []
-            else:
-                values[name] = left.pop(0)
+        left, values = list(words), dict[str, Any]()
+        for field in fields(cls):
+            flag = flag_of(cls, field.name)
+            if flag.position not in ("first", "rest"):
+                continue
+            if not left and field.default is MISSING:
+                raise UsageError(f"no {flag.metavar.strip('[]')} was given", expected=usage(cls))
+            if left and flag.position == "rest" and is_many(hint_of(cls, field.name)):
+                values[field.name], left = left, []
+            elif left:
+                values[field.name] = left.pop(0)
         if left:
             got, remedy = " ".join(map(repr, left)), "a value needs its flag before it"
             raise UsageError("too many words", expected=usage(cls), got=got, remedy=remedy)
@@ -195,6 +195,7 @@ class Step:
 HOMES: Final[Mapping[str, str]] = {
     "AnnotateConfig": "mudg.labels.settings",
     "BatchConfig": "mudg.fleet.settings",
+    "BenchConfig": "mudg.benchmarks.settings",
     "ConvertConfig": "mudg.diffusion.settings",
     "DatasetConfig": "mudg.datasets.settings",
     "FuseConfig": "mudg.scene.settings",
@@ -203,7 +204,6 @@ HOMES: Final[Mapping[str, str]] = {
     "FitConfig": "mudg.gaussians.settings",
     "ServeConfig": "mudg.sim.settings",
     "SynthesizeConfig": "mudg.diffusion.settings",
-    **dict.fromkeys(("BenchConfig", "BenchOwn"), "mudg.benchmarks.settings"),
     **dict.fromkeys(("EditConfig", "RenderConfig", "ScoreConfig"), "mudg.editing.settings"),
     **dict.fromkeys(("ExportConfig", "ImportConfig"), "mudg.exporting.settings"),
     **dict.fromkeys(("PageConfig", "ViewConfig"), "mudg.viewer.settings"),
@@ -239,11 +239,6 @@ def flag_of(cls: type[Any], name: str) -> Flag:
 
 def _notes(kind: Any) -> tuple[Any, ...]:
     return get_args(kind)[1:] if get_origin(kind) is Annotated else ()
-
-
-def positions(cls: type[Any]) -> list[str]:
-    """Fields whose values may stand without their flag, in order."""
-    return [field.name for field in fields(cls) if flag_of(cls, field.name).position]
 
 
 def is_many(kind: Any) -> bool:

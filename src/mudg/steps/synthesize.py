@@ -74,8 +74,7 @@ class Synthesize(Output):
     scene: Annotated[Path, SCENE]
     """Scene directory written by ingest or annotate, or folder of mudg run."""
     fused: Annotated[Path | None, Flag("FOLDER", "second", "fused")] = None
-    """Point clouds written by fuse. The folder may also follow SCENE without the flag (not given: those of the run at
-    SCENE)."""
+    """Point clouds written by fuse (not given: those of the run at SCENE)."""
     fitted: Annotated[Path | None, Flag("FOLDER", "", "fitted")] = None
     """Gaussian scene written by fit, without virtual views. Its renders become part of the diffusion model's input. For
     models that were trained with renders."""

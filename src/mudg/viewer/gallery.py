@@ -8,7 +8,7 @@ import hashlib
 import io
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
@@ -30,16 +30,16 @@ MANY: Final = 200
 
 @dataclass(frozen=True)
 class GalleryEntry:
-    """A finished folder on the page. ``folder``: of the run. ``kind``: what made it: run, score or bench. ``scores``:
-    its metrics.json, None of a benchmark. ``facts``: words below its name. ``picture``: of a rendered view, if there is
-    one. ``pages``: title -> file."""
+    """A finished folder on the page. ``kind``: what made it: run, score or bench. ``scores``: its metrics.json, None of
+    a benchmark. ``facts``: words below its name. ``picture``: of a rendered view. ``pages``: title -> file, those that
+    are there are linked."""
 
     folder: Path
     kind: str
-    scores: Mapping[str, Any] | None
-    facts: str
-    picture: Path | None
-    pages: Mapping[str, Path]
+    scores: Mapping[str, Any] | None = None
+    facts: str = ""
+    picture: Path | None = None
+    pages: Mapping[str, Path] = field(default_factory=dict)
 
 
 def read_shown(folder: Path) -> GalleryEntry:
@@ -54,12 +54,10 @@ def read_shown(folder: Path) -> GalleryEntry:
 
 
 def _read(folder: Path) -> GalleryEntry:
-    pages = lambda **known: {title: path for title, path in known.items() if path.is_file()}
     if (folder / "bench.json").is_file():
         found = store.read_json(folder / "bench.json")
         name = str(found.get("bench", "")) if isinstance(found, dict) else ""
-        own = pages(page=folder / "page.html", tables=folder / "bench.md")
-        return GalleryEntry(folder, f"bench {name}".strip(), None, "", None, own)
+        return GalleryEntry(folder, f"bench {name}".strip(), pages={"tables": folder / "bench.md"})
     state = store.read_json(folder / store.RUN_STATE) if (folder / store.RUN_STATE).is_file() else {}
     state = state if isinstance(state, dict) else {}
     asked = state.get("asked", {})
@@ -69,21 +67,17 @@ def _read(folder: Path) -> GalleryEntry:
     if state.get("state") != "complete":
         got, remedy = str(state.get("state"))[:40], "repeat its command: it resumes"
         raise InputError("the run is not finished", where=str(folder), got=got, remedy=remedy)
-    if not is_run:
-        return GalleryEntry(folder, "score", _scores(folder / "metrics.json"), "", None, {})
-    scores = _scores(folder / "score" / "metrics.json")
-    minutes, rest = divmod(round(sum(float(step.get("seconds", 0)) for step in state.get("steps", {}).values())), 60)
-    known = {"report": folder / "report.html", "viewer": folder / viewer_address(folder)}
-    own = pages(**known, scores=folder / "score" / "metrics.md")
-    return GalleryEntry(folder, "run", scores, f"{minutes} min {rest} s", _picture(folder), own)
-
-
-def _scores(path: Path) -> Mapping[str, Any]:
-    found = store.read_json(path)
-    if not isinstance(found, dict) or not {"scene", "methods", "metrics", "by_distance"} <= found.keys():
+    file = folder / "score" / "metrics.json" if is_run else folder / "metrics.json"
+    scores = store.read_json(file)
+    if not isinstance(scores, dict) or not {"scene", "methods", "metrics", "by_distance"} <= scores.keys():
         expected, remedy = "what mudg score wrote", "score the run again"
-        raise InputError("the scores are malformed", where=str(path), expected=expected, remedy=remedy)
-    return found
+        raise InputError("the scores are malformed", where=str(file), expected=expected, remedy=remedy)
+    if not is_run:
+        return GalleryEntry(folder, "score", scores)
+    minutes, rest = divmod(round(sum(float(step.get("seconds", 0)) for step in state.get("steps", {}).values())), 60)
+    pages = {"report": folder / "report.html", "viewer": folder / viewer_address(folder)}
+    pages["scores"] = folder / "score" / "metrics.md"
+    return GalleryEntry(folder, "run", scores, f"{minutes} min {rest} s", _picture(folder), pages)
 
 
 def _picture(folder: Path) -> Path | None:
@@ -123,11 +117,9 @@ def page(shown: Sequence[GalleryEntry], unread: Mapping[Path, str], out: Path) -
 
 def _names(folders: Sequence[Path]) -> list[str]:
     """The last parts of the folders' paths, as many as tell them apart."""
-    for count in range(1, 8):
-        names = ["/".join(Path(os.path.abspath(folder)).parts[-count:]) for folder in folders]
-        if len(set(names)) == len(names):
-            return names
-    return [f"{name} ({number + 1})" for number, name in enumerate(names)]
+    parts = [Path(os.path.abspath(folder)).parts for folder in folders]
+    count = next(n for n in range(1, 99) if n == 98 or len({part[-n:] for part in parts}) == len(parts))
+    return ["/".join(part[-count:]) for part in parts]
 
 
 def _card(one: GalleryEntry, name: str, out: Path, width: int) -> dict[str, Any]:
@@ -135,7 +127,7 @@ def _card(one: GalleryEntry, name: str, out: Path, width: int) -> dict[str, Any]
     frames = f"{scene['frames']} frames of {len(scene['cameras'])} cameras" if scene else ""
     facts = [one.kind, scene.get("id", ""), scene.get("dataset", ""), frames, one.facts]
     address = lambda path: quote(os.path.relpath(path, out.parent).replace(os.sep, "/"))
-    links = [{"title": title, "href": address(path)} for title, path in one.pages.items()]
+    links = [{"title": title, "href": address(path)} for title, path in one.pages.items() if path.is_file()]
     shown = [str(fact) for fact in facts if fact]
     return {"name": name, "facts": shown, "links": links, "picture": _thumbnail(one.picture, width)}
 
@@ -160,21 +152,17 @@ def _rows(one: GalleryEntry, name: str, metrics: Sequence[Mapping[str, Any]]) ->
     titles = {method["name"]: method["title"] for method in one.scores["methods"]}
     rows = []
     for entry in sorted(one.scores["by_distance"], key=lambda e: float(e["distance_m"])):
-        distance = float(entry["distance_m"])
-        values = [entry["values"].get(metric["name"]) for metric in metrics]
-        if not any(isinstance(value, float) for value in values):
-            continue
-        numbers = {m["name"]: v for m, v in zip(metrics, values, strict=True) if isinstance(v, float)}
-        texts = {name: number_text(name, value) for name, value in numbers.items()}
-        rows.append(
-            {
-                "run": name,
-                "scene": str(one.scores["scene"]["id"]),
-                "method": str(titles.get(entry["method"], entry["method"])),
-                "place": "recorded path" if distance == 0 else f"{distance:g} m aside",
-                "cells": [{"text": texts.get(m["name"], ""), "value": numbers.get(m["name"], "")} for m in metrics],
-            }
-        )
+        distance, values = float(entry["distance_m"]), [entry["values"].get(metric["name"]) for metric in metrics]
+        cells = [
+            {"text": number_text(metric["name"], value), "value": value}
+            if isinstance(value, float)
+            else {"text": "", "value": ""}
+            for metric, value in zip(metrics, values, strict=True)
+        ]
+        row = {"run": name, "scene": str(one.scores["scene"]["id"]), "cells": cells}
+        row["method"] = str(titles.get(entry["method"], entry["method"]))
+        row["place"] = "recorded path" if distance == 0 else f"{distance:g} m aside"
+        rows += [row] if any(isinstance(value, float) for value in values) else []
     return rows
 
 

@@ -17,6 +17,7 @@ import torch
 from markupsafe import Markup
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.spatial import KDTree
 
 from mudg.base import geometry, html, palette, seeds, store
 from mudg.base.camera_colors import CameraColors
@@ -29,6 +30,7 @@ from mudg.baselines.s3gaussian import HexPlaneNode
 from mudg.core.edit import HeightMap
 from mudg.core.pictures import depth_colors, resize_area
 from mudg.core.weather.air import FLAKE_EDGES_MM, RAIN_EDGES_MM
+from mudg.editing.apply import SEED, spread
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import DeformableNode, RigidNode
 from mudg.gaussians.start import SH_C0
@@ -126,9 +128,7 @@ def coverage(
 ) -> NDArray[np.float64]:
     """Opacity times the area that each Gaussian covers in an image taken where the path is nearest: f64[n], square
     radians."""
-    from scipy.spatial import cKDTree
-
-    tree = cKDTree(path) if path is not None and len(path) else None
+    tree = KDTree(path) if path is not None and len(path) else None
     found = np.empty(len(node))
     for part in _slices(len(node)):
         two = np.sort(columns["log_scales"][part], 1)[:, 1:].sum(1).astype(np.float64)
@@ -250,7 +250,12 @@ def pack_scene(
     UsageError: more Gaussians than a page can hold."""
     columns = _columns(model)
     layout = lay_out(columns, model.table.labels["node"].numpy(), path, most, chunk_rows)
-    low, high = _color_range(columns["sh_dc"], layout, model.sh_degree)
+    low, high = 0.0, 1.0  # between which colours the page tells levels apart
+    for index in range(len(layout)):
+        rgb = columns["sh_dc"][layout.chunk(index), 0] * SH_C0 + 0.5
+        low, high = min(low, float(rgb.min())), max(high, float(rgb.max()))
+    low = max(low, COLOR_LIMITS[0]) if model.sh_degree else 0.0  # without further bands what is below 0 is drawn as 0
+    high = min(high, COLOR_LIMITS[1])
     nodes, moving = motion_sections(model, begin_s)
     facts: dict[str, Any] = {
         "rows": len(layout.rows),
@@ -273,22 +278,16 @@ def pack_scene(
         panorama = model.sky.table["panorama"].detach()[0].numpy()
         moving["sky"] = to_u8(panorama.transpose(1, 2, 0))
         facts["sky_rows"] = model.sky.rows
-    return Packed(model, layout, moving, facts, _notes(model))
+    notes = []
+    if any(isinstance(node, (VibrationNode, HexPlaneNode, DeformedNode, BezierNode)) for node in model.nodes):
+        rest = "The page shows them at rest; boxes still carry them."
+        notes.append(f"Gaussians of this method change on their own with time. {rest}")
+    return Packed(model, layout, moving, facts, tuple(notes))
 
 
 def _columns(model: SceneModel) -> dict[str, NDArray[Any]]:
     """The table's columns, without copies."""
     return {name: value.detach().float().numpy() for name, value in model.table.columns.items()}
-
-
-def _notes(model: SceneModel) -> tuple[str, ...]:
-    notes = []
-    if any(isinstance(node, (VibrationNode, HexPlaneNode, DeformedNode, BezierNode)) for node in model.nodes):
-        rest = "The page shows them at rest; boxes still carry them."
-        notes.append(f"Gaussians of this method change on their own with time. {rest}")
-    if set(model.facts.get("drawing", ())) - {"antialias", "packed"}:
-        notes.append("This scene was fitted to be drawn along rays or as discs. The page draws the usual ellipsoids.")
-    return tuple(notes)
 
 
 def _geometry(columns: Mapping[str, Any], rows: Any, blocks: Sequence[Any]) -> Sections:
@@ -321,15 +320,6 @@ def smallest_three(quats: NDArray[np.float64]) -> NDArray[np.uint32]:
     others = unit[np.arange(4) != largest[:, None]].reshape(-1, 3)
     level = (np.clip(np.rint(others * np.sqrt(2) * 511), -511, 511) + 512).astype(np.uint32)
     return level[:, 0] | level[:, 1] << 10 | level[:, 2] << 20 | largest.astype(np.uint32) << 30
-
-
-def _color_range(bands: Any, layout: Layout, degree: int) -> tuple[float, float]:
-    """Between which colours the page tells levels apart. Without further bands what is below 0 is drawn as 0."""
-    low, high = 0.0, 1.0
-    for index in range(len(layout)):
-        rgb = bands[layout.chunk(index), 0] * SH_C0 + 0.5
-        low, high = min(low, float(rgb.min())), max(high, float(rgb.max()))
-    return max(low, COLOR_LIMITS[0]) if degree else 0.0, min(high, COLOR_LIMITS[1])
 
 
 def _classes(logits: Any, rows: Any) -> NDArray[np.uint8]:
@@ -436,6 +426,11 @@ def log_facts(scene: Scene, colors: CameraColors, image_width: int, most_images:
     places, images = _images(scene, frames, image_width, most_images)
     sweeps, points = _lidar(scene, begin)
     ramp = depth_colors(np.geomspace(NEAR_M, FAR_M, 256).astype(np.float32)[None], NEAR_M, FAR_M)[0].tolist()
+    # random drops and flakes are those of a render
+    particles = {
+        name: [seeds.key(SEED, index, purpose) & 0x7FFFFFFF for index in range(len(edges) - 1)]
+        for name, purpose, edges in (("rain", "rain", RAIN_EDGES_MM), ("snow", "flakes", FLAKE_EDGES_MM))
+    }
     facts = {
         "title": scene.id,
         "end_s": max(frame.view.time_s for frame in frames) - begin,
@@ -460,6 +455,7 @@ def log_facts(scene: Scene, colors: CameraColors, image_width: int, most_images:
         "class_colors": palette.DISPLAY_COLORS.tolist(),
         "depth_range_m": [NEAR_M, FAR_M],
         "depth_colors": ramp,
+        "particle_keys": particles,
     }
     return PageFacts(facts, {"keys": np.concatenate(keys), "lidar": points}, images)
 
@@ -482,15 +478,6 @@ def with_ground(page: PageFacts, ground: HeightMap | None) -> PageFacts:
     return replace(page, facts=facts, sections=page.sections | {"ground": levels})
 
 
-def with_particles(page: PageFacts, seed: int) -> PageFacts:
-    """The page with the keys of random drops and flakes, so that it draws those of a render with this seed."""
-    keys = {
-        name: [seeds.key(seed, index, purpose) & 0x7FFFFFFF for index in range(len(edges) - 1)]
-        for name, purpose, edges in (("rain", "rain", RAIN_EDGES_MM), ("snow", "flakes", FLAKE_EDGES_MM))
-    }
-    return replace(page, facts=page.facts | {"particle_keys": keys})
-
-
 def _camera(camera: Camera, colors: CameraColors) -> dict[str, Any]:
     known = colors.to_common.get(camera.name)
     shown = None if known is None else known.inverse()
@@ -501,12 +488,10 @@ def _camera(camera: Camera, colors: CameraColors) -> dict[str, Any]:
 
 def _images(scene: Scene, frames: Sequence[Frame], width: int, most: int) -> tuple[list[list[int] | None], bytes]:
     """Place [offset, length] of every frame's image, None where it has none, and the files."""
-    if most <= 0:
-        return [None] * len(frames), b""
-    chosen = set(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int).tolist())
+    chosen = {frame.id for frame in spread(frames, most)}
     places, parts, at = [], [], 0
-    for index, frame in enumerate(frames):
-        if index not in chosen:
+    for frame in frames:
+        if frame.id not in chosen:
             places.append(None)
             continue
         rgb = read_image(scene, frame)
@@ -541,10 +526,6 @@ def _lidar(scene: Scene, begin: float) -> tuple[dict[str, Any], NDArray[np.uint1
 # -- the page --------------------------------------------------------------------------------------
 ONE_FILE_BYTES: Final = 32 * 2**20
 """A page larger than this becomes a folder: not every browser opens larger ones."""
-TEXELS: Final = (2, 3, 4, 5)
-"""Texels per Gaussian by degree of the harmonics; as `assets/viewer/data.js` lays them out."""
-SORT_BYTES: Final = 38
-"""Per Gaussian in the sorter of a page (`assets/viewer/sorter.js`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -605,19 +586,6 @@ class ViewerPage:
         blob, directory = blob_of(sections)
         made = PageFile(name, gzip.compress(blob, self.effort, mtime=0))
         return made, {"file": made.record(), "directory": directory}
-
-    def chunks(self) -> int:
-        """Chunks of all scenes."""
-        return sum(len(packed.layout) for _, packed in self.scenes)
-
-    def graphics_bytes(self) -> int:
-        """What the scenes take on the graphics card: texels of 16 bytes, and the order, 4 bytes per Gaussian."""
-        rows = lambda packed: len(packed.layout) * min(packed.layout.size, packed.kept)
-        return sum(16 * TEXELS[packed.facts["degree"]] * rows(packed) + 4 * packed.kept for _, packed in self.scenes)
-
-    def heap_bytes(self) -> int:
-        """What a browser keeps of the scenes to sort them: places, nodes, keys and rows twice, two orders."""
-        return SORT_BYTES * sum(packed.kept for _, packed in self.scenes)
 
     def one_file(self, files: Iterable[PageFile], facts: Mapping[str, Any]) -> bytes:
         """The page with all data in it."""

@@ -1,8 +1,6 @@
-"""The report: one self-contained page of a finished run. Needs no network and works by double click.
-
-Each trajectory becomes one H.264 video that holds all panels (columns: truth and methods; rows: colour, depth, classes,
-colour error), so that the panels can never run apart; the page cuts them out of it.
-"""
+"""The report: one self-contained page of a finished run, without a network, by double click. Each trajectory becomes
+one H.264 video that holds all panels (columns: truth and methods; rows: colour, depth, classes, colour error), so that
+they never run apart; the page cuts them out of it."""
 
 from __future__ import annotations
 
@@ -26,7 +24,7 @@ from mudg.base.processes import computed_ahead
 from mudg.base.records import understood
 from mudg.base.types import Observation
 from mudg.core.pictures import class_colors, depth_colors, error_image, resize_nearest, resize_rgb, to_bytes
-from mudg.formats.exporters.video import Encoding, jpeg_bytes, mp4_within, video_encoders
+from mudg.formats.exporters.video import jpeg_bytes, mp4_within, video_encoders
 from mudg.scene.observations import ObservationSet, list_observation_sets, read_observations
 from mudg.scoring.tables import (
     FLOOR,
@@ -41,29 +39,16 @@ from mudg.scoring.tables import (
     values_by_distance,
 )
 
-# -- command lines: what to do with a run next, and its steps one by one ---------------------------
+# -- command lines: what to do with a run next ------------------------------------------------------
 
-PLAIN: Final = "fit/street_gaussians"
 GUIDED: Final = "fit/mudg_s"
-STEPS: Final = (
-    *("scene", "annotate", "fuse", PLAIN, "synthesize", GUIDED),
-    *("render/street_gaussians", "render/mudg_s", "score"),
-)
-"""Folders of the chain, in the order in which they are made."""
-INPUTS: Final = {
-    "fused": ("--fused", "fuse"),
-    "fitted": ("--fitted", PLAIN),
-    "start": ("--start-from", PLAIN),
-    "observations": ("--observations", "synthesize"),
-}
-"""Inputs that a step's record names: their flag, and the folder of the chain."""
-VIEWS: Final = {"street_gaussians": "render/street_gaussians", "mudg_r": "synthesize", "mudg_s": "render/mudg_s"}
 
 
 def next_commands(out: Path, source: str) -> list[tuple[str, tuple[str, ...]]]:
     """What a run can be used for, as (title, lines). Each block works by itself, in the folder from which the run was
     started."""
-    run, scene = str(out), scene_of(out, source)
+    run = str(out)
+    scene = next((f"{out}/{name}" for name in ("annotate", "scene") if (out / name / "scene.json").is_file()), source)
     try:  # an object that an edit script can name
         nodes = store.read_json(out / GUIDED / "model.json")["nodes"]
         movable = next((str(node["name"]) for node in nodes if "label" in node), "")
@@ -94,34 +79,6 @@ def next_commands(out: Path, source: str) -> list[tuple[str, tuple[str, ...]]]:
     return [(title, tuple(map(_line, lines))) for title, lines in blocks]
 
 
-def step_commands(out: Path, source: str) -> list[str]:
-    """The steps of a run, each as a command with the settings that it had: as it stands it verifies the result and
-    reuses it."""
-    found = []
-    for folder in STEPS:
-        try:
-            inputs: Sequence[str] = list(store.read_json(out / folder / store.RUN_STATE)["inputs"])
-            verb = str(store.read_json(out / folder / store.RUN_STATE)["verb"])
-        except (InputError, KeyError, TypeError):
-            continue
-        words = [verb, source if folder == "scene" else scene_of(out, source, labelled=folder != "annotate")]
-        for name in inputs:
-            if name in INPUTS:
-                words += [INPUTS[name][0], f"{out}/{INPUTS[name][1]}"]
-        if verb == "render":
-            words += ["--model", f"{out}/fit/{Path(folder).name}"]
-        if verb == "score":
-            words += ["--views", *(f"{name}={out}/{place}" for name, place in VIEWS.items() if name in inputs)]
-        found.append(_line([*words, "--config", f"{out}/{folder}/run.yaml", "--out", f"{out}/{folder}"]))
-    return found
-
-
-def scene_of(out: Path, source: str, labelled: bool = True) -> str:
-    """The scene that the steps of a run read: labelled by it, made by it, or given to it."""
-    names = ("annotate", "scene") if labelled else ("scene",)
-    return next((f"{out}/{name}" for name in names if (out / name / "scene.json").is_file()), source)
-
-
 def _line(words: Sequence[str]) -> str:
     return words[0] if len(words) == 1 else f"mudg {shlex.join(words)}"
 
@@ -134,7 +91,7 @@ GROUPS: Final = (
     ("Classes", ("miou", "accuracy")),
     ("At LiDAR points", ("lidar_abs_rel", "lidar_rmse_m", "lidar_delta1", "lidar_psnr", "agreement")),
     ("Vehicles and lanes", ("agent_iou", "lane_iou", "lane_correlation", "lane_psnr", "nta_iou", "ntl_iou")),
-    ("Steadiness", ("warp_error", "temporal_flickering", "subject_consistency", "clip_f")),
+    ("Steadiness", ("warp_error", "temporal_flickering")),
 )
 OPTIONAL: Final = frozenset({"At LiDAR points", "Vehicles and lanes", "Steadiness"})
 """Groups that are left out, and distances of them, where no method has a number."""
@@ -190,7 +147,6 @@ def page(
     for commands. ``curves``: as of ``fit_charts``."""
     scene = scores["scene"]
     heading, lead = headline(scores)
-    source = str(ledger.get("asked", {}).get("source", "LOG"))
     return html.render(
         "report.html.j2",
         title=f"{scene['id']}: mudg report",
@@ -199,14 +155,13 @@ def page(
         lead=lead,
         scene=scene,
         viewer=viewer,
-        curves=curves,
         facts=_facts(scores, ledger),
         rules=scores["rules"],
         methods=scores["methods"],
         settings=settings,
         provenance=_provenance(scores, ledger),
-        next_commands=next_commands(out, source),
-        step_commands=step_commands(out, source),
+        curves=curves,
+        next_commands=next_commands(out, str(ledger.get("asked", {}).get("source", "LOG"))),
         **_player_values(scores, videos, columns),
         **_score_values(scores),
         **_time_values(ledger),
@@ -333,7 +288,11 @@ def _score_values(scores: Mapping[str, Any]) -> dict[str, Any]:
             groups.append(_score_group(scores, title, [metrics[n] for n in names if n in metrics], there))
     made_of_sets = [metrics[name] for name, entry in SET_METRICS.items() if entry in scores]
     if made_of_sets:
-        groups.append(_with_floor(scores, _score_group(scores, "Distribution", made_of_sets, distances), distances))
+        group, floors = _score_group(scores, "Distribution", made_of_sets, distances), floors_by_distance(scores)
+        true = [(m["name"], floors.get(distance, {}).get(m["name"])) for distance in distances for m in made_of_sets]
+        cells = [{"text": number_text(name, value), "classes": ""} for name, value in true]
+        group["rows"].append({"method": "truth", "title": FLOOR, "cells": cells})  # what the truth itself scores
+        groups.append(group)
     has_number = lambda name: any(isinstance(r["values"].get(name), float) for r in scores["results"])
     numeric = [metric for metric in metrics.values() if has_number(metric["name"])]
     results = []
@@ -373,14 +332,6 @@ def _score_group(
     rows = [{"method": m["name"], "title": m["title"], "cells": list(cells(m["name"]))} for m in scores["methods"]]
     titles = [distance_title(scores, distance) for distance in distances]
     return {"title": title, "distances": titles, "metrics": metrics, "rows": rows}
-
-
-def _with_floor(scores: Mapping[str, Any], group: dict[str, Any], distances: Sequence[float]) -> dict[str, Any]:
-    """The group with a last row: what the truth itself scores."""
-    floors = floors_by_distance(scores)
-    values = [(m["name"], floors.get(distance, {}).get(m["name"])) for distance in distances for m in group["metrics"]]
-    cells = [{"text": number_text(name, value), "classes": ""} for name, value in values]
-    return {**group, "rows": [*group["rows"], {"method": "truth", "title": FLOOR, "cells": cells}]}
 
 
 def chart_points(scores: Mapping[str, Any], metric: str) -> dict[str, list[tuple[float, float]]]:
@@ -555,7 +506,7 @@ VIEWER: Final = "viewer.html"
 VIEWER_FOLDER: Final = "viewer_page/index.html"
 SAME_TIME_S: Final = 1e-4
 ROWS: Final = tuple(name for name, _ in PANEL_ROWS)
-ENCODING: Final = Encoding(FPS, first_crf=33, last_crf=45, preset="veryfast")
+QUALITY: Final = (33, 45)
 
 
 @dataclass(frozen=True)
@@ -626,7 +577,7 @@ def _video(trajectory: Mapping[str, Any], folders: Mapping[str, Mapping[str, Pat
     columns = _columns(trajectory, folders)
     size = panel_size(int(trajectory["width"]), int(trajectory["height"]), PANEL_WIDTH)
     order = list(folders)
-    video = mp4_within(lambda: _frames(columns, order, size), ENCODING, budget) if budget else b""
+    video = mp4_within(lambda: _frames(columns, order, size), FPS, QUALITY, budget) if budget else b""
     poster = jpeg_bytes(next(_frames(columns, order, size, first=columns.frames // 2)), quality=60)
     return TrajectoryVideo(
         name=trajectory["name"],

@@ -1,9 +1,6 @@
 """A small web server for one page on this machine. It serves names from a table, never paths, and answers only to its
-own page.
-
-Whoever reaches the port may send anything, with or without the token: what cannot be read is answered with 400 or not
-at all, who says nothing is cut off, and there are never more than `MOST_CONNECTIONS`.
-"""
+own page. What cannot be read is answered with 400 or not at all, who says nothing is cut off, and there are never more
+than `MOST_CONNECTIONS`."""
 
 from __future__ import annotations
 

@@ -154,7 +154,7 @@ export const screenVertex = HEAD + `
 void main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0); }`;
 
 /** Sums of one layer to a picture: sky behind colours, depth and confidence through their colour scales. */
-const GROUND = "0.43, 0.43, 0.42"; // as `live.GROUND`
+const GROUND = "0.43, 0.43, 0.42"; // as `view.GROUND`
 
 export const resolveFragment = HEAD + `
 uniform sampler2D sums, sky, scales; uniform int layer; uniform bool hasSky;

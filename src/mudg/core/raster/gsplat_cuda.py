@@ -98,11 +98,7 @@ def status() -> str:
 
 
 def load() -> ModuleType:
-    """The package.
-
-    Raises:
-        ResourceError: it cannot be used here.
-    """
+    """The package. ResourceError: it cannot be used here."""
     reason = problem()
     if reason:
         what = "raster backend 'gsplat' is not available"

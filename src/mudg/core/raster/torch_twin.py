@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mudg.base.errors import NumericsError
 from mudg.base.types import Camera, Gaussians, RasterTrace, Render
-from mudg.core.harmonics import rotation_of_unit
+from mudg.core.harmonics import basis_rows, rotation_of_unit
 
 if TYPE_CHECKING:
     from mudg.core.raster.rasterize import RasterConfig
@@ -129,32 +129,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """Real spherical harmonics of unit directions [N, 3]: [N, (degree + 1)^2]."""
-    x, y, z = directions.unbind(1)
-    cos2, sin2 = x * x - y * y, 2 * x * y
-    basis = [torch.full_like(x, 0.2820947917738781)]
-    if degree >= 1:
-        basis += [-0.48860251190292 * y, 0.48860251190292 * z, -0.48860251190292 * x]
-    if degree >= 2:
-        basis += [
-            0.5462742152960395 * sin2,
-            -1.092548430592079 * y * z,
-            0.9461746957575601 * z * z - 0.3153915652525201,
-            -1.092548430592079 * x * z,
-            0.5462742152960395 * cos2,
-        ]
-    if degree >= 3:
-        cos3, sin3 = x * cos2 - y * sin2, x * sin2 + y * cos2
-        c = 0.4570457994644658 - 2.285228997322329 * z * z
-        basis += [
-            -0.5900435899266435 * sin3,
-            1.445305721320277 * z * sin2,
-            c * y,
-            z * (1.865881662950577 * z * z - 1.119528997770346),
-            c * x,
-            1.445305721320277 * z * cos2,
-            -0.5900435899266435 * cos3,
-        ]
-    return torch.stack(basis, 1)
+    return torch.stack(basis_rows(*directions.unbind(1), degree), 1)
 
 
 def sh_colors(sh: Tensor, directions: Tensor) -> Tensor:

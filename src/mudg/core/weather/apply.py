@@ -24,7 +24,6 @@ from mudg.core.weather.gbuffer import (
     world_points,
     world_rays,
 )
-from mudg.core.weather.light import in_season
 
 Image = NDArray[np.float32]
 
@@ -42,7 +41,7 @@ def apply(
 
     Args:
         gbuffer: what the view shows as recorded.
-        settings: weather, light and season. Defaults change nothing.
+        settings: weather and light. Defaults change nothing.
         view: camera and pose.
         time_s: moment of falling drops and flakes, on the scene's clock (``view.time_s`` is not used).
         seed: run seed; puddles, patches of snow and drops follow from it.
@@ -57,8 +56,6 @@ def apply(
         share = np.exp(-air.extinction(weather.recorded_visibility_m) * euclidean_range(view, gbuffer.depth))
         clear = air.unveiled(gbuffer.color, share, light.airlight)
         gbuffer = replace(gbuffer, color=np.where(gbuffer.sky[..., None], gbuffer.color, clear).astype(np.float32))
-    if settings.season is not None:
-        gbuffer = in_season(gbuffer, view, settings.season, seed)
     if settings.light.time != "as_recorded":
         gbuffer, light = _in_new_light(gbuffer, view, light, settings.light)
     if weather.wet > 0:
@@ -171,7 +168,7 @@ def edited_view(
 
     Args:
         shown: the image, its depth and classes.
-        settings: weather, light and season.
+        settings: weather and light.
         seed: run seed.
         drive: from ``drive_facts``, the same for all images.
         velocity: of the camera, metres per second along the world's axes: it tilts the streaks of drops.

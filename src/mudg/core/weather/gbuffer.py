@@ -106,9 +106,8 @@ def places_within_pixels(view: View, gbuffer: GBuffer, where: NDArray[np.bool_])
     for du, dv in _SUB_PIXELS:
         ray = middle + du * across + dv * down
         against = (normal * ray).sum(1)
-        scale = np.where(
-            offset * against > 0, offset / np.where(against == 0, 1, against), 1.0
-        )  # grazing: stay at the depth
+        # grazing: stay at the depth
+        scale = np.where(offset * against > 0, offset / np.where(against == 0, 1, against), 1.0)
         found.append(view.center_world + ray * (depth * np.clip(scale, 0.5, 2))[:, None])
     return found
 
@@ -342,17 +341,14 @@ def _quantile_color(colors: Image, share: float, otherwise: Array) -> Array:
     return np.quantile(colors.reshape(-1, 3), share, axis=0).astype(np.float64) if len(colors) else otherwise
 
 
-def estimate_surroundings(views: Iterable[tuple[View, GBuffer]], ground_z_m: float | None = None) -> Surroundings:
+def estimate_surroundings(views: Iterable[tuple[View, GBuffer]]) -> Surroundings:
     """Light of a drive from its own images.
 
     Sky pixels below 20 degrees give the horizon, those above the zenith, and the lowest tenth of them the airlight.
     Without sky, the brightest tenth of everything stands for it. The sky's irradiance is a third horizon and two thirds
     zenith (cosine weights of both bands, rounded). Level ground in light and shadow gives the sun: what the brightest
     ground has beyond the darkest, over the same albedo. Its direction is not found: straight above is assumed.
-
-    Args:
-        views: views and G-buffers of some frames.
-        ground_z_m: height of the road; None = median of road pixels.
+    The road's height is the median of its pixels.
     """
     low, high, rises, rest, ground, heights = [], [], [], [], [], []
     for view, gbuffer in views:
@@ -377,7 +373,7 @@ def estimate_surroundings(views: Iterable[tuple[View, GBuffer]], ground_z_m: flo
     too_bright = max(float((ambient + sun).mean()) / WHITE_IN_SUN, 1.0)
     ambient, sun = ambient / too_bright, sun / too_bright
     z = np.concatenate(heights)
-    ground_z = ground_z_m if ground_z_m is not None else (float(np.median(z)) if len(z) else 0.0)
+    ground_z = float(np.median(z)) if len(z) else 0.0
     up, color = (np.concatenate(parts) for parts in zip(*rises, strict=True))
     lowest = color[up <= np.quantile(up, 0.1)] if len(up) else color
     airlight = _quantile_color(lowest, 0.5, horizon)

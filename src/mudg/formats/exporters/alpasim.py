@@ -1,14 +1,6 @@
-"""A scene as NVIDIA's AlpaSim reads it: a USDZ package with more files, found by their names.
-
-    metadata.yaml          names, sensors, first and last microsecond
-    rig_trajectories.json  path of the vehicle, calibration of the cameras, begin and end of every image
-    sequence_tracks.json   paths, classes and sizes of the objects
-    mesh_ground.ply        the ground as triangles, facing up
-    map.xodr               the driven corridor (OpenDRIVE)
-
-Times are microseconds, the first record at 1 s. World, and what NuRec calls its own frame, are the world of the file:
-z up, metres. The rig is the vehicle, x forward, y left, z up. Source: the layouts of AlpaSim's reader, of NuRec's
-writer, and of Autoware's 3dgs_io.
+"""A scene as NVIDIA's AlpaSim reads it: a USDZ package with more files (docs/reference/export.md). Microseconds, the
+first record at 1 s; the rig is the vehicle, x forward, y left, z up. Source: the layouts of AlpaSim's reader, of
+NuRec's writer, and of Autoware's 3dgs_io.
 """
 
 from __future__ import annotations
@@ -28,11 +20,11 @@ from mudg.base import geometry, store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Scene
 from mudg.core.edit import HeightMap
-from mudg.formats.ncore import MICRO, PoseKeys, shutter_type
+from mudg.formats.exporters.ncore import MICRO, PoseKeys, shutter_type
 from mudg.formats.splats import ply
 from mudg.formats.splats.cloud import SplatScene
 from mudg.formats.splats.usd import to_package
-from mudg.scene.road import Road
+from mudg.scene.motion import Road
 
 MOVES_M: Final = 1.0
 """Objects that go no farther stand."""
@@ -204,11 +196,8 @@ def ground_mesh(ground: HeightMap, file_from_world: NDArray[np.float64]) -> byte
 
 # OpenDRIVE ----------------------------------------------------------------------------------------
 #
-# The driven corridor as a minimal map of version 1.6: one road along the recorded path, with lanes of one width.
-#
-# Its reference line is the path in pieces of cubic polynomials, its elevation likewise. The lane that was driven is
-# centred on the path; further lanes are as many as the road's surface is wide, in the direction of travel to the right
-# of it and against it to the left. Nothing recorded says where lanes are painted or which way traffic goes there.
+# The driven corridor as a minimal map of version 1.6: one road along the recorded path in cubic pieces, the driven lane
+# centred on it, and as many lanes of one width beside it as its surface is wide.
 
 
 LANE_M: Final = 3.5

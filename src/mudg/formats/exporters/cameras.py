@@ -1,15 +1,12 @@
-"""Cameras and images of a log as a binary COLMAP model, with one rig of all cameras.
-
-Poses are camera from world, axes x right, y down, z forward, pixel centres at 0.5: those of this program. Images that
-the rig took at one time and whose poses agree with it are one frame; any other image is a frame by itself, so that
-every image has exactly its own pose.
+"""Cameras and images of a log for programs that train on them: nerfstudio's ``transforms.json``, and a binary COLMAP
+model with one rig. Images that the rig took at one time and whose poses agree with it are one frame; any other image is
+a frame by itself, so that every image has exactly its own pose.
 """
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Final
 
@@ -37,10 +34,6 @@ def pictures(scene: Scene) -> Iterator[tuple[str, bytes]]:
 
 
 # nerfstudio ---------------------------------------------------------------------------------------
-#
-# Cameras and images of a log as a nerfstudio data set: ``transforms.json``, pictures, starting points.
-#
-# Poses are camera-to-world with x right, y up, z back; the world is that of this program, z up.
 
 
 FLIP: Final = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -88,14 +81,6 @@ FOLDER: Final = "sparse/0"
 Matrix = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RigFrame:
-    """Images that one pose of the rig explains."""
-
-    rig_from_world: Matrix
-    frames: tuple[Frame, ...]
-
-
 def sensors_from_rig(scene: Scene) -> dict[str, Matrix]:
     """Pose of every camera in the rig, whose frame is that of the first camera: from the first image of each and the
     vehicle's path."""
@@ -109,19 +94,18 @@ def sensors_from_rig(scene: Scene) -> dict[str, Matrix]:
     return {name: pose @ geometry.invert(first) for name, pose in cam_from_ego.items()}
 
 
-def rig_frames(scene: Scene, sensors: Mapping[str, Matrix]) -> list[RigFrame]:
-    """The images by frame of the rig, in order of time."""
-    found: list[RigFrame] = []
+def rig_frames(scene: Scene, sensors: Mapping[str, Matrix]) -> list[tuple[Matrix, list[Frame]]]:
+    """Rig-from-world f64[4, 4] and the images that it explains, by frame of the rig, in order of time."""
+    found: list[tuple[Matrix, list[Frame]]] = []
     for frame in sorted(scene.frames, key=lambda one: one.view.time_s):
         pose = geometry.invert(sensors[frame.view.camera.name]) @ frame.view.cam_from_world
-        last = found[-1] if found else None
-        taken = set() if last is None else {other.view.camera.name for other in last.frames}
-        together = last is not None and abs(last.frames[0].view.time_s - frame.view.time_s) < 1e-6
-        free = together and frame.view.camera.name not in taken
-        if last is not None and free and np.abs(last.rig_from_world - pose).max() < AGREE:
-            found[-1] = RigFrame(last.rig_from_world, (*last.frames, frame))
+        last_pose, last = found[-1] if found else (pose, [])
+        together = last and abs(last[0].view.time_s - frame.view.time_s) < 1e-6
+        free = together and frame.view.camera.name not in {other.view.camera.name for other in last}
+        if free and np.abs(last_pose - pose).max() < AGREE:
+            last.append(frame)
         else:
-            found.append(RigFrame(pose, (frame,)))
+            found.append((pose, [frame]))
     return found
 
 
@@ -145,9 +129,9 @@ def colmap_files(scene: Scene, points: PointCloud | None = None) -> dict[str, by
         rig = struct.pack("<IIiI", 1, len(sensors), CAMERA, cameras[first])
         rig += b"".join(struct.pack("<iIB7d", CAMERA, cameras[name], 1, *_pose(sensors[name])) for name in others)
     moments = [
-        struct.pack("<II7dI", index + 1, 1, *_pose(one.rig_from_world), len(one.frames))
-        + b"".join(struct.pack("<iIQ", CAMERA, cameras[f.view.camera.name], images[f.id]) for f in one.frames)
-        for index, one in enumerate(rig_frames(scene, sensors))
+        struct.pack("<II7dI", index + 1, 1, *_pose(rig_from_world), len(frames))
+        + b"".join(struct.pack("<iIQ", CAMERA, cameras[f.view.camera.name], images[f.id]) for f in frames)
+        for index, (rig_from_world, frames) in enumerate(rig_frames(scene, sensors))
     ]
     cloud = np.zeros(
         0 if points is None else len(points),

@@ -1,12 +1,10 @@
-"""A driving log as records over time, and as messages of ROS 2 in an MCAP file or a bag.
-
-Times count from the first record. Pictures and sweeps are read when they are written, one at a time.
-"""
+"""A driving log as records over time, and as messages of ROS 2 in an MCAP file or a bag (docs/reference/export.md)."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path, PurePosixPath
 from types import SimpleNamespace
 from typing import Any, Final, NamedTuple
@@ -100,11 +98,6 @@ def box_color(label: str) -> tuple[float, float, float]:
     return red / 255, green / 255, blue / 255
 
 
-def above(pose: Matrix, track: Track) -> Matrix:
-    """Where the name of an object stands: 0.4 m over its box."""
-    return pose @ geometry.yaw_matrix(0.0, (0, 0, float(track.size_m[2]) / 2 + 0.4))
-
-
 # MCAP files ---------------------------------------------------------------------------------------
 
 
@@ -178,17 +171,9 @@ def write_mcap(path: Path, messages: Ros2Messages) -> tuple[dict[str, tuple[str,
 
 # ros2 ----------------------------------------------------------------------------------------------
 #
-# Written without ROS: the package rosbags gives types and bytes of messages. Its own writer begins with bags of version
-# 8, which Humble does not read.
-#
-#     /tf  /tf_static  /ego/path (once)  /ego/pose  /camera/NAME/image/compressed  /camera/NAME/camera_info
-#     /lidar/NAME/points
-#     /objects/markers  /objects/detections  /points (fused, once)
-#
 # Frames (REP 103, REP 105): ``map``, ``base_link`` (the vehicle), ``camera_NAME_optical`` (x right, y down, z forward),
-# ``lidar_NAME``. A sensor whose place on the vehicle is fixed hangs on ``base_link`` by /tf_static, any other on
-# ``map`` by /tf. Principal points count from the centre of the first pixel, as OpenCV's do: half a pixel less than in
-# this program.
+# ``lidar_NAME``. Principal points count from the centre of the first pixel: half a pixel less than in this program.
+# rosbags' own writer begins with bags of version 8, which Humble does not read.
 
 
 START_S: Final = 1
@@ -224,36 +209,19 @@ def bag_metadata(topics: Mapping[str, tuple[str, int]], span: tuple[int, int]) -
     for topic, (kind, count) in topics.items():
         about = {"name": topic, "type": kind, "serialization_format": "cdr", "offered_qos_profiles": _qos(topic)}
         listed.append({"topic_metadata": about, "message_count": count})
-    about = {
-        "version": 5,
-        "storage_identifier": "mcap",
-        "duration": length,
-        "starting_time": start,
-        "message_count": total,
-        "topics_with_message_count": listed,
-        "compression_format": "",
-        "compression_mode": "",
-        "relative_file_paths": [BAG_FILE],
-        "files": [{"path": BAG_FILE, "starting_time": dict(start), "duration": dict(length), "message_count": total}],
-    }
-    return yaml.safe_dump({"rosbag2_bagfile_information": about}, sort_keys=False).encode()
+    about = {"version": 5, "storage_identifier": "mcap", "duration": length, "starting_time": start}
+    about |= {"message_count": total, "topics_with_message_count": listed}
+    about |= {"compression_format": "", "compression_mode": "", "relative_file_paths": [BAG_FILE]}
+    file = {"path": BAG_FILE, "starting_time": dict(start), "duration": dict(length), "message_count": total}
+    return yaml.safe_dump({"rosbag2_bagfile_information": {**about, "files": [file]}}, sort_keys=False).encode()
 
 
 def _qos(topic: str) -> str:
     """Quality of service as rosbag2 writes it: reliable; kept for those who join later where one message is all."""
-    never = {"sec": 9223372036, "nsec": 854775807}
-    once = topic in ONCE
-    profile = {
-        "history": 1,
-        "depth": 1 if once else 10,
-        "reliability": 1,
-        "durability": 1 if once else 2,
-        "deadline": dict(never),
-        "lifespan": dict(never),
-        "liveliness": 1,
-        "liveliness_lease_duration": dict(never),
-        "avoid_ros_namespace_conventions": False,
-    }
+    once, never = topic in ONCE, {"sec": 9223372036, "nsec": 854775807}
+    profile = {"history": 1, "depth": 1 if once else 10, "reliability": 1, "durability": 1 if once else 2}
+    profile |= {"deadline": dict(never), "lifespan": dict(never), "liveliness": 1}
+    profile |= {"liveliness_lease_duration": dict(never), "avoid_ros_namespace_conventions": False}
     return yaml.safe_dump([profile], sort_keys=False)
 
 
@@ -283,11 +251,9 @@ class Ros2Messages:
         self._log, self._scene, self._types = records, records.scene, ros_types()
         packages = {"builtin_interfaces", "std_msgs", "geometry_msgs", "sensor_msgs", "nav_msgs", "tf2_msgs"}
         packages |= {"visualization_msgs", "vision_msgs"}
-        classes = {
-            kind.split("/")[-1]: made for kind, made in self._types.types.items() if kind.split("/")[0] in packages
-        }
-        self._ros: Any = SimpleNamespace(**classes)
-        lidars = {sweep.sensor: 0 for sweep in self._scene.sweeps}
+        kinds = {kind: made for kind, made in self._types.types.items() if kind.split("/")[0] in packages}
+        self._ros: Any = SimpleNamespace(**{kind.split("/")[-1]: made for kind, made in kinds.items()})
+        lidars = dict.fromkeys(sweep.sensor for sweep in self._scene.sweeps)
         self._names = {f"camera/{name}": plain for name, plain in ros_names(self._scene.cameras).items()}
         self._names |= {f"lidar/{name}": plain for name, plain in ros_names(lidars).items()}
         self._mounts = records.mounts()
@@ -325,19 +291,20 @@ class Ros2Messages:
         return self._ros.Pose(self._ros.Point(*pose[:3, 3].tolist()), self._turn(pose))
 
     def _once(self) -> Iterator[LogMessage]:
-        start, ego = self._log.start_s, self._scene.ego
+        start = self._log.start_s
         if self._mounts:
             yield self._tf("/tf_static", start, VEHICLE, {self._frame(name): m for name, m in self._mounts.items()})
-
-        def path() -> Any:
-            poses = [
-                (self._header(float(t), MAP), self._pose(pose)) for t, pose in zip(ego.times_s, ego.world_from_ego)
-            ]
-            return self._ros.Path(self._header(start, MAP), [self._ros.PoseStamped(*pose) for pose in poses])
-
-        yield LogMessage("/ego/path", "nav_msgs/msg/Path", start, path)
+        yield LogMessage("/ego/path", "nav_msgs/msg/Path", start, self._path)
         if self._log.fused is not None:
-            yield LogMessage("/points", "sensor_msgs/msg/PointCloud2", start, self._fused)
+            yield LogMessage("/points", "sensor_msgs/msg/PointCloud2", start, partial(self._fused, self._log.fused))
+
+    def _path(self) -> Any:
+        ego = self._scene.ego
+        poses = [self._posed(float(t), pose) for t, pose in zip(ego.times_s, ego.world_from_ego)]
+        return self._ros.Path(self._header(self._log.start_s, MAP), poses)
+
+    def _posed(self, time_s: float, pose: Matrix) -> Any:
+        return self._ros.PoseStamped(self._header(time_s, MAP), self._pose(pose))
 
     def _transforms(self) -> Iterator[LogMessage]:
         """The vehicle at every moment at which something was recorded, and sensors that are not fixed to it."""
@@ -345,7 +312,7 @@ class Ros2Messages:
             pose = self._scene.ego.pose_at(moment)
             if pose is not None:
                 yield self._tf("/tf", moment, MAP, {VEHICLE: pose})
-                ego = lambda t=moment, p=pose: self._ros.PoseStamped(self._header(t, MAP), self._pose(p))
+                ego = partial(self._posed, moment, pose)
                 yield LogMessage("/ego/pose", "geometry_msgs/msg/PoseStamped", moment, ego)
         for sensor, time_s, pose in self._log.sensor_poses():
             if sensor not in self._mounts:
@@ -356,24 +323,23 @@ class Ros2Messages:
         ros = self._ros
 
         def transforms() -> Any:
-            header = self._header(time_s, parent)
-            values = {
-                child: ros.Transform(ros.Vector3(*pose[:3, 3].tolist()), self._turn(pose))
-                for child, pose in poses.items()
-            }
-            return ros.TFMessage([ros.TransformStamped(header, child, value) for child, value in values.items()])
+            header, made = self._header(time_s, parent), []
+            for child, pose in poses.items():
+                transform = ros.Transform(ros.Vector3(*pose[:3, 3].tolist()), self._turn(pose))
+                made.append(ros.TransformStamped(header, child, transform))
+            return ros.TFMessage(made)
 
         return LogMessage(topic, "tf2_msgs/msg/TFMessage", time_s, transforms)
 
     def _of_sensors(self) -> Iterator[LogMessage]:
         for frame in self._scene.frames:
-            topic, view = f"/camera/{self._names[f'camera/{frame.view.camera.name}']}", frame.view
-            info, image = (lambda v=view: self._camera_info(v)), (lambda f=frame: self._image(f))
+            view, image = frame.view, partial(self._image, frame)
+            topic, info = f"/camera/{self._names[f'camera/{view.camera.name}']}", partial(self._camera_info, view)
             yield LogMessage(f"{topic}/camera_info", "sensor_msgs/msg/CameraInfo", view.time_s, info)
             yield LogMessage(f"{topic}/image/compressed", "sensor_msgs/msg/CompressedImage", view.time_s, image)
         for sweep in self._scene.sweeps:
             topic = f"/lidar/{self._names[f'lidar/{sweep.sensor}']}/points"
-            yield LogMessage(topic, "sensor_msgs/msg/PointCloud2", sweep.time_s, lambda s=sweep: self._sweep(s))
+            yield LogMessage(topic, "sensor_msgs/msg/PointCloud2", sweep.time_s, partial(self._sweep, sweep))
 
     def _camera_info(self, view: View) -> Any:
         camera, k = view.camera, view.camera.matrix
@@ -403,14 +369,12 @@ class Ros2Messages:
         rows["x"], rows["y"], rows["z"], rows["intensity"] = *points.xyz.T, points.intensity
         return self._cloud(sweep.time_s, self._frame(f"lidar/{sweep.sensor}"), rows)
 
-    def _fused(self) -> Any:
+    def _fused(self, cloud: PointCloud) -> Any:
         """Fused points; colours as programs of ROS expect them: 0x00RRGGBB in the bits of a float."""
-        cloud = self._log.fused
-        rows = np.zeros(0 if cloud is None else len(cloud), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<f4")])
-        if cloud is not None:
-            red, green, blue = cloud.rgb.T.astype("<u4")
-            rows["x"], rows["y"], rows["z"] = cloud.xyz.T
-            rows["rgb"] = (red << 16 | green << 8 | blue).astype("<u4").view("<f4")
+        rows = np.zeros(len(cloud), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<f4")])
+        red, green, blue = cloud.rgb.T.astype("<u4")
+        rows["x"], rows["y"], rows["z"] = cloud.xyz.T
+        rows["rgb"] = (red << 16 | green << 8 | blue).astype("<u4").view("<f4")
         return self._cloud(self._log.start_s, MAP, rows)
 
     def _cloud(self, time_s: float, frame: str, rows: NDArray[Any]) -> Any:
@@ -423,7 +387,7 @@ class Ros2Messages:
 
     def _of_objects(self) -> Iterator[LogMessage]:
         for time_s in self._log.moments():
-            markers, boxes = (lambda t=time_s: self._markers(t)), (lambda t=time_s: self._detections(t))
+            markers, boxes = partial(self._markers, time_s), partial(self._detections, time_s)
             yield LogMessage("/objects/markers", "visualization_msgs/msg/MarkerArray", time_s, markers)
             yield LogMessage("/objects/detections", "vision_msgs/msg/Detection3DArray", time_s, boxes)
 
@@ -439,8 +403,9 @@ class Ros2Messages:
         for track, pose in self._log.boxes(time_s):
             color, name = ros.ColorRGBA(*box_color(track.label), 0.4), f"{track.id} ({track.label})"
             size, white = ros.Vector3(*track.size_m.tolist()), ros.ColorRGBA(1.0, 1.0, 1.0, 1.0)
+            above = pose @ geometry.yaw_matrix(0.0, (0, 0, float(track.size_m[2]) / 2 + 0.4))
             box = {"ns": "boxes", "type": CUBE, "pose": self._pose(pose), "scale": size, "color": color, "text": ""}
-            label = {"ns": "names", "type": WORDS, "pose": self._pose(above(pose, track)), "color": white, "text": name}
+            label = {"ns": "names", "type": WORDS, "pose": self._pose(above), "color": white, "text": name}
             label["scale"] = ros.Vector3(0.0, 0.0, 0.5)
             markers += [ros.Marker(header=header, id=numbers[track.id], **rest, **one) for one in (box, label)]
         return ros.MarkerArray(markers)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -38,26 +37,18 @@ def mp4_bytes(frames: Iterable[NDArray[np.uint8]], fps: float = 10.0, crf: int =
     return buffer.getvalue()
 
 
-@dataclass(frozen=True)
-class Encoding:
-    """How a video is coded: pictures per second, the best and the worst quality (x264's CRF, lower is better), x264's
-    preset."""
-
-    fps: float
-    first_crf: int
-    last_crf: int
-    preset: str
-
-
-def mp4_within(frames: Callable[[], Iterable[NDArray[np.uint8]]], encoding: Encoding, budget_bytes: int) -> bytes:
-    """A video of at most ``budget_bytes``, if the worst quality allows; ``frames`` is called once per attempt."""
-    crf = encoding.first_crf
+def mp4_within(
+    frames: Callable[[], Iterable[NDArray[np.uint8]]], fps: float, crf: tuple[int, int], budget_bytes: int
+) -> bytes:
+    """A video of at most ``budget_bytes``, if the worst quality allows; ``frames`` is called once per attempt. ``crf``:
+    x264's value of the best and of the worst quality, lower is better."""
+    quality, worst = crf
     while True:
-        content = mp4_bytes(frames(), encoding.fps, crf, encoding.preset)
-        if len(content) <= budget_bytes or crf >= encoding.last_crf:
+        content = mp4_bytes(frames(), fps, quality, "veryfast")
+        if len(content) <= budget_bytes or quality >= worst:
             return content
         # Six steps of the quality halve the size, about.
-        crf = min(encoding.last_crf, crf + max(1, math.ceil(6 * math.log2(len(content) / budget_bytes))))
+        quality = min(worst, quality + max(1, math.ceil(6 * math.log2(len(content) / budget_bytes))))
 
 
 def jpeg_bytes(picture: NDArray[np.uint8], quality: int) -> bytes:

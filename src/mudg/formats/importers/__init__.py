@@ -16,8 +16,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from mudg.base.plugins import load_plugin, plugins
 from mudg.base.types import Scene
+from mudg.base.versions import load_plugin, plugins
 from mudg.formats.importers.common import ImportOptions, LogFiles, foreign_numbers
 from mudg.formats.unknown_fields import named_once
 

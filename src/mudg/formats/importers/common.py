@@ -125,12 +125,11 @@ class ImportOptions:
     Args:
         frames: source frame numbers ``(first, end)``, end not included; None takes all.
         cameras: the dataset's camera names; empty takes the importer's default.
-        sequence: which sequence or frame of a folder that holds many.
-        poses, boxes: files to use instead of those found by looking.
+        sequence: which sequence of a folder that holds many. poses, boxes: files to use instead of those found.
         skip_missing: leave out frames of which an image, scan or vehicle pose is missing, instead of refusing.
         untwist: undo the distortion of scans by the vehicle's motion; auto decides by what the dataset documents.
         test_every: hold out every n-th frame of all cameras (n, 2n, ...); 0 holds out none.
-        resolution: size of the scene's images; None keeps the recorded one. See ``images.ImageFit``.
+        resolution: size of the scene's images; None keeps the recorded one.
         workers: threads that convert frames; 0 = as many as there are processors to use. Results do not depend on it.
     """
 
@@ -209,55 +208,36 @@ _MAX_LOG_S: Final = 4 * 3600.0
 def for_each(
     items: Iterable[Item],
     work: Callable[[Item], None],
-    *,
     title: str,
-    total: int | None = None,
-    workers: int = 1,
-    name: Callable[[Item], str] = str,
-) -> int:
-    """Do ``work`` on every item with a progress bar; at most two items per worker are in memory.
+    total: int,
+    workers: int,
+    name: Callable[[Item], str],
+) -> None:
+    """Do ``work`` on every item with a progress bar, in ``workers`` threads (0 = as many as there are processors to
+    use); at most two items per worker are in memory. ``items``: read lazily, by the calling thread. ``total``: their
+    number; 0 = unknown. ``name``: what an item is called, put before the place of an error.
 
-    Args:
-        items: read lazily, by the calling thread.
-        work: called from several threads if ``workers`` > 1.
-        total: number of items; None = ``len(items)``, or unknown for a generator.
-        workers: threads; 0 = as many as there are processors to use.
-        name: what an item is called, put before the place of an error.
-
-    Returns the number of items. Raises the error of the earliest failed item. No item is started after one failed;
-    those under way are waited for.
+    Raises the error of the earliest failed item. No item is started after one failed; those under way are waited for.
     """
-    if total is None:
-        total = len(items) if isinstance(items, Sequence) else 0
     workers = workers or native.default_threads()
-    done = 0
-    with log.task(title, total) as bar:
-        if workers == 1:
-            for item in items:
-                _named(work, item, name)
-                done += 1
+    pending: deque[Future[None]] = deque()
+    with log.task(title, total) as bar, ThreadPoolExecutor(workers, thread_name_prefix="importer") as pool:
+
+        def finish(left: int) -> None:
+            while len(pending) > left:
+                pending.popleft().result()
                 bar.advance()
-            return done
-        with ThreadPoolExecutor(workers, thread_name_prefix="importer") as pool:
-            pending: deque[Future[None]] = deque()
 
-            def finish(left: int) -> None:
-                while len(pending) > left:
-                    pending.popleft().result()
-                    bar.advance()
-
-            try:
-                for item in items:
-                    pending.append(pool.submit(_named, work, item, name))
-                    done += 1
-                    if any(future.done() and future.exception() for future in pending):
-                        break
-                    finish(2 * workers - 1)
-                finish(0)
-            finally:
-                for future in pending:
-                    future.cancel()
-    return done
+        try:
+            for item in items:
+                pending.append(pool.submit(_named, work, item, name))
+                if any(future.done() and future.exception() for future in pending):
+                    break
+                finish(2 * workers - 1)
+            finish(0)
+        finally:
+            for future in pending:
+                future.cancel()
 
 
 def foreign_numbers() -> np.errstate:
@@ -586,17 +566,10 @@ def the_only(
     expected: str,
     fits: Callable[[str], bool] | None = None,
 ) -> Item:
-    """The one log that ``options.sequence`` means.
-
-    Args:
-        found: name -> log, in the order in which messages list them.
-        kind: data set, and what one of its logs is called, as in "PandaSet sequence".
-        expected: what ``folder`` should hold, for the message if nothing is found.
-        fits: whether a name is meant; None = if it is the same.
-
-    Raises:
-        InputError: nothing is found. UsageError: several logs, or none fits.
-    """
+    """The one of ``found`` (name -> log, in the order in which messages list them) that ``options.sequence`` means.
+    ``kind``: data set, and what one of its logs is called, as in "PandaSet sequence". ``expected``: what ``folder``
+    should hold. ``fits``: whether a name is meant; None = if it is the same. Raises InputError: nothing is found.
+    UsageError: several logs, or none fits."""
     if not found:
         raise InputError(f"no {kind} found", where=str(folder), expected=expected, got=folder_contents(folder))
     wanted, names = options.sequence, list(found)

@@ -3,7 +3,7 @@ reads."""
 
 from __future__ import annotations
 
-from collections import Counter
+import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -385,13 +385,13 @@ def _id_of(item: Numbered) -> str:
     return f"{item[1].sensor}/{item[0]:06d}"
 
 
-def _moments(images: Sequence[LogItem]) -> dict[LogItem, int]:
-    """Image -> number of the image of the first camera that is nearest in time."""
-    if not images:
+def _moments(records: Sequence[LogItem]) -> dict[LogItem, int]:
+    """Record -> number of the record of the first one's sensor that is nearest in time."""
+    if not records:
         return {}
-    clock = np.array([image.time_s for image in images if image.sensor == images[0].sensor])
-    numbers = common.nearest_index(clock, np.array([image.time_s for image in images]))
-    return dict(zip(images, numbers.tolist(), strict=True))
+    clock = np.array([record.time_s for record in records if record.sensor == records[0].sensor])
+    numbers = common.nearest_index(clock, np.array([record.time_s for record in records]))
+    return dict(zip(records, numbers.tolist(), strict=True))
 
 
 def _chosen(content: CustomLog, options: ImportOptions) -> CustomLog:
@@ -401,15 +401,12 @@ def _chosen(content: CustomLog, options: ImportOptions) -> CustomLog:
     images = [image for image in content.images if image.sensor in names]
     sweeps = list(content.sweeps)
     if options.frames is not None:
-        clock = [image.time_s for image in images if image.sensor == names[0]]
-        window = clock[options.frames[0] : options.frames[1]]
-        if not window:
-            expected, got = f"0:{len(clock)}", str(options.frames)
+        count = sum(image.sensor == names[0] for image in images)
+        if options.frames[0] >= count:
+            expected, got = f"0:{count}", str(options.frames)
             raise UsageError("no frames in this range", where="--frames", expected=expected, got=got)
-        slack = float(np.median(np.diff(clock))) / 2 if len(clock) > 1 else 0.0
-        inside = (window[0] - slack - 1e-9, window[-1] + slack + 1e-9)
-        images = [image for image in images if inside[0] <= image.time_s <= inside[1]]
-        sweeps = [sweep for sweep in sweeps if inside[0] <= sweep.time_s <= inside[1]]
+        chosen = {record for record, n in _moments([*images, *sweeps]).items() if n in range(*options.frames)}
+        images, sweeps = ([record for record in records if record in chosen] for records in (images, sweeps))
     if options.skip_missing:
         images, sweeps = _usable(content, images), _usable(content, sweeps)
     cameras = {name: content.cameras[name] for name in names}
@@ -430,12 +427,8 @@ def _usable(content: CustomLog, records: list[LogItem]) -> list[LogItem]:
 
 
 def _numbered(records: Sequence[LogItem]) -> list[Numbered]:
-    counts: Counter[str] = Counter()
-    numbered = []
-    for record in records:
-        numbered.append((counts[record.sensor], record))
-        counts[record.sensor] += 1
-    return numbered
+    counts = {record.sensor: itertools.count() for record in records}
+    return [(next(counts[record.sensor]), record) for record in records]
 
 
 # --- one record -----------------------------------------------------------------------------------

@@ -1,16 +1,10 @@
-"""The one writer of imported scenes, and logs whose sensors run on their own clocks.
-
-Every importer ends in ``write_scene``: a ``SceneContent`` holds what is small (cameras, vehicle path, notes), and turns
-one item after another (a frame, an image, a sweep) into ``SceneImage`` and ``SceneSweep``.
-
-Formats whose sensors run on their own clocks fill a ``DriveLog`` instead: every image and sweep with its own time and
-pose in the map's frame, nothing decoded yet. ``write_log`` chooses frames and moves the world to the first vehicle
-pose. Frame n is the n-th image of one camera, the reference, and what was recorded nearer to it than to its neighbours;
-``--frames`` and the held-out split go by this number.
+"""The one writer of imported scenes: every importer ends in ``write_scene``. Formats whose sensors run on their own
+clocks fill a ``DriveLog``, whose frame n is the n-th image of its first camera and what was recorded nearest to it.
 """
 
 from __future__ import annotations
 
+import itertools
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -36,7 +30,7 @@ from mudg.formats.importers import common
 from mudg.formats.importers.common import ImportOptions
 from mudg.formats.importers.images import ImageFit, Lens, fit_images, image_notes
 from mudg.scene import motion
-from mudg.scene.clouds import FLOAT32_SPACING_M, at_sensor, float32_spacing_m
+from mudg.scene.clouds import at_sensor
 from mudg.scene.write import SceneWriter
 
 Matrix = NDArray[np.float64]
@@ -109,8 +103,8 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
     dataset = content.source.dataset
     types.foreign_name(content.name, f"{dataset}: name of the log")
     moments: list[tuple[int, str]] = []
-    rows: dict[str, list[tuple[int, int, float]]] = {}
-    """Sensor -> rows without return, all rows, and how far apart float32 numbers are at the farthest point, a sweep."""
+    lost: dict[str, list[tuple[int, int]]] = {}
+    """Sensor -> rows without a return, and all rows, of its sweeps."""
 
     def convert(item: Item) -> None:
         for part in content.convert(item):
@@ -121,8 +115,7 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
                     classes = None if points.classes is None else points.classes[~zeros]
                     xyz, intensity, dt_s = (values[~zeros] for values in (points.xyz, points.intensity, points.dt_s))
                     points = SweepPoints(xyz, intensity, dt_s, classes, points.no_returns + int(zeros.sum()))
-                counts = points.no_returns, points.no_returns + len(points.xyz), float32_spacing_m(points.xyz)
-                rows.setdefault(part.sensor, []).append(counts)
+                lost.setdefault(part.sensor, []).append((points.no_returns, points.no_returns + len(points.xyz)))
                 if len(points.xyz) == 0:
                     log.warn(f"{dataset}: {part.where or sweep_id} has no points")
                 writer.add_sweep(sweep_id, part.sensor, part.time_s, part.world_from_lidar, points)
@@ -136,19 +129,16 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
     with SceneWriter(out, content.name, content.source) as writer:
         for fit in content.fits.values():
             writer.add_camera(fit.camera)
-        title, total, workers = f"importing {dataset}", content.total, options.workers
-        common.for_each(content.items, convert, title=title, total=total, workers=workers, name=content.item_name)
+        total = content.total or (len(content.items) if isinstance(content.items, Sequence) else 0)
+        common.for_each(content.items, convert, f"importing {dataset}", total, options.workers, content.item_name)
         tracks, notes = content.tracks()
         tracks, turned = turned_back(tracks)
         notes = [*notes, *turned]
-        for sensor, counts in sorted(rows.items()):
-            without, total = sum(one[0] for one in counts), sum(one[1] for one in counts)
+        for sensor, counts in sorted(lost.items()):
+            without, total = (sum(numbers) for numbers in zip(*counts, strict=True))
             if without:
                 share = f"{without} of {total} points ({without / total:.1%})"
                 notes.append(f"{sensor}: {share} mark beams without a return and were left out")
-            if (spacing_m := max(one[2] for one in counts)) > FLOAT32_SPACING_M:
-                far = f"points reach so far from the sensor that float32 rounds them to {spacing_m * 1e3:.3g} mm"
-                log.warn(f"{sensor}: {far}; are they in the sensor's frame?")
         _log_notes(dataset, notes)
         writer.add_notes(notes)
         for track in tracks:
@@ -238,11 +228,8 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
     chosen = _outside_gaps(_without_missing(_choose_frames(drive, options), options), drive, options)
     records = sorted(chosen, key=lambda record: record.time_s)
     start_s, end_s = records[0].time_s, records[-1].time_s
-    counts: Counter[str] = Counter()
-    numbers: dict[Record, int] = {}
-    for record in records:
-        numbers[record] = counts[record.sensor]
-        counts[record.sensor] += 1
+    counts = {record.sensor: itertools.count() for record in records}
+    numbers = {record: next(counts[record.sensor]) for record in records}
     near = (drive.ego.times_s >= start_s - _EGO_MARGIN_S) & (drive.ego.times_s <= end_s + _EGO_MARGIN_S)
     if not near.any():
         raise InputError("no vehicle pose lies in the time of the chosen frames", where=drive.where)
@@ -352,10 +339,9 @@ def _outside_gaps(chosen: dict[Record, int], drive: DriveLog, options: ImportOpt
 
 # --- when a box was seen --------------------------------------------------------------------------
 #
-# A turning sensor meets an object some time before or after the sweep's time stamp, and people draw the box around the
-# points as the beams met them: it belongs to the mean time of the points inside it, not to the stamp it is filed under
-# (0.8 m at 10 m/s and 0.08 s). Each such box is moved by the track's velocity to the stamp, where points, too, are
-# brought by their ``dt_s``.
+# A turning sensor meets an object some time before or after the sweep's stamp, and people draw the box around points as
+# the beams met them: it belongs to the mean time of the points inside it (0.8 m at 10 m/s and 0.08 s), and is moved by
+# the track's velocity to the stamp, where points, too, are brought by their ``dt_s``.
 MOVES_M: Final = 1.0
 """A track whose box's centre visits a region of a longer diagonal moves; other boxes stay as they were drawn."""
 REACH_S: Final = 0.05
@@ -477,9 +463,9 @@ def box_size(length: Any, width: Any, height: Any, where: str) -> tuple[float, f
 
 
 class BoxTracks:
-    """Collects boxes in any order; ``tracks`` puts them together. ``where``: file or folder of the boxes, for messages.
-    ``labels``: the data set's class -> the label here. Other classes keep the last part (after a dot) of their name in
-    lower case, and are named once in the notes. ``max_gap_s``: an object that is not seen for longer is split."""
+    """Collects boxes in any order; ``tracks`` puts them together. ``where``: file or folder of the boxes. ``labels``:
+    the data set's class -> the label here; other classes keep the last part (after a dot) of their name in lower case,
+    and are named in the notes. ``max_gap_s``: an object that is not seen for longer is split."""
 
     def __init__(self, where: str, labels: Mapping[str, str], max_gap_s: float = MAX_GAP_S) -> None:
         self._where, self._labels, self._max_gap_s = where, labels, max_gap_s
@@ -510,16 +496,14 @@ class BoxTracks:
         late_s: float = 0.0,
         where: str = "",
     ) -> None:
-        """Add one box. Raises InputError: the size is not positive or absurd, or the id is longer than 200 bytes.
+        """Add one box of the object ``track``. Raises InputError: the size is not positive or absurd, or the id is
+        longer than 200 bytes.
 
         Args:
-            track: the object's id.
-            label: of ``label_of``. The track takes its commonest one.
-            size_m: length, width, height.
+            label: of ``label_of``; the track takes its commonest one. size_m: length, width, height.
             world_from_box: f64[4, 4], x forward, y left, z up, origin in the centre.
             standing: the data set says with every box of the object that it does not move in the whole log.
-            late_s: how long after ``time_s`` the box was measured. The track's key stands at ``time_s``, moved there
-                with the object's velocity.
+            late_s: how long after ``time_s`` the box was measured; it is moved there with the object's velocity.
             where: file and record, for messages.
         """
         foreign_name(track, f"{where or self._where}: id of an object")
@@ -533,17 +517,13 @@ class BoxTracks:
     def tracks(
         self, speeds: Speeds | None = None, images_s: Mapping[float, tuple[float, float]] | None = None
     ) -> tuple[list[Track], list[str]]:
-        """All tracks in the order of their first boxes, and notes.
+        """All tracks in the order of their first boxes, and notes. Raises InputError: an object has two boxes at one
+        moment; length and width are swapped.
 
         The size is the median over the track. What stands gets one pose (median place, mean heading) from its first to
         its last moment. What may move is split where it is not seen for more than ``max_gap_s``: ``7``, ``7.1``, ...
-
-        Args:
-            speeds: how velocities are found; None = from the neighbouring boxes of a piece.
-            images_s: time of a box -> times of the first and last image that show the object, which a track reaches to.
-
-        Raises:
-            InputError: an object has two boxes at one moment; length and width are swapped.
+        ``speeds``: how velocities are found; None = from the neighbouring boxes of a piece. ``images_s``: time of a box
+        -> times of the first and last image that show the object, which a track reaches to.
         """
         tracks: list[Track] = []
         split = 0

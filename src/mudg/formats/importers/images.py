@@ -1,13 +1,5 @@
-"""Recorded images -> images of a scene: lens distortion removed and size changed, in one place for all formats.
-
-A scene's cameras are pinhole cameras: projection, fusion and rasteriser know nothing else. So:
-
-* Images that are rectified already, at the recorded size, are kept byte for byte.
-* Distorted images are rectified here. The pinhole camera keeps the optical centre and has the lens' focal length, made
-  longer just as far as needed for every pixel to show something: a scene holds no black borders and needs no mask of
-  them. What falls outside is lost; the coefficients stay in ``Camera.distortion`` for the record.
-* A lens for which this costs more than ``MAX_FOCAL_GAIN``, or whose polynomial turns back inside the image, is refused.
-* ``resolution`` shrinks by averaging over the exact area of each new pixel; images are never enlarged.
+"""Recorded images -> images of a scene, whose cameras are pinhole cameras: lens distortion removed and size changed, in
+one place for all formats. Rectified images of the recorded size are kept byte for byte.
 """
 
 from __future__ import annotations
@@ -134,8 +126,9 @@ class ImageFit:
 
 
 def fit_images(camera: Camera, options: ImportOptions, lens: Lens | None = None) -> ImageFit:
-    """Plan what happens to the images of a camera. Raises InputError: the lens cannot be rectified like this.
-    UsageError: ``resolution`` is larger than the images.
+    """Plan what happens to the images of a camera. A lens' pinhole camera keeps the optical centre, and has its focal
+    length, longer just as far as needed for every pixel to show something. Raises InputError: the lens cannot be
+    rectified like this. UsageError: ``resolution`` is larger than the images.
 
     Args:
         camera: as recorded: size and intrinsics of the files; with a lens, its coefficients in ``distortion``.

@@ -1,28 +1,9 @@
-"""KITTI-360 importer: one drive of the data set's folder.
-
-========================== =========================================================================================
-``calibration/``           cameras, velodyne (``calib``)
-``data_2d_raw/<drive>/``   ``image_00|01/data_rect`` (rectified stereo)
-``data_3d_raw/<drive>/``   ``velodyne_points/data`` with ``timestamps.txt``
-``data_poses/<drive>/``    ``poses.txt`` (vehicle), for part of the frames
-``data_3d_bboxes/``        ``train_full/<drive>.xml``, else ``train/<drive>.xml`` (``boxes``)
-``data_2d_semantics/``     ``train/<drive>/image_00|01/semantic`` and ``confidence``, where there are any
-========================== =========================================================================================
-
-Frames. World: z up, origin and x axis at the vehicle of the first imported frame (the data set's own world lies
-kilometres away). The vehicle is the GPS/IMU. ``image_00`` is called ``front``.
-
-Time. All sensors of a frame share one moment, as the data set's own tools have it: the velodyne's time stamp. Poses are
-missing where the vehicle hardly moves; they are interpolated there. Frames before the first and after the last pose are
-left out.
-
-Scans are distorted by the vehicle's motion; they are untwisted here. The sensor turns clockwise seen from above in 0.1
-s and looks forward at the frame's moment (as the data set's tools have it).
+"""KITTI-360 importer: one drive of the data set's folder (docs/formats/kitti360.md). World: z up, origin and x at the
+vehicle (the GPS/IMU) of the first imported frame. All sensors of a frame share the velodyne's time stamp.
 """
 
 from __future__ import annotations
 
-import io
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -33,7 +14,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
 
 from mudg.base import log, store
 from mudg.base.errors import InputError
@@ -44,7 +24,7 @@ from mudg.formats.importers import common
 from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
 from mudg.formats.importers.drive_log import BoxTracks, SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.formats.importers.images import ImageFit, fit_images, image_notes, image_size
-from mudg.formats.importers.kitti_files import (
+from mudg.formats.importers.kitti import (
     SENSOR,
     line_numbers,
     pinhole_camera,
@@ -58,14 +38,13 @@ from mudg.formats.importers.kitti_files import (
     xml_elements,
 )
 from mudg.formats.unknown_fields import note_unknown
+from mudg.scene.labels import decode_grey
 from mudg.scene.motion import GAP_M
 
 # boxes --------------------------------------------------------------------------------------------
 #
-# ``data_3d_bboxes/*/<drive>.xml``: OpenCV-style matrices in XML, boxes in the world. An object's ``transform`` maps its
-# ``vertices`` (a unit cube for the classes read here) to the world and holds the size as scale. Static objects have
-# ``timestamp`` -1 and a window of frames; objects that move have one entry per frame. A file holds a hundred thousand
-# objects of all classes; it is read in pieces and only the classes of ``LABEL_OF`` are taken.
+# OpenCV-style matrices in XML. An object's ``transform`` maps its ``vertices`` (a unit cube) to the world and holds the
+# size as scale. Static objects have ``timestamp`` -1 and a window of frames; moving ones have an entry per frame.
 _IDS: Final = """car: 13; truck: 14; trailer: 15; caravan: 16; motorcycle: 17; bicycle: 18; person: 19; rider: 20;
     train: 33; bus: 34; unknown vehicle: 36"""
 LABEL_OF_ID: Final = {int(number): name for number, name in name_table(_IDS).items()}
@@ -404,7 +383,7 @@ def _labels(folder: Path, name: str, fit: ImageFit) -> dict[str, NDArray[Any]]:
     path = folder / "semantic" / name
     if not path.is_file():
         return {}
-    ids = _grey(path)
+    ids = decode_grey(store.read_bytes(path), str(path), (8, 16))
     if ids.dtype != np.uint8 or (ids[ids != UNLABELLED] > _LAST_ID).any():
         what = "semantic image holds ids that do not exist"
         raise InputError(what, where=str(path), expected=f"0..{_LAST_ID}, 8 bits")
@@ -413,23 +392,10 @@ def _labels(folder: Path, name: str, fit: ImageFit) -> dict[str, NDArray[Any]]:
     labels: dict[str, NDArray[Any]] = {"semantics": fit.ids(table[ids])}
     path = folder / "confidence" / name
     if path.is_file():
-        grey = _grey(path)
+        grey = decode_grey(store.read_bytes(path), str(path), (8, 16))
         scale = np.float32(255 if grey.dtype == np.uint8 else 65535)
         labels["semantics_confidence"] = fit.ids(grey.astype(np.float32) / scale)
     return labels
-
-
-def _grey(path: Path) -> NDArray[Any]:
-    """A PNG of one channel, u8 or u16 [H, W]."""
-    try:
-        with Image.open(io.BytesIO(store.read_bytes(path)), formats=("PNG",)) as image:
-            if image.mode not in ("L", "P", "I;16", "I"):
-                what = "label image is not grey"
-                raise InputError(what, where=str(path), got=f"mode {image.mode}", expected="8 or 16 bits")
-            array = np.array(image)
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError, EOFError) as error:
-        raise InputError("label image cannot be decoded (is it cut off?)", where=str(path), got=str(error)) from error
-    return array if array.dtype == np.uint8 else array.astype(np.uint16)
 
 
 def _read_tracks(

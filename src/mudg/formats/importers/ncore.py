@@ -31,11 +31,7 @@ from mudg.base import log, memory, store
 from mudg.base.errors import InputError, MudgError
 from mudg.base.geometry import all_rigid, from_rotation_translation
 from mudg.base.types import Camera, EgoPath, Scene, Shutter, Source, SweepPoints, Track
-from mudg.formats.importers import common
-from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
-from mudg.formats.importers.drive_log import BoxTracks, CameraOptics, DriveLog, ImageRecord, SweepRecord, write_log
-from mudg.formats.importers.images import Lens
-from mudg.formats.ncore import (
+from mudg.formats.exporters.ncore import (
     ABOUT,
     EGO_MASK,
     EULER,
@@ -50,6 +46,10 @@ from mudg.formats.ncore import (
     close,
     package,
 )
+from mudg.formats.importers import common
+from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
+from mudg.formats.importers.drive_log import BoxTracks, CameraOptics, DriveLog, ImageRecord, SweepRecord, write_log
+from mudg.formats.importers.images import Lens
 from mudg.formats.unknown_fields import known, note_unknown, note_unknown_within
 
 # container ----------------------------------------------------------------------------------------

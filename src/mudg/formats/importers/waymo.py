@@ -19,7 +19,6 @@ is that of the image recorded with the same pose (the front camera's).
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +26,6 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
 from scipy.spatial.transform import Rotation
 
 from mudg.base import log
@@ -55,6 +53,7 @@ from mudg.formats.importers.waymo_logs import (
     TfrecordLog,
     WaymoLog,
 )
+from mudg.scene.labels import decode_grey
 
 LICENCE: Final = "Waymo Dataset License Agreement for Non-Commercial Use (non-commercial; attribution)"
 TURN_S: Final = 0.1
@@ -379,15 +378,11 @@ def vehicle_from_cam(calibration: CameraCalibration) -> Matrix:
 def panoptic_ids(png: bytes, camera: Camera, where: str) -> NDArray[np.int32]:
     """Values of a panoptic label, i32[H, W]: class * divisor + instance. Raises InputError: no 16-bit PNG of the
     camera's size."""
-    try:
-        with Image.open(io.BytesIO(png), formats=("PNG",)) as image:
-            if image.size != (camera.width, camera.height) or not image.mode.startswith("I"):
-                what = "panoptic label is not a 16-bit image of its camera's size"
-                got = f"{image.width}x{image.height}, mode {image.mode}"
-                raise InputError(what, where=where, expected=f"{camera.width}x{camera.height}, 16 bits", got=got)
-            return np.array(image).astype(np.int32)
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
-        raise InputError("panoptic label cannot be decoded (is it cut off?)", where=where, got=str(error)) from error
+    ids = decode_grey(png, where, (16,))
+    if ids.shape != (camera.height, camera.width):
+        what, expected = "panoptic label is not of its camera's size", f"{camera.width}x{camera.height}"
+        raise InputError(what, where=where, expected=expected, got=f"{ids.shape[1]}x{ids.shape[0]}")
+    return ids.astype(np.int32)
 
 
 def _panoptic_labels(ids: NDArray[np.int32], divisor: int) -> dict[str, NDArray[Any]]:

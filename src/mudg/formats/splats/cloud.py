@@ -72,12 +72,10 @@ class SplatCloud:
     """Gaussians of one frame.
 
     Args:
-        means: f32[n, 3] metres; f64 from a reader, until an origin near them is taken away. quats: f32[n, 4] (w, x, y,
-            z) of length 1.
-        log_scales: f32[n, 3], natural logarithm of metres. logits: f32[n], opacity = sigmoid. sh: f32[n, K, 3], K = 1,
-            4, 9 or 16 harmonics of the directions of the same frame.
-        class_ids: u8[n] train ids (255 = unknown), or None. antialias: they are to be drawn antialiased, as they were
-            fitted.
+        means: f32[n, 3] metres; f64 from a reader, until an origin near them is taken away.
+        quats: f32[n, 4] (w, x, y, z) of length 1. log_scales: f32[n, 3], natural logarithm of metres.
+        logits: f32[n], opacity = sigmoid. sh: f32[n, K, 3], K = 1, 4, 9 or 16 harmonics of directions of this frame.
+        class_ids: u8[n] train ids (255 = unknown), or None. antialias: they are to be drawn antialiased.
     """
 
     means: Floats | Matrix
@@ -154,11 +152,9 @@ class SplatFile:
     """What the reader of a format finds in a file.
 
     Args:
-        cloud: Gaussians in the axes of the file, ``means`` f64.
-        axes: where x, y and z of the file point, a letter each (``cloud.py``), as the file states them; empty: it does
-            not.
-        axes_by: what states them. step_m: distance of neighbouring numbers in which most places are stored; 0 = not
-            worth a word.
+        cloud: Gaussians in the axes of the file, ``means`` f64. axes: where x, y and z of the file point, a letter
+            each, as ``axes_by`` states them; empty: nothing does.
+        step_m: distance of neighbouring numbers in which most places are stored; 0 = not worth a word.
         notes: what a person may want to know. warnings: what may have come in otherwise than its program meant it.
     """
 
@@ -175,14 +171,11 @@ class SplatNode:
     """Gaussians that move together.
 
     Args:
-        name: of the object; the first node of a scene is what stands. label: class name of the object, empty for what
-            stands.
-        size_m: length, width, height of its box.
-        cloud: Gaussians in the node's own frame (the world for what stands).
-        times_s, world_from_node: keys of its path, f64[K] and f64[K, 4, 4]; before the first and after the last the
-            node does not exist. No keys: it is always there, in the world. Between keys: straight lines, slerp.
-        displacement: f32[K, n, 3] metres in the node's frame, what its Gaussians are moved by at every key; linear
-            between; or None.
+        name: of the object; the first node of a scene is what stands. label: its class, empty for what stands.
+        size_m: length, width, height of its box. cloud: Gaussians in the node's own frame.
+        times_s, world_from_node: keys of its path, f64[K] and f64[K, 4, 4]; before the first and after the last it does
+            not exist, between keys are straight lines and slerp. No keys: it is always there, in the world.
+        displacement: f32[K, n, 3] metres in the node's frame, what its Gaussians are moved by at every key; or None.
     """
 
     name: str
@@ -221,11 +214,10 @@ class SplatScene:
     """What is written to a file of a whole scene.
 
     Args:
-        name: of the scene. nodes: what stands first.
-        file_from_world: rigid f64[4, 4]: from the axes of this program to those of the file. Nodes are in world axes.
+        name: of the scene. nodes: in world axes; what stands first.
+        file_from_world: rigid f64[4, 4]: from the axes of this program to those of the file.
         sky: u8[H, 2 H, 3] panorama: zenith in row 0, columns from longitude -pi to pi (growing to the left as one
-            looks), or None.
-        facts: JSON values for people (method, times, versions).
+            looks), or None. facts: JSON values for people (method, times, versions).
     """
 
     name: str

@@ -31,12 +31,7 @@ from mudg.formats.splats.cloud import (
     spacing_m,
 )
 
-# splat ---------------------------------------------------------------------------------------------
-#
-# The ``.splat`` of web viewers: no header, 32 bytes a Gaussian, no harmonics beyond degree 0.
-#
-# f32 x y z  f32 scale x y z (metres)  u8 r g b (colour of degree 0), opacity
-# u8 rotation w x y z = round((q + 1) / 2 * 255)
+# splat, of web viewers: f32 x y z, scales (metres); u8 r g b (of degree 0), opacity, round((wxyz + 1) / 2 * 255) ------
 
 
 _SPLAT_ROW: Final = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
@@ -204,8 +199,7 @@ def format_of(content: bytes, name: str) -> str:
 
 def read_cloud(content: bytes, name: str, choice: str = "file") -> tuple[SplatCloud, str]:
     """The Gaussians of a file in the axes of this program (z up), and the name of its format; ``means`` f64: take an
-    origin near them away before they become f32. Says on stderr what the file holds that was passed over or taken with
-    doubt.
+    origin near them away before they become f32. Says on stderr what was passed over or taken with doubt.
 
     Args:
         name: of the file, for messages and for formats without a mark. choice: of axes. ``file``: what the file says,

@@ -1,7 +1,5 @@
-"""glTF 2.0 with KHR_gaussian_splatting, as one GLB file; objects are nodes of their own, which an animation moves.
-
-Axes: y up; (x, y, z) of this program is (x, z, -y). Quaternions x, y, z, w; scales in metres; opacities 0 to 1; one
-accessor per harmonic. An animation's times begin at 0. Where an object does not exist, its node has the scale `HIDDEN`.
+"""glTF 2.0 with KHR_gaussian_splatting, as one GLB file, y up: (x, y, z) of this program is (x, z, -y). Objects are
+nodes of their own, which an animation from 0 s on moves; where one does not exist, its node has the scale ``HIDDEN``.
 """
 
 from __future__ import annotations
@@ -191,6 +189,11 @@ _READ: Final = (EXTENSION, "KHR_mesh_quantization", "KHR_node_visibility", "KHR_
 _ATTRIBUTE: Final = re.compile(
     r"POSITION|NORMAL|TANGENT|(TEXCOORD|COLOR|JOINTS|WEIGHTS)_\d+|" + re.escape(PREFIX) + r".*", re.DOTALL
 )
+_STANDARD: Final = frozenset(
+    """extensions extras name camera skin weights indices material mode targets max min cameras images materials
+    samplers skins textures""".split()
+)
+"""Fields of glTF 2.0 that are not read."""
 _ROUNDING: Final = 1e-3
 _MOST_JSON: Final = 64 << 20
 _DEPTH: Final = 32
@@ -202,61 +205,47 @@ Four = Annotated[list[Number], Field(min_length=4, max_length=4)]
 Sixteen = Annotated[list[Number], Field(min_length=16, max_length=16)]
 
 
-class _Part(ForeignRecord):
-    """An object of glTF 2.0: what is read has a type, further fields of the standard are ``Any``."""
-
-    extensions: dict[str, Any] = {}
-    extras: Any = None
-    name: Any = None
-
-
-class _Node(_Part):
+class _Node(ForeignRecord):
     children: list[Size] = []
     mesh: Size | None = None
     matrix: Sixteen | None = None
     rotation: Four = [0.0, 0.0, 0.0, 1.0]
     translation: Three = [0.0, 0.0, 0.0]
     scale: Three = [1.0, 1.0, 1.0]
-    camera: Any = None
-    skin: Any = None
-    weights: Any = None
+    extensions: dict[str, Any] = {}
 
 
-class _Primitive(_Part):
+class _Primitive(ForeignRecord):
     attributes: dict[str, Size]
-    indices: Any = None
-    material: Any = None
-    mode: Any = None
-    targets: Any = None
+    extensions: dict[str, Any] = {}
 
 
-class _Mesh(_Part):
+class _Mesh(ForeignRecord):
     primitives: list[_Primitive] = []
 
 
-class _Accessor(_Part):
+class _Accessor(ForeignRecord):
     bufferView: Size
     byteOffset: Size = 0
     componentType: Literal[5120, 5121, 5122, 5123, 5126]
     count: Size
     type: str
     normalized: bool = False
-    max: Any = None
-    min: Any = None
 
 
-class _View(_Part):
+class _View(ForeignRecord):
     buffer: Literal[0] = 0
     byteOffset: Size = 0
     byteLength: Size
     byteStride: Size = 0
+    extensions: dict[str, Any] = {}
 
 
-class _GltfScene(_Part):
+class _GltfScene(ForeignRecord):
     nodes: list[Size] = []
 
 
-class _Document(_Part):
+class _Document(ForeignRecord):
     asset: dict[str, Any] = {}
     extensionsUsed: list[str] = []
     extensionsRequired: list[str] = []
@@ -268,12 +257,6 @@ class _Document(_Part):
     bufferViews: list[_View] = []
     buffers: list[dict[str, Any]] = []
     animations: list[Any] = []
-    cameras: Any = None
-    images: Any = None
-    materials: Any = None
-    samplers: Any = None
-    skins: Any = None
-    textures: Any = None
 
 
 class _Splatting(ForeignRecord):
@@ -284,7 +267,6 @@ class _Splatting(ForeignRecord):
     projection: Any = None
     sortingMethod: Any = None
     extensions: dict[str, Any] = {}
-    extras: Any = None
 
 
 def from_bytes(content: bytes, where: str) -> SplatFile:
@@ -371,13 +353,18 @@ class _GlbFile:
             remedy = "write the file without it, or as SPZ"
             raise InputError(what, where=f"{where}: JSON", got=listed(unknown), expected=expected, remedy=remedy)
         self.passed = {name for name in self.document.extensionsUsed if name not in _READ}
-        self.passed.update(self.document.model_extra or ())
-        for kind in ("nodes", "accessors"):
-            for record in getattr(self.document, kind):
-                self.passed.update(f"{kind}.{name}" for name in record.model_extra)
         self.warnings = list[str]()
         generator = str(self.document.asset.get("generator", ""))[:60]
         self.generator = "".join(letter for letter in generator if letter.isprintable())
+        self.note("", self.document)
+        for node in self.document.nodes:
+            self.note("nodes.", node)
+        for accessor in self.document.accessors:
+            self.note("accessors.", accessor)
+
+    def note(self, within: str, record: ForeignRecord) -> None:
+        """Note the fields of a record that glTF does not have."""
+        self.passed.update(within + name for name in record.model_extra or () if name not in _STANDARD)
 
     def of_old_transform(self, before: int) -> bool:
         """Whether splat-transform of a major version below this one wrote the file."""
@@ -433,9 +420,9 @@ class _GlbFile:
             what, got = "the Gaussians of the GLB file are compressed", listed(compressed)
             expected, remedy = "attributes without compression", "write it without, or as SPZ"
             raise InputError(what, where=where, got=got, expected=expected, remedy=remedy)
-        self.passed.update(f"primitives.{name}" for name in primitive.model_extra or ())
+        self.note("primitives.", primitive)
         self.passed.update(f"attributes.{name}" for name in attributes if not _ATTRIBUTE.fullmatch(name))
-        self.passed.update(f"{EXTENSION}.{name}" for name in kind.model_extra or ())
+        self.note(f"{EXTENSION}.", kind)
         self.passed.update(f"{EXTENSION}.extensions.{name}" for name in kind.extensions)
         if kind.colorSpace is None:
             self.warnings.append("it names no colorSpace, which the standard requires: read as sRGB")

@@ -1,17 +1,6 @@
-"""The PLY of Gaussian splatting (Kerbl et al. 2023), which every viewer reads.
-
-    ply / format binary_little_endian 1.0 / element vertex N / property float x ... / end_header, then rows of f32:
-    x y z  nx ny nz (zero)  f_dc_0..2  f_rest_0..(3 (K - 1) - 1)  opacity (logit)  scale_0..2 (natural logarithm)
-    rot_0..3 (w x y z)
-
-``f_rest`` holds all red coefficients, then green, then blue. Columns of our own stand last (``class``: train id, 255 =
-unknown).
-
-Read besides: files without ``scale_2`` (2DGS: flat), ``filter_3D`` (Mip-Splatting: the least size that the recording
-resolved, which belongs to size and opacity), elements and lists of others, and what comments say of drawing and axes:
-
-    comment SplatRenderMode: mip      (Brush, gsplat; also written here)      comment antialiased 1 (Postshot)
-    comment Vertical Axis: z          (nerfstudio; also written here, where a file has the axes of this program)
+"""The PLY of Gaussian splatting (Kerbl et al. 2023): rows of f32 x y z, nx ny nz (zero), f_dc_0..2, f_rest (all red,
+all green, all blue), opacity (logit), scale_0..2 (natural logarithm), rot_0..3 (w x y z); a column ``class`` of our own
+(train id, 255 = unknown). What comments say of drawing and axes is read, and written where it differs from the usual.
 """
 
 from __future__ import annotations
@@ -326,15 +315,10 @@ def coefficient_major(rest: NDArray[np.float32]) -> NDArray[np.float32]:
 
 # compressed ply ------------------------------------------------------------------------------------
 #
-# The compressed PLY of SuperSplat and PlayCanvas: 16 bytes a Gaussian, values within the bounds of chunks of 256.
-#
-#     element chunk ceil(N / 256): min_x y z max_x y z  min_scale_x y z max_scale_x y z  min_r g b max_r g b   f32
-#     element vertex N: packed_position packed_rotation packed_scale packed_color                              u32
-#     element sh N: f_rest_0.., from degree 1 on                                                               u8
+# Of SuperSplat and PlayCanvas: 16 bytes a Gaussian, values within the f32 bounds of chunks of 256; harmonics as u8.
 #
 # Positions and scales (natural logarithm): 11, 10, 11 bits from the top. Rotation: 2 bits index of the largest of (w,
-# x, y, z), the others in order, 10 bits each, ``v / sqrt 2 + 0.5``. Colour: 8 bits each of the colour of degree 0
-# within the chunk, and opacity.
+# x, y, z), the others in order, 10 bits each, ``v / sqrt 2 + 0.5``. Colour of degree 0 and opacity: 8 bits each.
 
 
 CHUNK: Final = 256

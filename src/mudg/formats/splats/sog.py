@@ -16,6 +16,7 @@ import io
 import json
 import math
 import zipfile
+from collections.abc import Callable
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
@@ -107,9 +108,9 @@ def to_bytes(cloud: SplatCloud, antialias: bool = False) -> bytes:
     colors, color_index = codebook(cloud.sh[:, 0])
     opacity = np.round(cloud.opacity * 255.0)
     solid = np.full(len(cloud), 255)
-    columns = [(place & 255, solid), (place >> 8, solid), (turn,), (size_index, solid), (color_index, opacity)]
-    names = ("means_l.webp", "means_u.webp", "quats.webp", "scales.webp", "sh0.webp")
-    files = {name: np.column_stack(parts) for name, parts in zip(names, columns)}
+    parts = {"means_l": (place & 255, solid), "means_u": (place >> 8, solid), "quats": (turn,)}
+    parts |= {"scales": (size_index, solid), "sh0": (color_index, opacity)}
+    pictures = {f"{name}.webp": _webp(_laid_out(np.column_stack(columns))) for name, columns in parts.items()}
     meta: dict[str, Any] = {
         "version": 2,
         "count": len(cloud),
@@ -121,13 +122,12 @@ def to_bytes(cloud: SplatCloud, antialias: bool = False) -> bytes:
     }
     if antialias:
         meta |= {"antialias": True, "model": "antialiased"}  # for programs before and since splat-transform 3.2
-    pictures = {name: _webp(_laid_out(rgba.astype(np.uint8))) for name, rgba in files.items()}
     if cloud.degree:
         palette, labels = _palette(cloud.sh[:, 1:].reshape(len(cloud), -1))
         table, index = codebook(palette.reshape(len(palette), -1, 3))
         pictures["shN_centroids.webp"] = _webp(_centroid_picture(index))
         columns = np.column_stack([labels & 255, labels >> 8, np.zeros_like(labels), solid])
-        pictures["shN_labels.webp"] = _webp(_laid_out(columns.astype(np.uint8)))
+        pictures["shN_labels.webp"] = _webp(_laid_out(columns))
         meta["shN"] = {
             "count": len(palette),
             "bands": cloud.degree,
@@ -147,10 +147,8 @@ def codebook(values: NDArray[np.floating]) -> tuple[Array, NDArray[np.intp]]:
         codes = np.concatenate([distinct, np.full(CODES - len(distinct), distinct[-1])])
         return codes, np.searchsorted(distinct, flat).reshape(values.shape)
     sums = np.concatenate([[0.0], np.cumsum(ordered)])
-    codes = distinct[np.linspace(0, len(distinct) - 1, CODES).round().astype(int)] / 2
-    codes += (
-        ordered[np.linspace(0, len(ordered) - 1, CODES).round().astype(int)] / 2
-    )  # between even steps and even shares
+    spread = lambda values: values[np.linspace(0, len(values) - 1, CODES).round().astype(int)]
+    codes = spread(distinct) / 2 + spread(ordered) / 2  # between even steps and even shares
     for _ in range(4 * ROUNDS):
         edges = np.concatenate([[0], np.searchsorted(ordered, (codes[1:] + codes[:-1]) / 2), [len(ordered)]])
         count = np.diff(edges)
@@ -175,8 +173,8 @@ def _palette(rows: NDArray[np.float32]) -> tuple[Array, NDArray[np.int64]]:
     return palette, labels.astype(np.int64)
 
 
-def _laid_out(rgba: Picture) -> Picture:
-    """Rows u8[n, 4] as a picture nearly as wide as high, in steps of 4 pixels; the rest is 0."""
+def _laid_out(rgba: NDArray[Any]) -> Picture:
+    """Rows [n, 4] of whole numbers as a picture nearly as wide as high, in steps of 4 pixels; the rest is 0."""
     width = 4 * math.ceil(math.sqrt(len(rgba)) / 4)
     height = 4 * math.ceil(len(rgba) / width / 4)
     picture = np.zeros((height * width, 4), np.uint8)
@@ -249,8 +247,9 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
 def _harmonics(stated: SogHarmonics, pixels: _Pictures, where: str) -> Array:
     """Harmonics from degree 1 on, f64[count, K - 1, 3]."""
     coefficients = (stated.bands + 1) ** 2 - 1
-    wanted = (_WIDTH * coefficients, -(-stated.count // _WIDTH))
-    picture = pixels.picture(stated.files[0], wanted)
+    across, down = _WIDTH * coefficients, -(-stated.count // _WIDTH)
+    fits = lambda width, height: width == across and down <= height <= down + _WIDTH
+    picture = pixels.picture(stated.files[0], fits, f"{across}x{down}")
     palette = picture.reshape(-1, coefficients, 4)[: stated.count, :, :3]
     labels = pixels.rows(stated.files[1])[:, :2] @ np.array([1, 256])
     if len(labels) and int(labels.max()) >= stated.count:
@@ -268,31 +267,22 @@ class _Pictures:
 
     def rows(self, name: str) -> Picture:
         """The pixels of the Gaussians, u8[count, 4]."""
-        return self.picture(name, None).reshape(-1, 4)[: self._count]
+        fits = lambda width, height: self._count <= width * height <= 2 * self._count + (1 << 16)
+        return self.picture(name, fits, f"about {self._count} pixels").reshape(-1, 4)[: self._count]
 
-    def picture(self, name: str, size: tuple[int, int] | None) -> Picture:
-        """A picture u8[H, W, 4]; of a given width and least height, or with a pixel for every Gaussian and few more."""
-        where = f"{self._where}: {name}"
-        most = 16 * max(self._count, MAX_PALETTE) + (1 << 20)
+    def picture(self, name: str, fits: Callable[[int, int], bool], wanted: str) -> Picture:
+        """A picture u8[H, W, 4] whose width and height fit."""
+        where, most = f"{self._where}: {name}", 16 * max(self._count, MAX_PALETTE) + (1 << 20)
         content = binary.zip_member(self._archive, self._folder + name, most, self._where)
         try:
             with Image.open(io.BytesIO(content), formats=["WEBP", "PNG"]) as image:
-                width, height = image.size
-                self._refuse_size(width, height, size, where)
+                if not fits(*image.size):
+                    what, got = "a picture of the SOG file has an impossible size", f"{image.size[0]}x{image.size[1]}"
+                    raise InputError(what, where=where, expected=wanted, got=got)
                 self.lossy |= _lossy(content)
                 return np.asarray(image.convert("RGBA"))
         except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
             raise InputError("a picture of the SOG file is damaged", where=where, got=str(error)[:120]) from error
-
-    def _refuse_size(self, width: int, height: int, size: tuple[int, int] | None, where: str) -> None:
-        if size is not None:
-            fits = width == size[0] and size[1] <= height <= size[1] + _WIDTH
-        else:
-            fits = self._count <= width * height <= 2 * self._count + (1 << 16)
-        if not fits:
-            wanted = f"about {self._count} pixels" if size is None else f"{size[0]}x{size[1]}"
-            what = "a picture of the SOG file has an impossible size"
-            raise InputError(what, where=where, expected=wanted, got=f"{width}x{height}")
 
 
 def _lossy(content: bytes) -> bool:

@@ -1,8 +1,5 @@
-"""OpenUSD with ParticleField3DGaussianSplat (26.03 and later): text (.usda), or a package with the sky (.usdz).
-
-The stage is z up in metres, a time code is a millisecond. Every object is an Xform with translation, rotation and
-visibility over time; what deforms has positions over time. Quaternions are written w, x, y, z; scales in metres;
-opacities 0 to 1; harmonics Gaussian by Gaussian, the constant band first.
+"""OpenUSD with ParticleField3DGaussianSplat (26.03 and later): text (.usda), or a package with the sky (.usdz). z up in
+metres; a time code is a millisecond. Objects are Xforms that move over time; what deforms has positions over time.
 """
 
 from __future__ import annotations
