@@ -2,13 +2,13 @@
 
     python bench/published_memory.py
 
-Prints the table of docs/research/published.md. Gigabytes are 10^9 bytes; see `mudg/diffusion/memory_plan.py` for what
+Prints the table of docs/research/published.md. Gigabytes are 10^9 bytes; see `mudg/diffusion/published.py` for what
 is counted.
 """
 
 import sys
 
-from mudg.diffusion import memory_plan
+from mudg.diffusion import published
 from mudg.diffusion.published import PublishedConfig
 
 CUTS = (
@@ -20,22 +20,21 @@ CUTS = (
 BUDGETS_GB = (8, 10, 16, 24, 40, 80)
 
 
-def report(needs: memory_plan.Needs) -> list[str]:
+def report(needs: published.Needs) -> list[str]:
     """What each way of cutting the work takes, and what is chosen for some budgets."""
     lines = [f"  condition, latents and images of a clip {needs.clip / 1e9:19.2f} GB"]
     for label, batch in CUTS:
-        total = needs.parameters + needs.clip + needs.one_video * batch + memory_plan.RESERVE_BYTES
+        total = needs.parameters + needs.clip + needs.one_video * batch + published.RESERVE_BYTES
         lines.append(f"  denoising, {label:<36}{needs.one_video * batch / 1e9:7.2f} GB, in all {total / 1e9:6.2f} GB")
-    for frames in memory_plan.FRAMES_AT_ONCE:
+    for frames in published.FRAMES_AT_ONCE:
         lines.append(f"  autoencoder, {frames:2d} frames at once {needs.one_frame * frames / 1e9:24.2f} GB")
     for budget in BUDGETS_GB:
-        plan, peak_bytes = memory_plan.choose(needs, budget * 10**9)
+        plan, peak_bytes = published.choose(needs, budget * 10**9)
         way = [f"modalities {'together' if plan.modalities_together else 'apart'}"]
         way += [
             f"guidance {'together' if plan.guidance_together else 'apart'}",
             f"{plan.frames_at_once} frames per decoding",
         ]
-        way += ["tower offloaded"] if plan.offload else []
         fits = "" if peak_bytes <= budget * 1e9 else "  (does not fit)"
         lines.append(f"  budget {budget:2d} GB: {', '.join(way):<80}{peak_bytes / 1e9:5.1f} GB{fits}")
     return lines
@@ -45,7 +44,7 @@ def main() -> None:
     """Print."""
     for bytes_per_value, name in ((2, "bfloat16"), (4, "float32")):
         for height, width in ((320, 512), (576, 1024)):
-            needs = memory_plan.needs_of(PublishedConfig(height=height, width=width), bytes_per_value)
+            needs = published.needs_of(PublishedConfig(height=height, width=width), bytes_per_value)
             title = f"{height}x{width}x16, {name}: weights {needs.parameters / 1e9:.2f} GB"
             sys.stdout.write("\n".join([title, *report(needs)]) + "\n")
 

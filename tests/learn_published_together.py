@@ -9,29 +9,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ["GLOO_SOCKET_IFNAME"] = "lo"
 
 import torch.distributed as dist
-from toy_clips import before_each_batch
 from toy_published import published_settings
 
-from mudg.base.processes import Interruption
 from mudg.steps.synthesize import Learn
 
 rank, store, start, clips, out = int(sys.argv[1]), *sys.argv[2:5], Path(sys.argv[5])
 dist.init_process_group("gloo", init_method=f"file://{store}", rank=rank, world_size=2)
-common = {"frozen": "temporal_transformers", "steps": 3}
-asked = Interruption.requested
-
-
-def stop_after_two(step):
-    if step == 1:
-        Interruption.requested = property(lambda self: True)
-
-
-try:
-    with before_each_batch(stop_after_two):
-        Learn(out=out, settings=published_settings(start, clips, **common)).run()
-except KeyboardInterrupt:
-    Interruption.requested = asked
-else:
-    sys.exit("the run was not stopped")
-Learn(out=out, settings=published_settings(start, clips, **common, parallel="fsdp", recompute=True)).run()
+settings = published_settings(start, clips, frozen="temporal_transformers", steps=3, recompute=True)
+Learn(out=out, settings=settings).run()
 dist.destroy_process_group()

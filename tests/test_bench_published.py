@@ -18,12 +18,11 @@ from mudg.benchmarks import run as bench
 from mudg.benchmarks.rows import LONGER, RECORDED, TABLES, method_fit, method_rows
 from mudg.benchmarks.settings import BenchConfig, bench_preset
 from mudg.city.config import CityConfig
-from mudg.diffusion import published
+from mudg.diffusion import model_files
 from mudg.diffusion.condition import ConditionRules
-from mudg.diffusion.inputs import ConditionSources, conditions_of
 from mudg.diffusion.published_network import VideoUNet
 from mudg.diffusion.settings import SynthesizeConfig
-from mudg.diffusion.views import recorded_images
+from mudg.diffusion.views import ConditionSources, conditions_of, recorded_images
 from mudg.formats import ingest
 from mudg.formats.settings import IngestConfig
 from mudg.gaussians.settings import FitConfig
@@ -245,7 +244,7 @@ def sources(scene, tmp_path_factory):
 def test_a_part_that_is_switched_off_does_not_reach_a_published_type_network(
     weights, sources, parts, points, tokens, frame
 ):
-    model = published.load(weights[0])
+    model = model_files.load_published(weights[0])
     views, *all_sources = sources
 
     def latents(given):

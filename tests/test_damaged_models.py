@@ -24,7 +24,7 @@ from mudg.base.types import Camera
 from mudg.baselines.emernerf import load_field, save_field
 from mudg.baselines.emernerf_field import Budget
 from mudg.core.table import Table
-from mudg.diffusion import model_files, published
+from mudg.diffusion import model_files
 from mudg.gaussians.corrections import COLOR, Appearance
 from mudg.gaussians.storage import StartFit, all_classes, kind_of, load_appearance, save_appearance, save_model
 from mudg.labels import street_net
@@ -137,7 +137,7 @@ def copied(source: Path, folder: Path) -> Path:
 
 
 def read_all_of(folder: Path) -> None:
-    for read in (model_files.facts, model_files.uses_renders, published.is_published):
+    for read in (model_files.facts, model_files.uses_renders, model_files.is_published):
         ends_in_words(lambda read=read: read(folder))
 
 
@@ -146,7 +146,7 @@ READERS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object]]] = {
     "radiance field": (saved_field, load_field),
     "diffusion model": (lambda folder: copied(model_files.EMBEDDED["embedded-tiny"], folder), model_files.load),
     "diffusion model's facts": (lambda folder: copied(model_files.EMBEDDED["embedded-tiny"], folder), read_all_of),
-    "published model": (lambda folder: copied(write_tiny(folder), folder), published.load),
+    "published model": (lambda folder: copied(write_tiny(folder), folder), model_files.load_published),
     "segmenter": (lambda folder: copied(street_net.EMBEDDED, folder), street_net.load),
 }
 

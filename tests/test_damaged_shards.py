@@ -49,7 +49,7 @@ PER_ARRAY: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 def read_whole(path: Path) -> None:
-    for clip in range(clip_shards.clips_at(path)):
+    for clip in range(clip_shards.counts_at(path)[0]):
         clip_shards.clip_at(path, clip, range(4))
 
 
@@ -65,7 +65,7 @@ def test_a_damaged_shard_is_refused(kind: str, whole: bytes, tmp_path: Path) -> 
     (tmp_path / "shard").write_bytes(DAMAGE[kind](whole, load(whole)))
     if kind == "no clip":
         with pytest.raises(InputError, match="damaged"):
-            clip_shards.clips_at(tmp_path / "shard")
+            clip_shards.counts_at(tmp_path / "shard")
     with pytest.raises(InputError) as refused:
         read_whole(tmp_path / "shard")
     assert str(tmp_path / "shard") in refused.value.where
@@ -101,11 +101,10 @@ def test_values_that_cannot_be_are_refused(name: str, value: float, whole: bytes
         read_whole(tmp_path / "shard")
 
 
-@pytest.mark.parametrize(("kind", "number"), [("cut off", 2), ("no array", 3)])
-def test_learn_finds_a_damaged_shard_before_it_begins(kind: str, number: int, tmp_path: Path) -> None:
+def test_learn_finds_a_damaged_shard_before_it_begins(tmp_path: Path) -> None:
     clips = write_clips(tmp_path / "clips")
-    path = sorted(clips.iterdir())[number]
-    path.write_bytes(DAMAGE[kind](path.read_bytes(), {}))
+    path = sorted(clips.iterdir())[2]
+    path.write_bytes(DAMAGE["cut off"](path.read_bytes(), {}))
     with pytest.raises(InputError, match="damaged") as refused:
         Learn(out=tmp_path / "out", settings=tiny(clips)).run()
     assert str(path) in refused.value.where

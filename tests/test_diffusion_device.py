@@ -19,18 +19,16 @@ from toy_scene import ToyStreet
 from mudg.base import log, store
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.types import Condition
-from mudg.diffusion import memory_plan, model_files, parallel
+from mudg.diffusion import model_files, parallel
 from mudg.diffusion.model import MDM
 from mudg.diffusion.models import model_config
-from mudg.diffusion.published import WorkSplit
-from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated
+from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated, half_format
 from mudg.diffusion.settings import SynthesizeConfig
-from mudg.diffusion.views import check_config, load_any
+from mudg.diffusion.views import check_config
 from mudg.labels.depth_networks import Preparation, TransformersDepth
 from mudg.labels.inputs import DepthInput
 from mudg.labels.segmenters import Segmenter
 from mudg.labels.settings import AnnotateConfig
-from mudg.scene.observations import read_observations
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.steps.ingest import Annotate, Fuse
@@ -111,21 +109,16 @@ def test_a_clip_of_the_small_model_is_the_same_on_a_device_and_crosses_once(smal
     assert crossed(seen, "back") == sorted(back + latents + fits)
 
 
-@pytest.mark.parametrize("guidance", [pytest.param(1.0, marks=pytest.mark.slow), 7.5])
-def test_a_clip_of_the_published_kind_is_the_same_on_a_device_and_crosses_once(guidance):
-    model, condition, request = tiny_model(), some_condition(), SampleRequest(3, 5, guidance=guidance)
+def test_a_clip_of_the_published_kind_is_the_same_on_a_device_and_crosses_once():
+    model, condition, request = tiny_model(), some_condition(), SampleRequest(2, 5)
     here = generated(model, condition, request)
     with pretend_device() as there:
         model.to(there)
         with transfers() as seen:
             made = generated(model, condition, request)
-        check_same_clip(here, made)
-        model.split = WorkSplit(guidance_together=False, frames_at_once=1, offload=True)
-        model.image.to("cpu")
-        check_same_clip(here, generated(model, condition, request))
-        assert model.image.whole.device.type == "cpu"  # the tower went back
+    check_same_clip(here, made)
     latent = here.latents["rgb"].numel()
-    posterior, noise = [latent] * 2, [3 * latent] * 4  # of both planes; at the start and after each step
+    posterior, noise = [latent] * 2, [3 * latent] * 3  # of both planes; at the start and after each step
     palette = [19 * 3]
     given = [x.numel() for x in tensors_of(condition)]
     # besides: labels, statistics of colours
@@ -178,27 +171,6 @@ def labelled(street, out, config):
     return read_scene(Annotate(scene=street / "scene", out=out, settings=config).run())
 
 
-@pytest.mark.slow
-def test_synthesize_on_a_device_writes_the_same_views(small, street, tmp_path):
-    model_files.save(small, tmp_path / "model", "", {})
-    how = {"steps": 2, "device": "cpu", "precision": "float32", "processes": 1}
-    config = SynthesizeConfig(shifts_m=(1.0, -1.0), model=str(tmp_path / "model"), **how)
-    here = synthesized(street, tmp_path / "here", config)
-    with pretend_device():
-        elsewhere = replace(config, device="pretend", processes=0)
-        there = synthesized(street, tmp_path / "there", elsewhere)
-        with pytest.raises(UsageError, match="one process makes all trajectories"):
-            synthesized(street, tmp_path / "more", replace(elsewhere, processes=2))
-        again = synthesized(street, tmp_path / "here", replace(elsewhere, processes=1))
-    assert again == here  # where a result was computed is no part of what it is
-    for name in ("front_shift+1.0", "front_shift-1.0"):
-        a, b = read_observations(here / name), read_observations(there / name)
-        assert len(a) == len(b) == 5
-        for i in range(5):
-            assert far_apart(a[i].rgb, b[i].rgb) < 1.01 / 255
-            assert (a[i].semantics != b[i].semantics).float().mean() < 1e-2
-
-
 def in_float16(folder):
     how = {"steps": 2, "guidance": 1.0, "device": "cpu", "precision": "float16"}
     return SynthesizeConfig(shifts_m=(1.0,), model=str(write_tiny(folder)), **how)
@@ -212,18 +184,6 @@ def test_float16_is_refused_on_the_cpu_and_for_other_models(street, tmp_path):
     with pretend_device(), pytest.raises(UsageError, match="another model on pretend"):
         synthesized(street, out, replace(config, model="embedded-tiny", guidance=None, device="pretend"))
     assert not out.exists()
-
-
-@pytest.mark.slow
-def test_weights_and_views_of_published_type_models_are_in_float16_on_cards(street, tmp_path):
-    config, out = in_float16(tmp_path), tmp_path / "out"
-    here = synthesized(street, tmp_path / "here", replace(config, precision="float32"))
-    with pretend_device():
-        assert load_any(replace(config, device="pretend")).dtype == torch.float16
-        there = synthesized(street, out, replace(config, device="pretend"))
-    a, b = read_observations(here / "front_shift+1.0"), read_observations(there / "front_shift+1.0")
-    apart = [float((a[i].rgb - b[i].rgb).abs().mean()) for i in range(5)]
-    assert 0 < max(apart) < 0.02  # measured: see the message of a failure
 
 
 class Plain(torch.nn.Module):
@@ -298,10 +258,10 @@ def test_processes_take_a_device_each_and_the_number_format_follows_it(monkeypat
     card, apple = torch.device("cuda", 0), torch.device("mps", 0)
     for capability, half, narrow in (((8, 0), torch.bfloat16, torch.bfloat16), ((7, 5), None, torch.float16)):
         monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _, found=capability: found)
-        assert memory_plan.half_format("auto", card) == half
-        assert memory_plan.half_format("auto", card, float16=True) == narrow
-        assert memory_plan.choose_bf16("bfloat16", card) and not memory_plan.choose_bf16("float32", card)
-    assert not memory_plan.choose_bf16("auto", apple)
+        assert half_format("auto", card) == half
+        assert half_format("auto", card, float16=True) == narrow
+        assert half_format("bfloat16", card) == torch.bfloat16 and half_format("float32", card) is None
+    assert half_format("auto", apple) is None
     assert "diffusion model: bfloat16 (cuda:0 has bfloat16)" in said
     assert "diffusion model: float16 (cuda:0 has no bfloat16)" in said
     assert said[-1] == "diffusion model: float32 (on mps:0)"

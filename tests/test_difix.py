@@ -18,8 +18,8 @@ from mudg.benchmarks.settings import BenchConfig
 from mudg.diffusion import condition as conditions
 from mudg.diffusion import views
 from mudg.diffusion.condition import ConditionRules
-from mudg.diffusion.inputs import ConditionSources, conditions_of
 from mudg.diffusion.settings import SynthesizeConfig
+from mudg.diffusion.views import ConditionSources, conditions_of
 from mudg.gaussians.recipes import recipe_of
 from mudg.gaussians.settings import METHODS, FitConfig
 from mudg.steps.fit import Fit

@@ -27,11 +27,10 @@ from mudg.core.weather.gbuffer import Surroundings
 from mudg.core.weather.light import srgb_decode, srgb_encode
 from mudg.diffusion import condition as clip_parts
 from mudg.diffusion import model_files as files
-from mudg.diffusion.condition import ConditionRules, build_conditions, image_tensor
-from mudg.diffusion.inputs import ConditionSources, InWeather, conditions_of
+from mudg.diffusion.condition import ConditionRules, InWeather, build_conditions, image_tensor
 from mudg.diffusion.model import MDM
 from mudg.diffusion.settings import SynthesizeConfig
-from mudg.diffusion.synthesize import JobInputs, view_maker
+from mudg.diffusion.views import ConditionSources, JobInputs, conditions_of, view_maker
 from mudg.editing.edit import boxes_mask, cleared_cloud, photos_of_edited, vacated_at
 from mudg.editing.plan import Actor, EditPlan, EditWorld, plan_edits
 from mudg.editing.render import REPAIR_STEPS, RenderMixer, off_path_m

@@ -87,7 +87,7 @@ def test_the_whole_image_is_one_pass_and_memory_that_of_a_tile(monkeypatch):
     once = finisher(enlarged, given, 2, torch.full((2,), 2.0))
     whole = finish_in_tiles(finisher, made, given.color.shape[-2:], given.crop)
     assert torch.allclose(whole.rgb, once.rgb, atol=1e-6)
-    assert torch.equal(whole.ids[:, 0], once.shares.argmax(1).to(torch.uint8))
+    assert torch.equal(whole.ids[:, 0], once.shares().argmax(1).to(torch.uint8))
     forward, seen = finisher.forward, []
     noted = lambda made, given, *rest: (seen.append(given.color.shape), forward(made, given, *rest))[1]
     monkeypatch.setattr(finisher, "forward", noted)
@@ -134,13 +134,13 @@ def test_it_starts_as_fixed_shares_of_its_sources_and_an_unknown_class_takes_non
     clip, measured, render = torch.tensor([2.0, 0, -2]).softmax(0).tolist()
     depth = clip * made.depth_code + measured * given.depth_code + render * given.render_code
     assert torch.allclose(done.depth_code, depth, atol=1e-5)
-    assert torch.equal(done.shares.argmax(1, keepdim=True), made.ids.long())
+    assert torch.equal(done.shares().argmax(1, keepdim=True), made.ids.long())
     assert torch.allclose(done.log_error, made.log_error)
     finisher, given, made = Finisher((8, 16), (1, 1)), some_pixels(16, 16), some_made(16, 16)
     unknown = torch.full_like(given.ids, 255)
     done = finisher(made, replace(given, ids=unknown, backdrop_ids=unknown, render_ids=unknown), 2, torch.ones(2))
     share = float(torch.tensor([2.0, 0, -2, 0]).softmax(0)[0])
-    assert torch.allclose(done.shares.sum(1), torch.full((2, 16, 16), share), atol=1e-5)
+    assert torch.allclose(done.shares().sum(1), torch.full((2, 16, 16), share), atol=1e-5)
     assert bool(torch.isfinite(network.class_scores(done)).all())
 
 
@@ -158,7 +158,7 @@ def test_it_can_copy_each_source(source):
     colors = (made.rgb, given.color, given.backdrop, given.render)
     classes = (made.ids, given.ids, given.backdrop_ids, given.render_ids)
     assert torch.allclose(done.rgb, colors[source], atol=1e-5)
-    assert torch.equal(done.shares.argmax(1, keepdim=True), classes[source].long())
+    assert torch.equal(done.shares().argmax(1, keepdim=True), classes[source].long())
     if depth_source is not None:
         depths = (made.depth_code, given.depth_code, given.render_code)
         assert torch.allclose(done.depth_code, depths[depth_source], atol=1e-5)

@@ -14,7 +14,7 @@ from test_score_metrics import lpips_state
 from toy_published import TINY, tiny_checkpoint
 
 from mudg.base import store
-from mudg.diffusion import published
+from mudg.diffusion import model_files
 from mudg.scene.observations import list_observation_sets, read_observations
 from mudg.steps.settings import PRESETS
 
@@ -50,7 +50,7 @@ def test_from_a_published_checkpoint_to_a_table_of_the_paper(mudg, tmp_path):
     mudg("fuse log/scene --out log/fuse")
 
     mudg("convert 512-mdm-checkpoint.ckpt --to models/start --dtype bfloat16", TOY)
-    start = published.load(tmp_path / "models" / "start")
+    start = model_files.load_published(tmp_path / "models" / "start")
     assert (start.config.width, start.config.height) == (512, 320) and start.config.net == TINY.net
 
     training = (
@@ -61,7 +61,7 @@ def test_from_a_published_checkpoint_to_a_table_of_the_paper(mudg, tmp_path):
     mudg(f"learn --start models/start --data.width 32 --data.height 32 {training} --out one")
     frozen = "--data.width 36 --data.height 32 --frozen temporal_transformers"
     mudg(f"learn --start one/model {frozen} {training} --out two")
-    one, two = (published.load(tmp_path / name / "model") for name in ("one", "two"))
+    one, two = (model_files.load_published(tmp_path / name / "model") for name in ("one", "two"))
     assert ((one.config.width, one.config.height), (two.config.width, two.config.height)) == ((32, 32), (36, 32))
     before, after = (model.trained_part().state_dict() for model in (one, two))
     unchanged = {name for name in before if torch.equal(before[name], after[name])}

@@ -15,7 +15,7 @@ import mudg
 from mudg.base.errors import ResourceError
 from mudg.base.types import Camera, Condition, Trajectory, View
 from mudg.core.metrics import Pair
-from mudg.diffusion import synthesize
+from mudg.diffusion import views as generating
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing import render
 from mudg.networks import featnets
@@ -59,16 +59,16 @@ def test_trajectories_are_made_one_after_another_where_memory_lasts_for_one(
     camera = Camera("front", 3840, 2160, 2000.0, 2000.0, 1920.0, 1080.0)
     views = (View(camera, np.eye(4), 0.0),) * 3
     paths = [Trajectory(f"front_shift+{n}.0", views, None) for n in (2, 3)]
-    monkeypatch.setattr(synthesize.native, "default_threads", lambda: 2)
+    monkeypatch.setattr(generating.native, "default_threads", lambda: 2)
     said: list[str] = []
-    monkeypatch.setattr(synthesize.log, "info", said.append)
+    monkeypatch.setattr(generating.log, "info", said.append)
     for free_gib, expected in ((64, 2), (8, 1), (1, 1), (0, 2)):
-        monkeypatch.setattr(synthesize.memory, "free_bytes", lambda f=free_gib: f << 30)
-        assert synthesize.usual_processes(SynthesizeConfig(device="cpu"), paths) == expected
+        monkeypatch.setattr(generating.memory, "free_bytes", lambda f=free_gib: f << 30)
+        assert generating.usual_processes(SynthesizeConfig(device="cpu"), paths) == expected
     assert len(said) == 2 and "8.0 GiB are free" in said[0]
     assert "1 of 2 processes: at 3840x2160 each takes about" in said[0]
-    monkeypatch.setattr(synthesize.memory, "free_bytes", lambda: 8 << 30)
-    assert synthesize.usual_processes(SynthesizeConfig(device="cpu", full_size=False), paths) == 2
+    monkeypatch.setattr(generating.memory, "free_bytes", lambda: 8 << 30)
+    assert generating.usual_processes(SynthesizeConfig(device="cpu", full_size=False), paths) == 2
 
 
 def test_tiles_of_a_condition_are_those_of_the_whole() -> None:

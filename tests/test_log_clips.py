@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 from refusals import refused
-from toy_clips import tiny, write_clips
+from toy_clips import tiny
 from toy_scene import ToyStreet
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Source, View
 from mudg.core import losses
-from mudg.diffusion import clips, learn, log_clips, models
+from mudg.diffusion import clips, learn, log_clips, model_files, models
 from mudg.diffusion.city_clips import HELD_OUT
 from mudg.diffusion.log_clips import LogClipRules, LogSource
 from mudg.diffusion.model import MDM
@@ -136,14 +136,14 @@ def depth_term(truth):
 def test_unknown_depth_has_no_part_in_the_loss(measured, tmp_path):
     opened = log_clips.OpenLog(measured[1], replace(RULES, width=64, height=32))
     window = log_clips.log_windows(opened.scene, RULES)[0]
-    clips.write_shard(tmp_path, 0, clips.pack_clips([log_clips.make_clip(opened, window, 0)], gaps=True))
+    clips.write_shard(tmp_path, 0, [log_clips.make_clip(opened, window, 0)], gaps=True)
     model = MDM(models.model_config(tiny(tmp_path, width=64, height=32, window=3)))
-    clip = clips.read_clip(tmp_path, 0, 0, range(3))
+    clip = clips.ShardFolder(tmp_path).clip(0, 0, range(3))
     assert not bool(clip.depth_valid.all())
 
     def term(depth, known):
         filled = replace(clip, depth=torch.where(known, clip.depth, depth))
-        return depth_term(model.encode_truth([filled]).pixels)
+        return depth_term(model.pixel_truth([filled]))
 
     assert term(torch.tensor(3.0), clip.depth_valid) == term(torch.tensor(90.0), clip.depth_valid)
     assert term(torch.tensor(3.0), ~clip.depth_valid) != term(torch.tensor(90.0), ~clip.depth_valid)
@@ -154,9 +154,9 @@ def test_unknown_depth_has_no_part_in_the_loss(measured, tmp_path):
 
 
 def test_a_model_goes_on_learning_on_a_log(log, tmp_path):
-    small = write_clips(tmp_path / "clips")
-    first = Learn(out=tmp_path / "first", settings=tiny(small, steps=1)).run()
-    run = tmp_path / "run"
+    first, run = tmp_path / "first", tmp_path / "run"
+    plain = replace(models.model_config(tiny("")), renders=False, finish_widths=(), finish_blocks=())
+    model_files.save(MDM(plain), first, "card", {})
     run.mkdir()
     for name, folder in (("scene", log[1].scene), ("fuse", log[1].fused)):
         (run / name).symlink_to(folder)
@@ -214,8 +214,8 @@ def test_annotated_depth_is_learned_with_its_confidence(annotated, tmp_path, pub
     bare = lambda frame: replace(frame, labels={name: ref for name, ref in frame.labels.items() if name != "depth"})
     alone._frames = [bare(frame) for frame in alone._frames]
     window = log_clips.log_windows(opened.scene, rules)[0]
-    clips.write_shard(tmp_path, 0, clips.pack_clips([log_clips.make_clip(opened, window, 0)], gaps=True))
-    clip, sweep = clips.read_clip(tmp_path, 0, 0, range(3)), log_clips.make_clip(alone, window, 0)
+    clips.write_shard(tmp_path, 0, [log_clips.make_clip(opened, window, 0)], gaps=True)
+    clip, sweep = clips.ShardFolder(tmp_path).clip(0, 0, range(3)), log_clips.make_clip(alone, window, 0)
     assert sweep.depth_confidence is None and 0.05 < float(sweep.depth_valid.float().mean()) < 0.8
     measured = sweep.depth_valid
     assert torch.allclose(clip.depth[measured], sweep.depth[measured], rtol=1e-3)

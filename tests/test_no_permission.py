@@ -125,7 +125,8 @@ def test_clips_that_cannot_be_written_are_refused_before_any_is_made(open_folder
 
     def begin() -> int:
         try:
-            with learn.making_clips(learn.clips_of_cities(config, open_folder / "clips"), learn.city_rules(config)):
+            clips, rules = open_folder / "clips", learn.city_rules(config)
+            with learn.making_clips(learn.clips_of_cities(config, clips), clips, rules):
                 return 0
         except ResourceError as error:
             return error.exit_code

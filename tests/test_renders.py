@@ -18,7 +18,7 @@ from mudg.diffusion import city_clips, clips
 from mudg.diffusion import condition as conditions
 from mudg.diffusion import model as mdm
 from mudg.diffusion.city_clips import CityClipRules
-from mudg.diffusion.condition import build_conditions
+from mudg.diffusion.condition import FAR_M, REACH_PX, SURE_ALPHA, build_conditions
 from mudg.diffusion.models import extended
 from mudg.diffusion.requests import SampleRequest
 
@@ -52,7 +52,7 @@ def test_renders_tell_the_depth_beyond_the_reach_of_measured_pixels():
     plain = build_conditions(cloud, [], [view], [], RULES)[0]
     helped = build_conditions(cloud, [], [view], [], RULES, render_at=render)[0]
     measured = plain.valid[0, 0]
-    near = torch.from_numpy(ndimage.binary_dilation(measured.numpy(), iterations=RULES.measured_reach_px))
+    near = torch.from_numpy(ndimage.binary_dilation(measured.numpy(), iterations=REACH_PX))
     assert bool((near & ~measured).any()) and bool((~near).any())
     assert torch.equal(helped.valid, plain.valid)
     assert torch.equal(helped.depth[0, 0][near], plain.depth[0, 0][near])
@@ -78,11 +78,11 @@ def test_the_outline_of_a_measured_surface_is_that_of_the_render(alpha, depth):
     board = np.zeros_like(measured)
     board[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1] = True
     assert (board & ~measured).sum() > 50
-    beside = ndimage.binary_dilation(measured, iterations=RULES.measured_reach_px) & ~board
+    beside = ndimage.binary_dilation(measured, iterations=REACH_PX) & ~board
     assert beside.sum() > 50
     z = made.depth[0, 0].numpy()
     assert np.allclose(z[board], 12.0)
-    assert np.allclose(z[beside], depth if alpha > RULES.sure_alpha and depth != 12.5 else 12.0)
+    assert np.allclose(z[beside], depth if alpha > SURE_ALPHA and depth != 12.5 else 12.0)
 
 
 def test_what_a_render_shows_in_the_box_of_an_object_moves_with_it():
@@ -108,7 +108,7 @@ def test_what_a_render_shows_in_the_box_of_an_object_moves_with_it():
 def test_what_the_render_hardly_covers_is_far_away(alpha, depth, expected):
     render_at = lambda view: flat_render(view, depth, alpha)
     made = build_conditions(NOTHING, [], [view_at()], [], RULES, render_at=render_at)[0]
-    assert not bool(made.valid.any()) and bool((made.depth == (expected or RULES.far_m)).all())
+    assert not bool(made.valid.any()) and bool((made.depth == (expected or FAR_M)).all())
     published = build_conditions(NOTHING, [], [view_at()], [], replace(RULES, published=True), render_at=render_at)[0]
     assert published.renders is None and not bool(published.depth.any())
 
@@ -135,9 +135,7 @@ def test_a_hole_below_the_horizon_is_no_sky(recorded, above):
     assert all(bool((x[below] == 2).all()) for x in (ids, shown.semantics[0, 0])) and bool((depth[below] < 12.01).all())
     assert not torch.allclose(shown.color[0][:, below], torch.tensor([0.5, 0.7, 1.0]).view(3, 1, 1), atol=0.1)
     if above == "far":
-        assert bool((depth[top] == rules.far_m).all()) and torch.equal(
-            shown.color[0][:, top], empty(view).color[:, top]
-        )
+        assert bool((depth[top] == FAR_M).all()) and torch.equal(shown.color[0][:, top], empty(view).color[:, top])
     else:
         assert bool((depth[top] < 12.01).all()) and bool((ids[top] == 2).all())
 
@@ -238,9 +236,9 @@ def same_planes(read, planes, frames):
 def test_shards_give_back_renders_and_patches(tmp_path):
     first, second = (with_patch(made_up_clip(n), row=4 + n, column=7 + 2 * n, scale=2) for n in (0, 1))
     bare = replace(second, condition=replace(second.condition, renders=None))
-    clips.write_shard(tmp_path, 0, clips.pack_clips([first, bare]))
+    clips.write_shard(tmp_path, 0, [first, bare])
     frames = [1, 3]
-    read, other = (clips.read_clip(tmp_path, 0, n, frames) for n in (0, 1))
+    read, other = (clips.ShardFolder(tmp_path).clip(0, n, frames) for n in (0, 1))
     same_planes(read.condition.renders, first.condition.renders, frames)
     assert other.condition.renders is None
     for found, clip in ((read, first), (other, second)):
@@ -251,8 +249,8 @@ def test_shards_give_back_renders_and_patches(tmp_path):
         assert torch.equal(found.fine.clip.condition.valid, clip.fine.clip.condition.valid[frames])
         assert found.fine.clip.condition.views[0].camera.width == 24
         assert found.fine.clip.fine is None
-    clips.write_shard(tmp_path, 1, clips.pack_clips([replace(bare, fine=None)]))
-    plain = clips.read_clip(tmp_path, 1, 0, frames)
+    clips.write_shard(tmp_path, 1, [replace(bare, fine=None)])
+    plain = clips.ShardFolder(tmp_path).clip(1, 0, frames)
     assert plain.fine is None and plain.condition.renders is None
 
 

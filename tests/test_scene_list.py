@@ -1,10 +1,9 @@
-"""Lists of scenes and streamed clips: what is drawn, what is kept, what is left out."""
+"""Lists of scenes: what is drawn, what is kept, what is left out."""
 
 import collections
 import os
 import shutil
 import threading
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,9 +12,8 @@ from refusals import refused
 from toy_clips import interrupted_at, losses_of, tiny, write_clips
 
 from mudg import app
-from mudg.base import config as configuration
 from mudg.base import seeds, store
-from mudg.base.errors import InputError, IntegrityError, UsageError
+from mudg.base.errors import IntegrityError, UsageError
 from mudg.base.location import Location
 from mudg.diffusion import learn, log_clips, shard_sources
 from mudg.diffusion.shard_sources import (
@@ -24,7 +22,6 @@ from mudg.diffusion.shard_sources import (
     ListedShards,
     SceneList,
     ShardCache,
-    StreamedShards,
     is_list,
     read_list,
 )
@@ -83,17 +80,20 @@ def test_lists_are_read_in_two_formats(tmp_path):
         refused(words, read_list, str(tmp_path / "bad.json"))
 
 
-def listed_folder(clips, tmp_path, count=6, bad=()):
-    """A list of folders with one shard each; `bad`: missing ones."""
-    entries = []
-    for n in range(count):
-        folder = tmp_path / "scenes" / f"{n}"
-        if n not in bad:
-            folder.mkdir(parents=True)
-            shutil.copy(clips / f"city_{n % 3:07d}.safetensors", folder / "city_0000000.safetensors")
-        entries.append({"path": str(folder), "data_set": "ab"[n % 2], "held_out": n == 0})
+def listed(tmp_path, paths):
+    """A list of these folders or addresses, the first one held out, in two data sets by turns."""
+    entries = [{"path": str(path), "data_set": "ab"[n % 2], "held_out": n == 0} for n, path in enumerate(paths)]
     store.write_json(tmp_path / "list.json", {"scenes": entries, "data_sets": {"a": 1.0, "b": 2.0}})
     return str(tmp_path / "list.json")
+
+
+def listed_folder(clips, tmp_path, count=6, bad=()):
+    """A list of folders with one shard each; `bad`: missing ones."""
+    folders = [tmp_path / "scenes" / f"{n}" for n in range(count)]
+    for n in set(range(count)) - set(bad):
+        folders[n].mkdir(parents=True)
+        shutil.copy(clips / f"city_{n % 3:07d}.safetensors", folders[n] / "city_0000000.safetensors")
+    return listed(tmp_path, folders)
 
 
 def from_list(text, **changes):
@@ -141,18 +141,17 @@ def test_a_training_on_a_list_resumes_bit_equal(clips, tmp_path):
     refused("list of scenes says", both.run, raises=UsageError)
 
 
-def test_streamed_clips_give_the_same_losses(clips, address, tmp_path, capsys):
-    Learn(out=tmp_path / "local", settings=tiny(clips, log_every=1, steps=2)).run()
-    settings = tiny(address.text, log_every=1, steps=2, cache=str(tmp_path / "cache"), cache_gb=1e-6)
-    (tmp_path / "recipe.yaml").write_text(configuration.dump_yaml(settings))
-    words = ["learn", "--config", str(tmp_path / "recipe.yaml"), "--out", str(tmp_path / "streamed"), "--quiet"]
-    assert app.main(words) == 0
-    assert app.main([*words, "--data.textures", "s3://bucket/textures"]) == 2
-    assert "a path of this machine" in capsys.readouterr().err
+def test_clips_at_an_address_give_the_same_losses(clips, address, tmp_path, capsys):
+    for name, place in (("local", clips), ("streamed", address)):
+        text = listed(tmp_path, [clips, place])
+        settings = from_list(text, cache=str(tmp_path / "cache"), cache_gb=1e-6)
+        Learn(out=tmp_path / name, settings=settings).run()
     assert losses_of(tmp_path / "local") == losses_of(tmp_path / "streamed")
     assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 1  # all others had to go
-    local, streamed = (store.read_json(tmp_path / name / "metrics.json") for name in ("local", "streamed"))
-    assert local == streamed
+    for setting in ("textures", "clips"):
+        words = ["learn", f"--data.{setting}", "s3://bucket/here", "--out", str(tmp_path / "c"), "--quiet"]
+        assert app.main(words) == 2
+        assert "a path of this machine" in capsys.readouterr().err
 
 
 def test_the_least_recently_used_clips_leave_the_cache(tmp_path):
@@ -163,30 +162,27 @@ def test_the_least_recently_used_clips_leave_the_cache(tmp_path):
         os.utime(path, ns=(when, when))
         return {p.stem for p in tmp_path.glob("*.safetensors")}
 
-    assert [get("a", 1), get("b", 2), get("a", 3)][-1] == {"a", "b"} and cache.made == 2
+    assert [get("a", 1), get("b", 2), get("a", 3)][-1] == {"a", "b"}
     assert get("c", 4) == {"a", "c"}
-    assert get("b", 5) == {"b", "c"} and cache.made == 4
+    assert get("b", 5) == {"b", "c"}
     small = ShardCache(tmp_path / "small", 10)
     assert small.get("x.safetensors", lambda at: store.atomic_write(at, bytes(100))).is_file()
 
 
 def test_what_arrives_is_verified(clips, address, tmp_path):
-    folder = FolderOfShards.open(address)
-    assert folder.numbers()[:3] == (0, 1, 2) and len(folder.sums) == 4
+    folder = FolderOfShards(address)
+    assert folder.numbers[:3] == [0, 1, 2] and len(folder.sums) == 4
     folder.bring(1, tmp_path / "one")
     assert (tmp_path / "one").read_bytes() == (clips / "city_0000001.safetensors").read_bytes()
-    with pytest.raises(IntegrityError, match="not what was uploaded"):
-        FolderOfShards(address, {**folder.sums, "city_0000001.safetensors": "0" * 64}).bring(1, tmp_path / "two")
+    folder.sums["city_0000001.safetensors"] = "0" * 64
+    refused("not what was uploaded", folder.bring, 1, tmp_path / "two", raises=IntegrityError)
     assert not (tmp_path / "two").exists()
-    with pytest.raises(InputError, match="another number of clips(.|\n)*clips-per-city 2"):
-        StreamedShards(address, ShardCache(tmp_path / "c", 10**9), 5).path(0)
-    assert FolderOfShards.open(Location.of(f"{address}")).key == folder.key
+    assert FolderOfShards(Location.of(f"{address}")).key == folder.key
 
 
-def test_drawing_ahead_draws_what_would_be_drawn(address, tmp_path):
+def test_drawing_ahead_draws_what_would_be_drawn(clips, tmp_path):
     """The same clips, whether drawn before or at their step; nothing is drawn ahead that would be waited for."""
-    shards = StreamedShards(address, ShardCache(tmp_path, 10**9), 2)
-    source = replace(learn.clips_of_cities(tiny(address.text), tmp_path), shards=shards)
+    source = learn.clips_of_cities(tiny(clips), clips)
     plain, asked = [source.draw(step, 4, 2, "batch") for step in range(4)], []
 
     def draw(step):
@@ -196,19 +192,17 @@ def test_drawing_ahead_draws_what_would_be_drawn(address, tmp_path):
     with learn.DrawingAhead(draw, lambda step: step != 2, 2, 4) as ahead:
         taken = [ahead.take(step)[0] for step in range(4)]
     assert sorted(asked) == [(0, True), (1, False), (2, True), (3, False)]
-    for clips, others in zip(taken, plain, strict=True):
-        assert all(torch.equal(a.rgb, b.rgb) for a, b in zip(clips, others, strict=True))
-    local = replace(source, shards=tmp_path / "none yet")
-    assert source.ready(0) and not local.ready(0)
+    for some, others in zip(taken, plain, strict=True):
+        assert all(torch.equal(a.rgb, b.rgb) for a, b in zip(some, others, strict=True))
+    assert source.ready(0) and not learn.clips_of_cities(tiny(clips), tmp_path / "none yet").ready(0)
 
 
-def test_a_listed_log_is_cut_when_it_is_drawn(tmp_path, monkeypatch):
-    """Made once; how many clips there are is not counted again."""
+def test_a_listed_log_is_cut_once_when_it_is_drawn(tmp_path, monkeypatch):
     calls = collections.Counter()
     windows = [log_clips.LogWindow("front", ("a",), False)] * 3
     monkeypatch.setattr(shard_sources.log_clips, "log_source", lambda text: log_clips.LogSource(tmp_path, tmp_path))
     monkeypatch.setattr(shard_sources.store, "digest", lambda path: "content")
-    monkeypatch.setattr(shard_sources, "read_scene", lambda path: calls.update(["scene"]))
+    monkeypatch.setattr(shard_sources, "read_scene", lambda path: None)
     monkeypatch.setattr(shard_sources.log_clips, "log_windows", lambda scene, rules: windows)
 
     def write_log(source, rules, chosen, folder):
@@ -223,6 +217,5 @@ def test_a_listed_log_is_cut_when_it_is_drawn(tmp_path, monkeypatch):
         return ListedShards(scenes, ShardCache(tmp_path / "cache", 10**9), log_clips.LogClipRules(48, 32), 0.0)
 
     shards = make()
-    assert len(shards.opened(0).shards) == 3 and calls == {"scene": 1}
-    assert shards.path(2).is_file() and shards.path(1).is_file() and calls == {"scene": 2, "write": 1}
-    assert make().path(3).is_file() and calls["write"] == 1
+    assert len(shards.opened(0).shards) == 3 and not calls
+    assert all(path.is_file() for path in (shards.path(2), shards.path(1), make().path(3))) and calls["write"] == 1

@@ -19,8 +19,7 @@ from toy_published import TINY, dynamicrafter_checkpoint, scale_table, tiny_chec
 from mudg import app
 from mudg.base import weights
 from mudg.base.errors import IntegrityError, ResourceError, UsageError
-from mudg.diffusion import convert
-from mudg.diffusion import published as published_files
+from mudg.diffusion import convert, model_files
 from mudg.diffusion.published import PublishedConfig
 from mudg.diffusion.settings import ConvertConfig
 
@@ -54,7 +53,7 @@ def saved(tmp_path, content, name="model.ckpt"):
 
 def converted(tmp_path, content, config=CONFIG):
     convert.convert_file(config, saved(tmp_path, content), tmp_path / "out", TINY)
-    return published_files.load(tmp_path / "out")
+    return model_files.load_published(tmp_path / "out")
 
 
 # names --------------------------------------------------------------------------------------------
@@ -178,7 +177,7 @@ def test_files_without_tensors_are_refused(tmp_path):
 
 
 def test_conversion_keeps_every_value(whole, complete):
-    model = published_files.load(whole)
+    model = model_files.load_published(whole)
     state = model.state_dict()
     names = weights.published_names(n for n in state if n not in ("text", "scale"))
     assert all(torch.equal(state[ours], complete[theirs]) for ours, theirs in names.items())
@@ -195,11 +194,11 @@ def test_the_files_rescale_wins(tmp_path):
 
 
 def test_rescale_stays_exact_in_half_precision(tmp_path, complete, monkeypatch):
-    monkeypatch.setattr(convert, "SHARD_BYTES", 1 << 20)
+    monkeypatch.setattr(model_files, "SHARD_BYTES", 1 << 20)
     model = converted(tmp_path, {"state_dict": complete}, ConvertConfig(resolution="320x512", dtype="bfloat16"))
     assert model.dtype == torch.bfloat16
     assert torch.equal(model.schedule.scale, scale_table()[:1000])
-    again = published_files.load(tmp_path / "out", dtype=torch.float16)
+    again = model_files.load_published(tmp_path / "out", dtype=torch.float16)
     assert again.dtype == torch.float16
     assert torch.equal(again.scale, scale_table())
     assert len(list((tmp_path / "out").glob("weights_*.safetensors"))) > 1
@@ -245,19 +244,6 @@ def test_impossible_values_are_refused(tmp_path, complete, name, value, message)
     assert not (tmp_path / "out").exists()
 
 
-def test_towers_can_come_from_another_file(tmp_path, whole, complete):
-    prefixes = ("cond_stage_model.model.", "embedder.model.")
-    without = {n: v for n, v in complete.items() if not n.startswith(prefixes)}
-    towers = {n.removeprefix(p): v for p in prefixes for n, v in complete.items() if n.startswith(p)}
-    path = saved(tmp_path, towers, "towers.pt")
-    refused("missing", convert.convert_file, CONFIG, saved(tmp_path, without), tmp_path / "b", TINY)
-    convert.convert_file(
-        ConvertConfig(resolution="320x512", towers=str(path)), saved(tmp_path, without), tmp_path / "b", TINY
-    )
-    joined, plain = published_files.load(tmp_path / "b").state_dict(), published_files.load(whole).state_dict()
-    assert all(torch.equal(value, joined[name]) for name, value in plain.items())
-
-
 def converted_by_process(config: ConvertConfig, path: Path, to: Path, *, overwrite: bool = False) -> Path:
     return convert.run(
         config, path, to, functools.partial(convert.of_diffusion, config, path, network=TINY), overwrite=overwrite
@@ -269,7 +255,7 @@ def test_conversion_in_its_own_process(tmp_path, complete):
     """The way of the command line: a fresh process with a memory limit."""
     path = saved(tmp_path, {"state_dict": complete}, "512.ckpt")
     assert converted_by_process(ConvertConfig(), path, tmp_path / "model") == tmp_path / "model"
-    assert published_files.load(tmp_path / "model").config.height == 320
+    assert model_files.load_published(tmp_path / "model").config.height == 320
     refused("exists", converted_by_process, ConvertConfig(), path, tmp_path / "model", raises=UsageError)
     (tmp_path / "photos").mkdir()
     again = functools.partial(converted_by_process, overwrite=True)
@@ -313,9 +299,9 @@ def test_altered_model_folders_are_refused(tmp_path, whole):
     content = bytearray(part.read_bytes())
     content[-1] ^= 1
     part.write_bytes(bytes(content))
-    refused("altered", published_files.load, tmp_path / "out", raises=IntegrityError)
+    refused("altered", model_files.load_published, tmp_path / "out", raises=IntegrityError)
     description = tmp_path / "out" / "model.json"
     values = json.loads(description.read_text())
     values["config"]["net"]["colour"] = 1
     description.write_text(json.dumps(values))
-    refused("unknown field 'colour'", published_files.load, tmp_path / "out")
+    refused("unknown field 'colour'", model_files.load_published, tmp_path / "out")

@@ -15,7 +15,7 @@ import torch
 
 from mudg.base.types import Camera, Clip, Condition, FinePatch, RenderPlanes, View
 from mudg.diffusion.city_clips import HELD_OUT
-from mudg.diffusion.clips import pack_clips, write_shard
+from mudg.diffusion.clips import write_shard
 from mudg.diffusion.learn import DrawingAhead
 from mudg.diffusion.settings import LearnCodec, LearnConfig
 
@@ -70,7 +70,7 @@ def write_clips(folder: Path, width: int = WIDTH, height: int = HEIGHT, *, point
         made = [with_patch(made_up_clip(number * 7 + k, width, height)) for k in range(2)]
         made = [points_alone(clip) for clip in made[: 1 if number == HELD_OUT else 2]] if points else made
         made = [replace(clip, shift_m=shift) for clip, shift in zip(made, (2.0, 0.0), strict=False)]
-        write_shard(folder, number, pack_clips(made))
+        write_shard(folder, number, made)
     return folder
 
 
@@ -154,34 +154,6 @@ def before_each_batch(act: Callable[[int], None]) -> Iterator[None]:
 def interrupted_at(step: int) -> contextlib.AbstractContextManager[None]:
     """Within, the user interrupts a training during this step."""
     return before_each_batch(lambda now: signal.raise_signal(signal.SIGINT) if now == step else None)
-
-
-def training_words(clips: Path, out: Path, **changes: Any) -> list[str]:
-    """Words after `mudg learn` for a training like `tiny`; changes by the names of the flags."""
-    flags = {
-        "out": out,
-        "data.clips": clips,
-        "data.cities": 3,
-        "data.first-cities": 2,
-        "data.held-out": 1,
-        "data.width": WIDTH,
-        "data.height": HEIGHT,
-        "data.window": WINDOW,
-        "network.widths": "16 32",
-        "network.blocks": "1 1",
-        "network.spatial-attention": "False True",
-        "network.temporal-attention": "False True",
-        "network.refine-widths": "8 16",
-        "network.refine-blocks": "1 1",
-        "codec.steps": 2,
-        "codec.batch": 2,
-        "codec.fit-batches": 1,
-        "score.steps": 1,
-        "compute.workers": 0,
-        "compute.log-every": 1,
-        **changes,
-    }
-    return [word for name, value in flags.items() for word in (f"--{name}", *str(value).split())]
 
 
 def losses_of(out: Path) -> dict[int, float]:

@@ -31,13 +31,6 @@ TINY = PublishedConfig(
 )
 
 
-def choose_trainable(model, stage, temporal="transformers"):
-    """Gradients on for what a training stage moves, off for the rest; returns the parameters that move."""
-    frozen = model.temporal_parameters(temporal) if stage == 2 else set()
-    model.requires_grad_(False)
-    return [p.requires_grad_(True) for name, p in model.trained_part().named_parameters() if name not in frozen]
-
-
 def value_for(name, shape):
     """Values that depend on a tensor's published name alone (see golden/published_networks.md)."""
     draw = (

@@ -33,7 +33,7 @@ from mudg.core import metrics
 from mudg.core.metrics import Pair
 from mudg.core.noise import ScheduleConfig
 from mudg.core.pictures import class_colors, depth_colors, to_bytes
-from mudg.diffusion import city_clips, model_files, published, score
+from mudg.diffusion import city_clips, model_files, models
 from mudg.diffusion import clips as clip_shards
 from mudg.diffusion.published import GUIDANCE, PublishedConfig, PublishedLatents, PublishedMDM, WorkSplit
 from mudg.diffusion.published_network import AutoencoderConfig, ResamplerConfig, VideoUNetConfig
@@ -114,11 +114,8 @@ def images_of(clip: Clip, model: PublishedMDM) -> Tensor:
 
 def every_clip(folder: Path, cities: Sequence[int], window: int) -> list[Clip]:
     """All clips of the cities."""
-    return [
-        clip_shards.read_clip(folder, city, number, range(window))
-        for city in cities
-        for number in range(clip_shards.clips_in(folder, city))
-    ]
+    shards = clip_shards.ShardFolder(folder)
+    return [shards.clip(city, number, range(window)) for city in cities for number in range(shards.clips_in(city))]
 
 
 # autoencoder --------------------------------------------------------------------------------------
@@ -259,8 +256,8 @@ def trained(
     if not (work / "codec").is_dir():
         train_codec(model, clips, options.codec_steps)
         tensors = {name: value.cpu() for name, value in model.state_dict().items()}
-        published.save(work / "codec", config, tensors, {}, "An autoencoder of a stand-in.\n")
-    model = published.load(work / "codec", device, torch.float32)
+        model_files.save_published(work / "codec", config, tensors, {}, "An autoencoder of a stand-in.\n")
+    model = model_files.load_published(work / "codec", device, torch.float32)
     for value in (*model.parameters(), *model.buffers()):
         value.data = value.data.clone()  # out of the mapped files: training writes in place
     model.requires_grad_(False)
@@ -299,7 +296,7 @@ def generated_with(model: PublishedMDM, clips: Sequence[Clip], how: Sampling) ->
 def scores_of(clips: Sequence[Clip], made: Sequence[GeneratedClip], distance: PerceptualDistance) -> dict[str, float]:
     """Mean scores of generated clips; classes are pooled."""
     rows, matrices = zip(
-        *(score.score_clip(clip, sample) for clip, sample in zip(clips, made, strict=True)), strict=True
+        *(models.score_clip(clip, sample) for clip, sample in zip(clips, made, strict=True)), strict=True
     )
     frames = (
         (a, b) for clip, sample in zip(clips, made, strict=True) for a, b in zip(sample.rgb, clip.rgb, strict=True)

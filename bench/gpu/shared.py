@@ -18,8 +18,7 @@ from mudg.base import seeds, store
 from mudg.base.devices import choose_device
 from mudg.base.versions import environment
 from mudg.core.noise import ScheduleConfig
-from mudg.diffusion import memory_plan
-from mudg.diffusion.published import PublishedConfig, PublishedMDM
+from mudg.diffusion.published import PublishedConfig, PublishedMDM, meta_model
 from mudg.diffusion.published_network import AutoencoderConfig, ResamplerConfig, VideoUNetConfig
 from mudg.networks.clip import TowerConfig
 
@@ -90,7 +89,7 @@ def measured(function: Callable[[], object], device: torch.device, repeats: int)
 
 def drawn_model(config: PublishedConfig, device: torch.device, dtype: torch.dtype) -> PublishedMDM:
     """A network of the published kind on a device, every weight drawn."""
-    model = memory_plan.meta_model(config, dtype).to_empty(device=device)
+    model = meta_model(config, dtype).to_empty(device=device)
     generator = generator_of("weights", device)
     with torch.no_grad():
         for value in model.parameters():

@@ -107,10 +107,16 @@ def save(
 ) -> Path:
     """Write checkpoint ``step`` (finished steps) under ``folder`` and remove the oldest beyond ``keep`` (never fewer
     than two). tensors: group -> name -> tensor, one file per group. state: JSON-serialisable facts."""
-    with writing(folder, step, state, keep) as partial:
+    final = _path(folder, step)
+    with store.atomic_directory(final) as partial:
         for name, group in tensors.items():
             store.write_safetensors(partial / f"{name}.safetensors", dict(group))
-    return _path(folder, step)
+        store.write_json(partial / "state.json", {"step": step, "state": dict(state)})
+        store.write_manifest(partial)
+    older = sorted(p for p in folder.glob(f"{_PREFIX}*") if p.is_dir() and p != final and not p.name.endswith(".part"))
+    for stale in older[: max(0, len(older) + 1 - max(2, keep))]:
+        shutil.rmtree(stale)
+    return final
 
 
 class Pace:
@@ -134,26 +140,6 @@ class Pace:
         yield
         self._ended_s = time.monotonic()
         self._took_s = self._ended_s - began
-
-
-@contextlib.contextmanager
-def writing(folder: Path, step: int, state: Mapping[str, Any], keep: int = 2) -> Iterator[Path]:
-    """Yield the temporary folder of checkpoint ``step``; on success it gets state and manifest and its name, and the
-    oldest ones go. Other processes may write into it too (``partial_path``)."""
-    final = _path(folder, step)
-    with store.atomic_directory(final) as partial:
-        yield partial
-        store.write_json(partial / "state.json", {"step": step, "state": dict(state)})
-        store.write_manifest(partial)
-    older = sorted(p for p in folder.glob(f"{_PREFIX}*") if p.is_dir() and p != final and not p.name.endswith(".part"))
-    for stale in older[: max(0, len(older) + 1 - max(2, keep))]:
-        shutil.rmtree(stale)
-
-
-def partial_path(folder: Path, step: int) -> Path:
-    """The temporary folder that ``writing`` yields."""
-    final = _path(folder, step)
-    return final.with_name(final.name + ".part")
 
 
 def _path(folder: Path, step: int) -> Path:

@@ -158,12 +158,9 @@ def _address(value: Any) -> Location | None:
 
 
 def _refuse_in_settings(settings: Any, where: str) -> None:
-    """UsageError for an address in a setting: settings are part of what a result is made of, and name paths. Those that
-    their group names in ``STREAMED`` may be addresses: the verb itself reads there what it needs."""
+    """UsageError for an address in a setting: settings are part of what a result is made of, and name paths."""
     if is_dataclass(settings):
         for item in fields(settings):
-            if item.name in getattr(settings, "STREAMED", ()):
-                continue
             _refuse_in_settings(getattr(settings, item.name), f"{where}.{item.name}" if where else item.name)
     elif isinstance(settings, list | tuple):
         for one in settings:

@@ -585,8 +585,6 @@ class Clip(_Tensors):
         depth: f32[T, 1, H, W] metres where ``depth_valid`` bool[T, 1, H, W]; elsewhere it only fills a gap.
         semantics: i64[T, H, W] train ids, 255 = unlabelled.
         shift_m: lateral shift from the recorded path, metres, positive to the left.
-        point_color: f32[T, 3, H, W] in [0, 1] or None: colour of the nearest point, no image warped in; for scoring
-            only.
         fine: a rectangle at a higher resolution, or None.
         depth_confidence: f32[T, 1, H, W] in [0, 1] or None: how far valid depth is to be believed (1 = measured); None:
             wholly.
@@ -598,7 +596,6 @@ class Clip(_Tensors):
     depth_valid: Tensor
     semantics: Tensor
     shift_m: float = 0.0
-    point_color: Tensor | None = None
     fine: FinePatch | None = None
     depth_confidence: Tensor | None = None
 
@@ -606,7 +603,7 @@ class Clip(_Tensors):
         t, _, h, w = self.condition.color.shape
         one = (t, 1, h, w)
         check_tensors(self, rgb=(t, 3, h, w), depth=one, depth_valid=one, semantics=(t, h, w))
-        check_given_tensors(self, point_color=(t, 3, h, w), depth_confidence=one)
+        check_given_tensors(self, depth_confidence=one)
 
     @property
     def depth_weight(self) -> Tensor:

@@ -383,16 +383,6 @@ def _without_prefix(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return dict(tensors)
 
 
-def with_towers(state: Mapping[str, Tensor], towers: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """A checkpoint completed by an OpenCLIP file (names without prefix) where it lacks the text or the image tower."""
-    result = dict(state)
-    for prefix in (_TEXT, _IMAGE):
-        if not any(name.startswith(prefix) for name in state):
-            image = prefix == _IMAGE
-            result |= {prefix + name: value for name, value in towers.items() if name.startswith("visual.") == image}
-    return result
-
-
 # matching -----------------------------------------------------------------------------------------
 
 

@@ -1,20 +1,15 @@
 """Training clips from generated cities: pure functions of (seed, city number).
 
-One city is a short log (12 frames) recorded by the front camera and, sometimes, the two beside it. Its sweeps are fused
-as the `fuse` verb does, the condition is built as `synthesize` does, and the truth comes from the generator at exactly
-the views of the clip. Most clips lie beside the recorded path; one per city follows it, with only some of its recorded
-images given, as for frames that a log lacks.
-
-What varies from city to city besides the city itself: field of view, mounting height and pitch, number and elevation
-range of the LiDAR's beams, drop-out, frame rate, number of sweeps fused, errors of the LiDAR poses. With
-``realism="varied"`` much more does (`draw_city`, `draw_sensors`).
+One city is a short log of the front camera and, sometimes, the two beside it. Its sweeps are fused as `fuse` does, the
+condition is built as `synthesize` does, and the truth comes from the generator at exactly the views of the clip. Most
+clips lie beside the recorded path; one per city follows it, with only some of its recorded images given.
 """
 
 from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -52,7 +47,7 @@ from mudg.city.sensors import (
 from mudg.city.world import CityTruth, CityWorld
 from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
 from mudg.core.trajectory import ego_left_world
-from mudg.diffusion.clips import FAR_M, pack_clips, shard_path, write_shard
+from mudg.diffusion.clips import FAR_M, shard_path, write_shard
 from mudg.diffusion.condition import ConditionRules, RenderAt, WarpSource, build_conditions
 from mudg.gaussians import fit
 from mudg.gaussians.rendering import render_planes
@@ -62,10 +57,8 @@ from mudg.scene.write import PlacedSweep, write_photos
 
 # varied cities ------------------------------------------------------------------------------------
 #
-# The training distribution that resembles recorded logs: `draw_city` and `draw_sensors` give, as pure functions of
-# (seed, city number), the generator's configuration and the faults of the sensors. Cameras have horizontal fields of
-# view of 30 to 120 degrees and five aspect ratios from 4:3 to 3.4:1 (by city number, all of about the same area).
-# LiDARs are of the kinds that public datasets use, 16 to 128 beams; most see nothing of the upper third of the image.
+# The training distribution that resembles recorded logs: the generator's configuration and the faults of the sensors.
+# Most LiDARs see nothing of the upper third of the image.
 
 
 ASPECTS: Final = (1.5, 4 / 3, 16 / 9, 2.4, 3.4)
@@ -97,20 +90,12 @@ def sized(width: int, height: int, city: int, multiple: int = 16) -> tuple[int, 
     return columns * multiple, rows * multiple
 
 
-def draw_city(
-    seed: int, city: int, plain: CityConfig, textures: str = "", side_cameras: float = SIDE_CAMERAS
-) -> CityConfig:
-    """Configuration of a training city.
-
-    Args:
-        seed, city: fix everything.
-        plain: seed, length and image size; the rest is drawn here.
-        textures: folder of photographs for `CityConfig.textures`; four fifths of the cities use it.
-        side_cameras: share of the cities with two cameras beside the front one.
-    """
+def draw_city(seed: int, city: int, plain: CityConfig, textures: str = "") -> CityConfig:
+    """Configuration of a training city. seed, city: fix everything. plain: seed, length and image size; the rest is
+    drawn here. textures: folder of photographs for `CityConfig.textures`; four fifths of the cities use it."""
     rng = seeds.numpy_rng(seed, city, "varied city")
     beams, lower, upper = LIDARS[int(rng.choice(len(LIDARS), p=LIDAR_SHARES))]
-    beside = rng.random() < side_cameras
+    beside = rng.random() < SIDE_CAMERAS
     return replace(
         plain,
         rate_hz=float(rng.choice([10.0, 10.0, 10.0, 6.0, 12.0])),
@@ -199,8 +184,6 @@ def _lidar_faults(rng: np.random.Generator) -> LidarFaults:
 
 # city log -----------------------------------------------------------------------------------------
 #
-# A generated log as its training clips need it, and its recording with the faults of real sensors.
-#
 # With faults, the cameras are the reference: the view of a clip is where the camera truly was (moved sideways), and its
 # truth is exact. What the condition knows may be wrong. Its views carry the recorded poses, which have errors; an image
 # recorded at the time of a view has the same error and so still fits it; points and images of other times, and points
@@ -230,7 +213,7 @@ class CityLog:
 
     def claimed(self, view: View) -> View:
         """A true view of a frame's time with the pose that the log's poses make of it."""
-        return view if self.errors is None else claimed_view(self.world, self.errors, view)
+        return claimed_view(self.world, self.errors, view)
 
     def truth(self, view: View) -> CityTruth:
         """The truth at a true view, with the look of its camera."""
@@ -239,8 +222,10 @@ class CityLog:
         return found if look is None else replace(found, rgb=with_look(found.rgb, look, view.time_s))
 
 
-def claimed_view(world: CityWorld, errors: NDArray[np.float64], view: View) -> View:
+def claimed_view(world: CityWorld, errors: NDArray[np.float64] | None, view: View) -> View:
     """`CityLog.claimed` for the errors of a log's poses."""
+    if errors is None:
+        return view
     ego = world.frame_pose(view.time_s)
     error = errors[min(max(round(view.time_s * world.config.rate_hz), 0), len(errors) - 1)]
     return View(view.camera, ego @ error @ geometry.invert(ego) @ view.world_from_cam, view.time_s)
@@ -251,7 +236,14 @@ def record_with_faults(config: CityConfig, sensors: SensorFaults, used: Sequence
     ``key``."""
     world = CityWorld(config)
     errors = pose_errors(sensors.poses, config.n_frames, key)
-    photos = {name: _photos(world, sensors, errors, name, key) for name in config.cameras}
+    photos: dict[str, list[Photo]] = {}
+    for name in config.cameras:
+        faults, look = sensors.cameras.get(name, CameraFaults()), sensors.looks.get(name, CameraLook())
+        for index, view in enumerate(world.frame_views(name)):
+            truth = world.render_rolling(view, faults.readout_s) if faults.readout_s else world.render(view)
+            image = recorded(with_look(truth.rgb, look, view.time_s), faults, seeds.key(key, index, f"image {name}"))
+            photo = Photo(claimed_view(world, errors, view), image, truth.semantics)
+            photos.setdefault(name, []).append(photo)
     boxes = noisy_tracks(world.tracks(), sensors.boxes, key)
     delay_s, mounting = sensors.lidar.delay_s, sensors.lidar.mounting_error()
     scans = [LidarScan(ego_from_lidar(), lidar_elevations(config), delay_s)]
@@ -276,16 +268,6 @@ def record_with_faults(config: CityConfig, sensors: SensorFaults, used: Sequence
     return CityLog(world, cloud, images, tuple(sweeps), sensors, boxes, errors)
 
 
-def _photos(world: CityWorld, sensors: SensorFaults, errors: NDArray[np.float64], name: str, key: int) -> list[Photo]:
-    faults, look = sensors.cameras.get(name, CameraFaults()), sensors.looks.get(name, CameraLook())
-    photos = []
-    for index, view in enumerate(world.frame_views(name)):
-        truth = world.render_rolling(view, faults.readout_s) if faults.readout_s else world.render(view)
-        image = recorded(with_look(truth.rgb, look, view.time_s), faults, seeds.key(key, index, f"image {name}"))
-        photos.append(Photo(claimed_view(world, errors, view), image, truth.semantics))
-    return photos
-
-
 # from city ----------------------------------------------------------------------------------------
 
 
@@ -298,7 +280,7 @@ REPORTED = tuple(range(HELD_OUT + 100, HELD_OUT + 106))
 """Cities whose scores are reported and on which nothing is chosen."""
 LISTS: dict[str, tuple[int, ...]] = {"development": DEVELOPMENT, "reported": REPORTED}
 
-Realism = Literal["plain", "varied", "mixed"]
+Realism = Literal["plain", "varied"]
 
 FRAMES = 12
 SIZES = len(ASPECTS)
@@ -325,14 +307,7 @@ class CityClipRules:
     the time of the first view, from where it was recorded."""
     realism: Realism = "plain"
     """varied: training cities and their sensors are drawn from `draw_city`; clips then have the size of
-    `size_of`. mixed: so are half of them; the others are plain, of these sizes."""
-    log_frames: int = FRAMES
-    """Length of the logs at least. In longer ones than `FRAMES` each clip begins at a frame of its own."""
-    side_cameras: float | None = None
-    """Share of the training cities with two cameras beside the front one (None: 0.4 of plain cities, 0.35 of varied
-    ones)."""
-    fit_steps: tuple[int, int] = (100, 300)
-    """Fewest and most steps of the fit to a training city; cities for scoring have the middle of them."""
+    `size_of`."""
     fitted: bool = False
     """Clips have renders of a scene fitted to the recorded images (which the maker of the clips supplies), and a patch
     at a higher resolution; recorded images are 2 to 4 times larger than the clips."""
@@ -342,21 +317,19 @@ class CityClipRules:
     @property
     def frames(self) -> int:
         """Length of the log."""
-        return max(FRAMES, self.log_frames, FIRST + self.window)
+        return max(FRAMES, FIRST + self.window)
 
 
 def is_varied(rules: CityClipRules, city: int) -> bool:
-    """Whether a city is drawn from the varied distribution; cities for scoring never are. Of mixed ones, `SIZES`
-    neighbours are (one of each size) and the next are not."""
-    return city < HELD_OUT and (rules.realism == "varied" or (rules.realism == "mixed" and city // SIZES % 2 == 0))
+    """Whether a city is drawn from the varied distribution; cities for scoring never are."""
+    return city < HELD_OUT and rules.realism == "varied"
 
 
 def size_of(rules: CityClipRules, city: int) -> tuple[int, int]:
-    """Width and height of a city's clips. Varied and mixed cities differ in aspect, except for the published system's
-    fixed size."""
-    if rules.realism != "plain" and city < HELD_OUT and not rules.published:
-        return sized(rules.width, rules.height, city)
-    return rules.width, rules.height
+    """Width and height of a city's clips. Varied cities differ in aspect, except for the published system's fixed
+    size."""
+    varied = is_varied(rules, city) and not rules.published
+    return sized(rules.width, rules.height, city) if varied else (rules.width, rules.height)
 
 
 def fine_of(rules: CityClipRules, city: int) -> int:
@@ -379,10 +352,9 @@ def city_config(rules: CityClipRules, city: int) -> CityConfig:
     if city >= HELD_OUT:
         return plain
     if is_varied(rules, city):
-        share = SIDE_CAMERAS if rules.side_cameras is None else rules.side_cameras
-        return draw_city(rules.seed, city, plain, rules.textures, share)
+        return draw_city(rules.seed, city, plain, rules.textures)
     rng = seeds.numpy_rng(rules.seed, city, "city configuration")
-    side_cameras = rng.random() < (0.4 if rules.side_cameras is None else rules.side_cameras)
+    side_cameras = rng.random() < 0.4
     return replace(
         plain,
         rate_hz=float(rng.choice([10.0, 10.0, 6.0])),
@@ -453,13 +425,12 @@ def make_log(rules: CityClipRules, city: int, frames: int = FRAMES) -> CityLog:
     return CityLog(world, cloud, tuple(photo for name in config.cameras for photo in photos[name]), tuple(sweeps))
 
 
-def given_images(rules: CityClipRules, city: int, log: CityLog) -> tuple[Photo, ...]:
+def given_images(
+    rules: CityClipRules, city: int, log: CityLog, rng: np.random.Generator | None = None
+) -> tuple[Photo, ...]:
     """The recorded images that the clips of a city may know: all, or as in a log whose every fourth moment is held
     out."""
-    return _known(rules, city, log, seeds.numpy_rng(rules.seed, city, "clips"))
-
-
-def _known(rules: CityClipRules, city: int, log: CityLog, rng: np.random.Generator) -> tuple[Photo, ...]:
+    rng = rng or seeds.numpy_rng(rules.seed, city, "clips")
     if city >= HELD_OUT and rules.fitted:
         times = sorted({photo.view.time_s for photo in log.recorded})
         return tuple(photo for photo in log.recorded if photo.view.time_s not in times[4::4])
@@ -469,12 +440,8 @@ def _known(rules: CityClipRules, city: int, log: CityLog, rng: np.random.Generat
 def make_clips(
     rules: CityClipRules, city: int, log: CityLog | None = None, render_at: RenderAt | None = None
 ) -> list[Clip]:
-    """All clips of one city.
-
-    Args:
-        log: the city's own from `make_log`; made here if not given.
-        render_at: renders of a scene that was fitted to `given_images`; with `rules.fitted`.
-    """
+    """All clips of one city. log: the city's own from `make_log`; made here if not given. render_at: renders of a scene
+    that was fitted to `given_images`; with `rules.fitted`."""
     log = log or make_log(rules, city, rules.frames)
     rng = seeds.numpy_rng(rules.seed, city, "clips")
     size, scale = size_of(rules, city), fine_of(rules, city)
@@ -483,7 +450,7 @@ def make_clips(
     tracks = log.tracks()
     clips = []
     sources: dict[int, WarpSource] = {}
-    known = _known(rules, city, log, rng)
+    known = given_images(rules, city, log, rng)
     for number, shift_m in enumerate(shifts_of(rules, city)):
         start = start_of(rules, city, number)
         views = [shifted_view(log.world, view, shift_m) for view in front_views[start : start + rules.window]]
@@ -520,22 +487,14 @@ def patch_side(size: tuple[int, int]) -> int:
 
 
 def cut_patch(full: Clip, scale: int, side_px: int, rng: np.random.Generator) -> FinePatch:
-    """A square of a clip that is `scale` times finer than the one it belongs to, anywhere in it.
-
-    Args:
-        side_px: its side in fine pixels; a multiple of `scale`.
-    """
+    """A square of a clip that is `scale` times finer than the one it belongs to, anywhere in it. side_px: its side in
+    fine pixels; a multiple of `scale`."""
     height, width = (size // scale for size in full.rgb.shape[-2:])
     side = min(side_px // scale, height, width)
     row, column = int(rng.integers(height - side + 1)), int(rng.integers(width - side + 1))
     rows, columns = (slice(start * scale, (start + side) * scale) for start in (row, column))
-    return FinePatch(cropped(full, rows, columns), row, column, scale)
-
-
-def cropped(clip: Clip, rows: slice, columns: slice) -> Clip:
-    """A rectangle of a clip and of its condition. Its cameras only say how large it is: they look straight ahead."""
-    cut = replace(clip, fine=None, point_color=None).map(lambda x: x[..., rows, columns].contiguous())
-    return replace(cut, condition=clip.condition.cropped(rows, columns))
+    cut = replace(full, fine=None).map(lambda x: x[..., rows, columns].contiguous())
+    return FinePatch(replace(cut, condition=full.condition.cropped(rows, columns)), row, column, scale)
 
 
 def shifted_view(world: CityWorld, view: View, shift_m: float) -> View:
@@ -556,45 +515,36 @@ def clip_from_truth(condition: Condition, truths: Sequence[CityTruth]) -> Clip:
     return Clip(condition, rgb.float(), torch.where(sky, FAR_M, depth), torch.ones_like(sky), ids)
 
 
-def write_missing(rules: CityClipRules, cities: Sequence[int], folder: Path, fit: FitCity | None = None) -> None:
-    """Make the shards of those cities that have none in `folder` yet, one after another (`fit`: with
-    `rules.fitted`)."""
-    missing = [city for city in cities if not shard_path(folder, city).is_file()]
-    for city in progress(missing, len(missing), "generating cities"):
-        write_city(rules, city, folder, fit)
-
-
-FitCity = Callable[[CityClipRules, int, CityLog], RenderAt]
-"""Fits a scene to the images of a log that its clips may know (`given_images`)."""
-
-
-def write_city(rules: CityClipRules, city: int, folder: Path, fit: FitCity | None = None) -> int:
-    """Make one city's clips and write its shard; returns the number of clips. Runs in a process of its own.
-
-    Args:
-        fit: with `rules.fitted`.
-    """
+def write_city(rules: CityClipRules, city: int, folder: Path) -> int:
+    """Make one city's clips and write its shard; returns the number of clips. Runs in a process of its own."""
     torch.set_num_threads(1)
     native.set_threads(1)
     log = make_log(rules, city, rules.frames)
-    clips = make_clips(rules, city, log, None if fit is None else fit(rules, city, log))
-    if city >= HELD_OUT:  # the colours of the nearest points, without images
-        plain = ConditionRules(*size_of(rules, city), warp=False)
-        tracks = log.tracks()
-        points = [build_conditions(log.cloud, tracks, c.condition.views, (), plain)[0].color for c in clips]
-        clips = [replace(clip, point_color=color) for clip, color in zip(clips, points)]
-    write_shard(folder, city, pack_clips(clips))
+    clips = make_clips(rules, city, log, fit_city(rules, city, log) if rules.fitted else None)
+    write_shard(folder, city, clips)
     return len(clips)
 
 
-# fits to cities ----------------------------------------------------------------------------------------
-#
-# Short fits to generated cities, whose renders become part of the conditions that the diffusion model is trained on.
+def write_missing(rules: CityClipRules, cities: Sequence[int], folder: Path) -> None:
+    """Make the shards of those cities that have none in `folder` yet, one after another."""
+    missing = [city for city in cities if not shard_path(folder, city).is_file()]
+    for city in progress(missing, len(missing), "generating cities"):
+        write_city(rules, city, folder)
+
+
+# fits to cities -----------------------------------------------------------------------------------
+
+
+FIT_STEPS = 100, 300
+"""Fewest and most steps of the fit to a training city, because renders of logs are of different quality, too; cities
+for scoring have the middle of them."""
 
 
 def fit_city(rules: CityClipRules, city: int, log: CityLog) -> RenderAt:
     """Fit a scene to the images that the clips of a city may know; returns what it shows at a view."""
-    steps = steps_of(rules, city)
+    fewest, most = FIT_STEPS
+    drawn = seeds.numpy_rng(rules.seed, city, "fit")
+    steps = (fewest + most) // 2 if city >= HELD_OUT else int(drawn.integers(fewest, most))
     width = size_of(rules, city)[0]
     images = given_images(rules, city, log)
     config = short_fit(steps, width, images[0].view.camera.width, seed=city)
@@ -608,14 +558,6 @@ def fit_city(rules: CityClipRules, city: int, log: CityLog) -> RenderAt:
         model = fit.load_model(work.path)
 
     return partial(render_planes, model)
-
-
-def steps_of(rules: CityClipRules, city: int) -> int:
-    """Steps of a city's fit, drawn from `rules.fit_steps`, because renders of logs are of different quality, too."""
-    fewest, most = rules.fit_steps
-    if city >= HELD_OUT or fewest == most:
-        return (fewest + most) // 2
-    return int(seeds.numpy_rng(rules.seed, city, "fit").integers(fewest, most))
 
 
 def placed_sweeps(log: CityLog) -> Iterator[PlacedSweep]:

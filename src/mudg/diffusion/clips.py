@@ -1,28 +1,14 @@
-"""Training clips on disk, one file per generated city; and which of them a training step draws (`TrainingClips`).
+"""Training clips on disk, one file per generated city or window of a log; and which of them a training step draws.
 
-A shard is a safetensors file with, for K clips of T frames,
+A shard is a safetensors file with the arrays of `_ARRAYS` for K clips of T frames: truth (rgb, depth, semantics) and
+condition (the others).
 
-    rgb u8[K,T,3,H,W]  depth f16[K,T,H,W] metres (codes beyond 1000 m and sky as 1000)  semantics u8[K,T,H,W]
-    color u8[K,T,3,H,W]  sparse_depth f16[K,T,H,W]
-    flags u8[K,T,H,W] (1 = a point was seen, 2 = colour warped, 4 = depth
-        is not true, it only fills a gap; clips of recorded logs)
-    backdrop u8[K,T,3,H,W]  reference u8[K,3,H,W]  shift_m f32[K]
-    ids, backdrop_ids u8[K,T,H,W]: classes that came with color and backdrop, 255 = unknown
-    world_from_cam f64[K,T,4,4]  intrinsics f64[K,T,4] (fx, fy, cx, cy)
-    point_color u8[K,T,3,H,W], cities for scoring only: colour of the nearest point, no image warped in
-
-and, where a fitted scene was rendered,
-
-    render u8[K,T,3,H,W]  render_depth f16[K,T,H,W]  alpha, certainty u8[K,T,H,W] (of 255)  render_ids u8[K,T,H,W]
-    rendered bool[K]: false = this clip has no renders
-
-and, of recorded logs with annotated depth, depth_confidence u8[K,T,H,W] (of 255)
-
-and, of the published system's conditions, measured f16[K,T,H,W] metres: what points measured (`Condition.measured`), 0
-= nothing
-
-and, for patches at a higher resolution, all of these once more as fine_NAME, with fine_place i32[K,3] (row, column,
-scale).
+    depth            metres; codes beyond 1000 m and sky as 1000. depth_confidence (of 255): of labelled logs alone
+    flags            1 = a point was seen, 2 = colour warped, 4 = depth is not true, it only fills a gap (logs)
+    ids              classes that came with color, backdrop_ids with backdrop; 255 = unknown
+    measured         what points measured (`Condition.measured`), 0 = nothing: the published system's conditions
+    render ...       what a fitted scene shows; alpha, certainty of 255; rendered: false = this clip has none
+    fine_NAME        all of these once more, of patches at a higher resolution; fine_place: row, column, scale
 """
 
 from __future__ import annotations
@@ -31,7 +17,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -57,11 +43,11 @@ def shard_path(folder: Path, city: int) -> Path:
     return folder / f"city_{city:07d}.safetensors"
 
 
-_OPTIONAL = ("point_color", "measured", "depth_confidence")
+_OPTIONAL = ("measured", "depth_confidence")
 _RENDERS = ("render", "render_depth", "alpha", "certainty", "render_ids")
 _IDS = ("semantics", "ids", "backdrop_ids", "render_ids")
 _ARRAYS = {
-    **dict.fromkeys(("rgb", "color", "backdrop", "point_color", "render"), ("U8", "KT3HW")),
+    **dict.fromkeys(("rgb", "color", "backdrop", "render"), ("U8", "KT3HW")),
     **dict.fromkeys(("depth", "sparse_depth", "measured", "render_depth"), ("F16", "KTHW")),
     **dict.fromkeys((*_IDS, "flags", "alpha", "certainty", "depth_confidence"), ("U8", "KTHW")),
     "world_from_cam": ("F64", "KT44"),
@@ -125,8 +111,6 @@ def _packed(clip: Clip, gaps: bool, rendered: bool, weighed: bool) -> dict[str, 
         "intrinsics": np.array([[v.camera.fx, v.camera.fy, v.camera.cx, v.camera.cy] for v in c.views], np.float64),
         "shift_m": np.float32(clip.shift_m),
     }
-    if clip.point_color is not None:
-        arrays["point_color"] = u8(clip.point_color)
     if c.measured is not None:
         arrays["measured"] = f16(c.measured.depth) * c.measured.valid[:, 0].numpy()
     if weighed:
@@ -140,55 +124,25 @@ def _packed(clip: Clip, gaps: bool, rendered: bool, weighed: bool) -> dict[str, 
     return arrays
 
 
-def write_shard(folder: Path, city: int, arrays: Mapping[str, NDArray[np.generic]]) -> None:
-    """Write one city's clips, completely or not at all."""
-    store.write_safetensors(shard_path(folder, city), dict(arrays))
+def write_shard(folder: Path, city: int, clips: Sequence[Clip], *, gaps: bool = False) -> None:
+    """Write one city's clips (see `pack_clips`), completely or not at all."""
+    store.write_safetensors(shard_path(folder, city), pack_clips(clips, gaps=gaps))
 
 
-class ShardSource(Protocol):
-    """Shards that are brought to this machine when they are needed, by number."""
-
-    def clips_in(self, number: int) -> int:
-        """Number of clips in a shard."""
-        ...
-
-    def reading(self, number: int, read: Callable[[Path], Result]) -> Result:
-        """What `read` makes of a shard's file."""
-        ...
-
-
-def clips_in(folder: Path | ShardSource, city: int) -> int:
-    """Number of clips in a shard."""
-    return clips_at(shard_path(folder, city)) if isinstance(folder, Path) else folder.clips_in(city)
-
-
-def clips_at(path: Path) -> int:
-    """Number of clips in the shard at `path`; InputError if its arrays are not those of a shard."""
+def counts_at(path: Path) -> tuple[int, int]:
+    """Clips in the shard at `path`, and frames of each; InputError if its arrays are not those of a shard."""
     with _open(path) as shard:
         _check_arrays(shard, path)
-        return int(shard.get_slice("shift_m").get_shape()[0])
-
-
-def frames_in(folder: Path | ShardSource, city: int) -> int:
-    """Frames of each clip in a shard."""
-    return _frames_at(shard_path(folder, city)) if isinstance(folder, Path) else folder.reading(city, _frames_at)
-
-
-def _frames_at(path: Path) -> int:
-    with _open(path) as shard:
-        return int(shard.get_slice("rgb").get_shape()[1])
+        clips, frames = shard.get_slice("rgb").get_shape()[:2]
+        return clips, frames
 
 
 def _open(path: Path) -> safe_open:
     try:
         return safe_open(str(store.regular(path)), "numpy")
     except (SafetensorError, OSError) as error:
-        raise InputError(
-            "a shard of training clips is missing or damaged",
-            where=str(path),
-            got=str(error),
-            remedy="delete it; it is made again",
-        ) from error
+        what = "a shard of training clips is missing or damaged"
+        raise InputError(what, where=str(path), got=str(error), remedy="delete it; it is made again") from error
 
 
 def _check_arrays(shard: Any, path: Path) -> None:
@@ -230,15 +184,8 @@ def _damaged(path: Path, expected: str, got: str) -> InputError:
     )
 
 
-def read_clip(folder: Path | ShardSource, city: int, clip: int, frames: Sequence[int]) -> Clip:
-    """Some frames of one clip of a shard, as a `Clip`. Shards hold no times: frame numbers stand for seconds."""
-    if isinstance(folder, Path):
-        return clip_at(shard_path(folder, city), clip, frames)
-    return folder.reading(city, lambda path: clip_at(path, clip, frames))
-
-
 def clip_at(path: Path, clip: int, frames: Sequence[int]) -> Clip:
-    """The same, of the shard at `path`."""
+    """Some frames of one clip of the shard at `path`. Shards hold no times: frame numbers stand for seconds."""
     with _open(path) as shard:
         _check_arrays(shard, path)
         clips, most = shard.get_slice("rgb").get_shape()[:2]
@@ -297,7 +244,6 @@ def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int], path: 
         (ids("flags") & FLAG_DEPTH_UNKNOWN) == 0,
         x["semantics"].long(),
         shift_m,
-        image("point_color") if "point_color" in x else None,
         depth_confidence=plane("depth_confidence") / 255 if "depth_confidence" in x else None,
     )
 
@@ -306,12 +252,10 @@ def vary(clip: Clip, rng: np.random.Generator) -> Clip:
     """Random mirror image, one random colour curve for truth and condition alike, and worse or no given classes.
 
     Curves: gain 0.7-1.4, gamma 0.75-1.35, contrast 0.75-1.35 about the clip's mean, saturation 0.5-1.4, white balance
-    +-8 %; the condition gets a further exposure error of +-3 %. Given classes: see `ClassMistakes`. A mirrored clip
+    +-8 %; the condition gets a further exposure error of +-3 %. Given classes: see `class_mistakes`. A mirrored clip
     keeps its poses and intrinsics: they then describe the mirror image of the place.
 
-    Args:
-        clip: as read from a shard, with warped colours, backdrop and classes. Its patch is varied in the same way.
-    """
+    clip: as read from a shard, with warped colours, backdrop and classes. Its patch is varied in the same way."""
     gain = rng.uniform(0.7, 1.4) * (1 + rng.uniform(-0.08, 0.08, 3))
     gamma, contrast, saturation = rng.uniform(0.75, 1.35), rng.uniform(0.75, 1.35), rng.uniform(0.5, 1.4)
     middle = float(clip.rgb.numpy().mean(dtype=np.float64))  # the same by any number of threads
@@ -324,18 +268,18 @@ def vary(clip: Clip, rng: np.random.Generator) -> Clip:
         x = grey + saturation * (x - grey)
         return (middle + contrast * (x - middle)).clamp(0, 1)
 
-    classes = ClassMistakes.drawn(rng)
+    mistaken = class_mistakes(rng)
     mirrored = rng.random() < 0.5
     without_renders = rng.random() < NO_RENDERS
 
     def varied(one: Clip) -> Clip:
         given = one.condition
         colors = {n: curve(getattr(given, n), error) for n in ("color", "backdrop", "reference")}
-        ids = {n: classes.on(getattr(given, n)) for n in ("semantics", "backdrop_semantics")}
+        ids = {n: mistaken(getattr(given, n)) for n in ("semantics", "backdrop_semantics")}
         renders = None
         if given.renders is not None and not without_renders:
             shown = given.renders
-            renders = replace(shown, color=curve(shown.color, error), semantics=classes.on(shown.semantics))
+            renders = replace(shown, color=curve(shown.color, error), semantics=mistaken(shown.semantics))
         condition = replace(given, **colors, **ids, renders=renders)
         made = replace(one, rgb=curve(one.rgb, 1.0), condition=condition, fine=None)
         return replace(made.map(lambda x: x.flip(-1)), shift_m=-one.shift_m) if mirrored else made
@@ -355,43 +299,82 @@ NO_RENDERS = 0.1
 """Share of the training clips with renders that are used without."""
 
 
-@dataclass(frozen=True, eq=False)
-class ClassMistakes:
-    """Given classes as a labeller might have made them: exact, none at all, or with mistakes.
+def class_mistakes(rng: np.random.Generator) -> Callable[[Tensor], Tensor]:
+    """What makes of true classes u8[T,1,H,W] those that a labeller might have given: exact ones, none at all, or with
+    mistakes.
 
-    Mistakes: a class is unknown (15 %) or taken for another one (8 %) throughout (`table` u8[256], None = none are
-    given), and blocks of 8x8 pixels are unknown (`holes`: the share of the blocks, and the seed of the draw).
+    Mistakes: a class is unknown (15 %) or taken for another one (8 %) throughout, and blocks of 8x8 pixels are unknown.
     """
-
-    table: NDArray[np.uint8] | None
-    holes: tuple[float, int]
-
-    @classmethod
-    def drawn(cls, rng: np.random.Generator) -> ClassMistakes:
-        """One way to be wrong."""
-        draw = rng.random()
-        if draw < NO_IDS:
-            return cls(None, (0.0, 0))
-        table = np.arange(256)
-        if draw >= NO_IDS + WORSE_IDS:
-            return cls(table.astype(np.uint8), (0.0, 0))
-        for number in range(19):
+    draw, table, share, seed = rng.random(), np.arange(256), 0.0, 0
+    if draw < NO_IDS:
+        return lambda ids: torch.full_like(ids, UNLABELLED)
+    if draw < NO_IDS + WORSE_IDS:
+        for number in range(len(CLASSES)):
             chance = rng.random()
-            table[number] = 255 if chance < 0.15 else int(rng.integers(19)) if chance < 0.23 else number
-        return cls(table.astype(np.uint8), (float(rng.uniform(0, 0.25)), int(rng.integers(2**31))))
+            other = int(rng.integers(len(CLASSES))) if 0.15 <= chance < 0.23 else number
+            table[number] = UNLABELLED if chance < 0.15 else other
+        share, seed = float(rng.uniform(0, 0.25)), int(rng.integers(2**31))
 
-    def on(self, ids: Tensor) -> Tensor:
-        """Classes u8[T,1,H,W] with the mistakes."""
-        if self.table is None:
-            return torch.full_like(ids, 255)
-        worse = torch.from_numpy(self.table)[ids.long()]
-        share, seed = self.holes
+    def given(ids: Tensor) -> Tensor:
+        worse = torch.from_numpy(table.astype(np.uint8))[ids.long()]
         if not share:
             return worse
         height, width = ids.shape[-2:]
         blocks = seeds.numpy_rng(seed, 0, "holes").random((1, 1, -(-height // 8), -(-width // 8))) < share
         holes = torch.from_numpy(blocks).repeat_interleave(8, -2).repeat_interleave(8, -1)[..., :height, :width]
-        return torch.where(holes, torch.full_like(worse, 255), worse)
+        return torch.where(holes, torch.full_like(worse, UNLABELLED), worse)
+
+    return given
+
+
+# where shards are ---------------------------------------------------------------------------------
+
+
+class Shards:
+    """Shards of training clips by number."""
+
+    def path(self, number: int) -> Path:
+        """A shard's file, on this machine."""
+        raise NotImplementedError
+
+    def has(self, number: int) -> bool:
+        """Whether reading a shard waits for nobody who is still making it."""
+        del number
+        return True
+
+    def reading(self, number: int, read: Callable[[Path], Result]) -> Result:
+        """What `read` makes of a shard's file."""
+        return read(self.path(number))
+
+    def clips_in(self, number: int) -> int:
+        """Clips in a shard."""
+        return self.reading(number, counts_at)[0]
+
+    def clip(self, number: int, clip: int, frames: Sequence[int]) -> Clip:
+        """Some frames of one clip of a shard."""
+        return self.reading(number, lambda path: clip_at(path, clip, frames))
+
+
+class ShardFolder(Shards):
+    """Shards in a folder, where other processes may still be making them; `patience_s`: how long one is waited for."""
+
+    def __init__(self, folder: Path, patience_s: float = 900.0) -> None:
+        self.folder, self._patience_s = folder, patience_s
+
+    def has(self, number: int) -> bool:
+        """Whether a shard is there."""
+        return shard_path(self.folder, number).is_file()
+
+    def path(self, number: int) -> Path:
+        """A shard's file, once it is there; ResourceError: nobody makes it."""
+        started = time.monotonic()
+        while not self.has(number):
+            if time.monotonic() - started > self._patience_s:
+                what, remedy = "no training clips arrived", "see the errors of the generating processes above"
+                expected = f"within {self._patience_s:.0f} s"
+                raise ResourceError(what, where=str(shard_path(self.folder, number)), expected=expected, remedy=remedy)
+            time.sleep(0.5)
+        return shard_path(self.folder, number)
 
 
 # the clips of a training --------------------------------------------------------------------------
@@ -402,19 +385,16 @@ class TrainingClips:
     """The clips that a training draws from, in numbered shards.
 
     What is drawn for a clip depends on (seed, step, purpose) and the clip's place in the batch of a step: not on which
-    part of that batch is drawn here, nor on where the shards come from.
+    part of that batch is drawn here.
 
-    Args:
-        config: of the training. shards: their folder, or what fetches them.
-        size: width and height, as the settings come to.
-        sizes: of the clips: shard number n has the n-th, counted round. All clips of a step have that of its first.
-        numbers: of the shards to train on, of which `begin` are in use from the first step. The others join at steps
-            that are the same in every run, so that clips can still be in the making while training runs.
-        scored: shards for scoring only. about: the data in a sentence for the model card; empty = generated cities.
-    """
+    config: of the training. shards: where the clips are. size: width and height, as the settings come to. sizes: of the
+    clips: shard number n has the n-th, counted round. All clips of a step have that of its first. numbers: of the
+    shards to train on, of which `begin` are in use from the first step. The others join at steps that are the same in
+    every run, so that clips can still be in the making while training runs. scored: shards for scoring only. about: the
+    data in a sentence for the model card; empty = generated cities."""
 
     config: LearnConfig
-    shards: Path | ShardSource
+    shards: Shards
     size: tuple[int, int]
     sizes: Sequence[tuple[int, int]]
     numbers: range
@@ -445,11 +425,11 @@ class TrainingClips:
 
     def read(self, shard: int, number: int, frames: range, size: tuple[int, int]) -> Clip:
         """Some frames of a clip; InputError if it has another size."""
-        clip = read_clip(self.shards, shard, number, frames)
+        clip = self.shards.clip(shard, number, frames)
         if clip.rgb.shape[-2:] != size[::-1]:
             raise InputError(
                 "the training clips have another size",
-                where=str(shard_path(self.shards, shard)) if isinstance(self.shards, Path) else f"shard {shard}",
+                where=f"{self.config.data.clips or 'clips'}, shard {shard}",
                 expected=f"{size[0]}x{size[1]}",
                 got=f"{clip.rgb.shape[-1]}x{clip.rgb.shape[-2]}",
                 remedy="choose another --data.clips",
@@ -463,8 +443,7 @@ class TrainingClips:
         for _ in range(count):
             shard = shards[int(rng.integers(len(shards)))]
             shard = self.of_same_size(shard, picks[0][0], shards) if picks else shard
-            await_shard(self.shards, shard)
-            number = int(rng.integers(clips_in(self.shards, shard)))
+            number = int(rng.integers(self.shards.clips_in(shard)))
             start = int(rng.integers(self.config.data.window - frames + 1))
             picks.append((shard, number, range(start, start + frames)))
         return picks
@@ -476,13 +455,11 @@ class TrainingClips:
 
     def ready(self, step: int) -> bool:
         """Whether `draw` at a step waits for no city that is still being made."""
-        folder = self.shards
-        return not isinstance(folder, Path) or all(shard_path(folder, n).is_file() for n in self.in_use(step))
+        return all(map(self.shards.has, self.in_use(step)))
 
     def have_patches(self) -> bool:
         """Whether the clips have patches at a higher resolution; seen in the first one."""
-        await_shard(self.shards, self.numbers[0])
-        return read_clip(self.shards, self.numbers[0], 0, range(1)).fine is not None
+        return self.shards.clip(self.numbers[0], 0, range(1)).fine is not None
 
     def weighed(self) -> Sequence[int]:
         """Shards over which classes are counted."""
@@ -493,33 +470,14 @@ class TrainingClips:
         return self.scored
 
 
-def await_shard(folder: Path | ShardSource, city: int, patience_s: float = 900.0) -> None:
-    """Wait until a shard is there (it is being made by another process). One of another source is brought when it is
-    read."""
-    if not isinstance(folder, Path):
-        return
-    path, started = shard_path(folder, city), time.monotonic()
-    while not path.is_file():
-        if time.monotonic() - started > patience_s:
-            raise ResourceError(
-                "no training clips arrived",
-                where=str(path),
-                expected=f"within {patience_s:.0f} s",
-                remedy="see the errors of the generating processes above",
-            )
-        time.sleep(0.5)
-
-
-def class_weights(folder: Path | ShardSource, cities: Iterable[int], balance: float) -> Tensor:
-    """Weights f32[19] of the classes in the semantic loss: share^-balance, counted over some cities.
+def class_weights(shards: Shards, numbers: Iterable[int], balance: float) -> Tensor:
+    """Weights f32[19] of the classes in the semantic loss: share^-balance, counted over some shards.
 
     Scaled so that the mean over labelled pixels is 1; a class that never occurs weighs as much as the rarest that does.
     """
     counts = torch.zeros(256, dtype=torch.float64)
-    for city in cities:
-        await_shard(folder, city)
-        ids = read_clip(folder, city, 0, range(1)).semantics
-        counts += torch.bincount(ids.flatten(), minlength=256)
+    for number in numbers:
+        counts += torch.bincount(shards.clip(number, 0, range(1)).semantics.flatten(), minlength=256)
     counts = counts[: len(CLASSES)]
     if not bool(counts.any()):  # logs without labels
         return torch.ones(len(CLASSES))

@@ -1,4 +1,4 @@
-"""Conditions of the diffusion model.
+"""Conditions of the diffusion model: what a fused cloud and recorded images tell about a path of views.
 
 `build_conditions` makes the model's input for a path of views from a fused cloud and recorded images:
 
@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,14 +35,16 @@ from torch.nn import functional
 from mudg.base import geometry, memory, palette
 from mudg.base.errors import InputError
 from mudg.base.types import Condition, FusedCloud, Photo, RenderPlanes, SparseDepth, Track, View
+from mudg.base.weather_settings import Conditions
+from mudg.core import weather
 from mudg.core.pictures import resize_area, to_bytes
 from mudg.core.project import ProjectConfig, ProjectedPoints, project_sparse
+from mudg.core.weather import DriveFacts, ShownView
 
 # vacated ------------------------------------------------------------------------------------------
 #
-# Conditions of an edited drive where something stood that is not there any more. Photographs taken earlier or later, or
-# from elsewhere, show what is behind it: they are warped in as everywhere. What is left is a hole: its colours continue
-# those around it, and nothing in it counts as seen.
+# An edited drive where something stood that is gone. Photographs of other times or places show what is behind it; what
+# is left is a hole that continues the colours around it, and nothing in it counts as seen.
 
 
 GROUND_IDS = torch.tensor([palette.ID[name] for name in ("road", "sidewalk", "terrain")], dtype=torch.uint8)
@@ -53,14 +55,9 @@ KNOWN_SHARE = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Vacated:
-    """Where edits changed a view.
-
-    Args:
-        mask: pixels bool[H,W] in which something stood that is gone, its shadow included.
-        ground: depth f32[H,W] in metres of level ground there, NaN above it.
-        shown: pixels bool[H,W] in which objects are new or stand anew.
-        stood: pixels bool[H,W] of the mask in which it stood itself.
-    """
+    """Where edits changed a view. mask: pixels bool[H,W] in which something stood that is gone, its shadow included.
+    ground: depth f32[H,W] in metres of level ground there, NaN above it. shown: pixels bool[H,W] in which objects are
+    new or stand anew. stood: pixels bool[H,W] of the mask in which it stood itself."""
 
     mask: Tensor
     ground: Tensor
@@ -85,13 +82,6 @@ def determined(render: RenderPlanes, usual: Tensor) -> Tensor:
 VacatedAt = Callable[[View], Vacated]
 
 
-def ground_behind(depth: Tensor, measured: Tensor, vacated: Vacated) -> Tensor:
-    """Depth f32[H,W] in which vacated pixels without a `measured` bool[H,W] surface lie on the ground, where there is
-    some."""
-    there = vacated.mask & ~measured & torch.isfinite(vacated.ground)
-    return torch.where(there, vacated.ground, depth)
-
-
 def continued(color: Tensor, ids: Tensor, vacated: Vacated, hole: Tensor) -> tuple[Tensor, Tensor]:
     """Colours f32[3,H,W] and classes u8[H,W] with those of a `hole` bool[H,W] continued smoothly from around it: ground
     from ground, what is above it from what stands there or from the sky, nothing from objects that move."""
@@ -108,9 +98,8 @@ def continued(color: Tensor, ids: Tensor, vacated: Vacated, hole: Tensor) -> tup
 def _pulled(color: Tensor, weight: Tensor) -> Tensor:
     """Colours where weight is 1, continued where it is 0; `color` [1,C,H,W] is 0 there."""
     if min(color.shape[-2:]) <= 2:
-        return color.sum((-2, -1), keepdim=True) / weight.sum((-2, -1), keepdim=True).clamp(
-            min=1e-6
-        ) + torch.zeros_like(color)
+        total, share = (x.sum((-2, -1), keepdim=True) for x in (color, weight))
+        return (total / share.clamp(min=1e-6)).expand_as(color)
     pool = lambda x: functional.avg_pool2d(x, 2, ceil_mode=True, count_include_pad=False)
     share = pool(weight)
     coarse = pool(color) / share.clamp(min=1e-6)
@@ -122,47 +111,45 @@ def _pulled(color: Tensor, weight: Tensor) -> Tensor:
 # condition ----------------------------------------------------------------------------------------
 
 
+FAR_M = 100.0
+"""Farther than this nothing is measured, and what no surface covers is taken to be."""
+SAME_TIME_S = 0.06
+"""Recorded images nearer in time than this may also colour dynamic objects."""
+OTHER_CAMERA_S = 0.1
+"""Images of other cameras count as farther away in time by this."""
+LEAST_OVERLAP = 0.02
+"""Images that show less than this share of a view are not tried."""
+BACKDROP_M = 80.0
+"""Distance at which the nearest recorded image is put up as a backdrop."""
+REACH_PX = 4
+"""A pixel this near to a measured one takes that one's depth; farther ones take the depth of the render, where there is
+one."""
+SURE_ALPHA, ANOTHER_SURFACE = 0.9, 0.1
+"""A pixel near to a measured one takes the depth of the render all the same where the render covers it by more than the
+first and is farther from the measured depth than the second share of it: outlines of surfaces are the render's."""
+SOLID_ALPHA = 0.5
+"""Coverage from which on a render has a surface; what it covers less is taken to be far away above the horizon."""
+GROUND_SLOPE = 0.05
+"""Rays that fall at least this much per metre ahead end on a surface, covered by the render or not."""
+
+
 @dataclass(frozen=True, slots=True)
 class ConditionRules:
-    """How a condition is made. Sizes are those of the model's images, distances metres, times seconds."""
+    """How a condition is made. Sizes are those of the model's images."""
 
     width: int
     height: int
     fine_width: int = 0
     fine_height: int = 0
     """Colours are gathered on this finer grid and averaged (0 = at the condition's own size): that avoids aliasing."""
-    near_m: float = 1.0
-    far_m: float = 100.0
-    point_px: float = 1.0
-    """Side of the square a point covers, in pixels."""
-    same_time_s: float = 0.06
-    """Recorded images nearer in time than this may also colour dynamic objects."""
     images_per_view: int = 6
     """How many recorded images are tried per view, nearest in time (then in place) first. 0: the backdrop alone."""
-    other_camera_s: float = 0.1
-    """Images of other cameras count as farther away in time by this."""
-    least_overlap: float = 0.02
-    """Images that show less than this share of a view are not tried."""
     hidden_share: float = 0.08
     """A pixel is hidden in a recorded image if a surface there is nearer by this share of its depth plus 0.3 m."""
     warp: bool = True
     """Warp recorded images in; otherwise holes keep the nearest point's colour."""
-    backdrop_m: float = 80.0
-    """Distance at which the nearest recorded image is put up as a backdrop."""
     occluder_m: float = 0.2
     """Side of the square with which points hide what lies behind them."""
-    measured_reach_px: int = 4
-    """A pixel this near to a measured one takes that one's depth; farther ones take the depth of the render, where
-    there is one."""
-    sure_alpha: float = 0.9
-    """A pixel near to a measured one takes the depth of the render all the same where the render covers it by more than
-    this ..."""
-    another_surface: float = 0.1
-    """... and is farther from the measured depth than this share of it: the outlines of surfaces are the render's."""
-    solid_alpha: float = 0.5
-    """Coverage from which on a render has a surface; what it covers less is taken to be far away above the horizon."""
-    ground_slope: float = 0.05
-    """Rays that fall at least this much per metre ahead end on a surface, covered by the render or not."""
     published: bool = False
     """The published system's condition: points only, 0 where nothing was seen, no filling, no warping.
 
@@ -171,15 +158,19 @@ class ConditionRules:
     beside it (`Condition.measured`).
     """
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.width, self.height
+
+    @property
+    def fine(self) -> tuple[int, int]:
+        """Width and height of the finer grid."""
+        return self.fine_width or self.width, self.fine_height or self.height
+
     def project(self, cloud: FusedCloud, tracks: Sequence[Track], view: View) -> ProjectedPoints:
         """The cloud's points in a view of the condition's resolution."""
-        drawn = ProjectConfig(
-            static_splat_px=self.point_px,
-            object_splat_px=self.point_px,
-            near_m=self.near_m,
-            far_m=self.far_m,
-            occluder_m=0.0 if self.published else self.occluder_m,
-        )
+        drawn = ProjectConfig(near_m=1.0, far_m=FAR_M, occluder_m=0.0 if self.published else self.occluder_m)
         return project_sparse(cloud, tracks, view, drawn, hide=not self.published)
 
 
@@ -193,28 +184,15 @@ RenderAt = Callable[[View], RenderPlanes]
 """What a fitted scene shows at a view, without the leading dimension."""
 
 
-class Recolor(Protocol):
-    """Another weather or light for what the published system is given."""
-
-    def points(self, view: View, seen: ProjectedPoints) -> Tensor:
-        """Colours f32[3,H,W] of the valid pixels of projected points."""
-        ...
-
-    def photo(self, view: View, rgb: Tensor) -> Tensor:
-        """A recorded image f32[3,H,W]."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class DrawnCloud:
-    """A fused cloud ready to be drawn, and the renders of a fitted scene, if there is one."""
+    """A fused cloud ready to be drawn; renders of a fitted scene; where something stood that an edit took away."""
 
     cloud: FusedCloud
     tracks: Sequence[Track]
     rules: ConditionRules
     render_at: RenderAt | None
     vacated_at: VacatedAt | None = None
-    """Where something stood that an edit took away."""
 
     def look(self, view: View, far_ids: Tensor, render: RenderPlanes | None = None) -> Surfaces:
         """The surfaces at a view: measured ones, and between them those of the render (None: of `render_at`) or else of
@@ -224,38 +202,44 @@ class DrawnCloud:
         classes of what a recorded image shows in the same direction (255 = unknown), are something else: there a
         surface stands that no image shows, and the nearest measured pixel stands for it, in the render too.
         """
-        rules, sparse = self.rules, self.rules.project(self.cloud, self.tracks, view)
+        sparse = self.rules.project(self.cloud, self.tracks, view)
         valid, nearest = sparse.valid, nearest_pixels(sparse.valid)
         color, moving, ids = sparse.rgb, sparse.moving, sparse.semantics
-        depth = torch.full_like(sparse.depth, rules.far_m)
+        depth = torch.full_like(sparse.depth, FAR_M)
         if bool(valid.any()):
             here = (..., *nearest)
             color, depth, moving, ids = color[here], sparse.depth[here], moving[here], ids[here]
         vacated = None if self.vacated_at is None else self.vacated_at(view)
+
+        def on_ground(depth: Tensor) -> Tensor:
+            """The ground's depth where a vacated pixel has no measured surface."""
+            if vacated is None:
+                return depth
+            return torch.where(vacated.mask & ~valid & torch.isfinite(vacated.ground), vacated.ground, depth)
+
         render = self.render_at(view) if render is None and self.render_at is not None else render
         if render is None:
-            depth = depth if vacated is None else ground_behind(depth, valid, vacated)
-            return Surfaces(valid, color, depth, moving, ids, None, vacated)
-        near = torch.from_numpy(ndimage.binary_dilation(valid.numpy(), iterations=max(rules.measured_reach_px, 1)))
-        solid = render.alpha[0] >= rules.solid_alpha
+            return Surfaces(valid, color, on_ground(depth), moving, ids, None, vacated)
+        near = torch.from_numpy(ndimage.binary_dilation(valid.numpy(), iterations=REACH_PX))
+        solid = render.alpha[0] >= SOLID_ALPHA
         # where the render shows another surface, which photographs determined
-        sure = (render.alpha[0] > rules.sure_alpha) & determined(render, torch.ones_like(depth, dtype=torch.bool))
-        other = sure & ((render.depth[0] - depth).abs() > rules.another_surface * depth)
-        near &= _among_measured(sparse, depth, rules) | ~other
+        sure = (render.alpha[0] > SURE_ALPHA) & determined(render, torch.ones_like(depth, dtype=torch.bool))
+        other = sure & ((render.depth[0] - depth).abs() > ANOTHER_SURFACE * depth)
+        near &= _among_measured(sparse, depth) | ~other
         surface_seen = (far_ids != palette.ID["sky"]) & (far_ids != palette.UNLABELLED)
-        hidden = ~solid & (below_horizon(view, rules.ground_slope) | surface_seen) & bool(valid.any())
+        x, y, z = ray_directions(view)
+        hidden = ~solid & ((z < -GROUND_SLOPE * torch.hypot(x, y)) | surface_seen) & bool(valid.any())
         # ground goes on at the height, not at the depth, of the nearest measured pixel
-        falls = -ray_directions(view)[2]
+        falls = -z
         level = torch.isin(ids, GROUND_IDS) & (falls > LEAST_FALL) & (falls[nearest] > LEAST_FALL)
         levelled = torch.where(level, depth * falls[nearest] / falls.clamp(min=LEAST_FALL), depth)
-        depth = torch.where(valid, depth, levelled.clamp(max=rules.far_m))
+        depth = torch.where(valid, depth, levelled.clamp(max=FAR_M))
         render = replace(
             render, color=torch.where(hidden, color, render.color), semantics=torch.where(hidden, ids, render.semantics)
         )
-        shown = torch.where(solid, render.depth[0], torch.full_like(depth, rules.far_m)).clamp(max=rules.far_m)
+        shown = torch.where(solid, render.depth[0], torch.full_like(depth, FAR_M)).clamp(max=FAR_M)
         pick = lambda mine, theirs: torch.where(near | hidden, mine, theirs)
-        depth = pick(depth, shown)
-        depth = depth if vacated is None else ground_behind(depth, valid, vacated)
+        depth = on_ground(pick(depth, shown))
         moving = (moving & near) | self._in_objects(view, depth, ~near & torch.isin(render.semantics[0], MOVING_IDS))
         color, ids = pick(color, render.color), pick(ids, render.semantics[0])
         return Surfaces(valid, color, depth, moving, ids, render, vacated)
@@ -316,28 +300,33 @@ class Surfaces:
         return replace(self, measured=self.measured & ~(hole & ~ground), render=render), color, ids, found
 
 
-def nearest_valid(valid: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Row and column of the nearest valid pixel for every pixel; the pixel itself where nothing at all is valid."""
-    if not valid.any():
-        rows, columns = np.indices(valid.shape)
-        return rows, columns
-    nearest: Any = ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True)
-    return nearest[0], nearest[1]
-
-
 def nearest_pixels(valid: Tensor) -> tuple[Tensor, Tensor]:
-    """The same of bool[H,W], i64[H,W] each."""
-    rows, columns = nearest_valid(valid.numpy())
-    return torch.from_numpy(rows.astype(np.int64)), torch.from_numpy(columns.astype(np.int64))
+    """Row and column i64[H,W] of the nearest valid pixel for every pixel of bool[H,W]; the pixel itself where nothing
+    at all is valid."""
+    mask = valid.numpy()
+    found: Any = np.indices(mask.shape)
+    if mask.any():
+        found = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
+    rows, columns = torch.from_numpy(found.astype(np.int64))
+    return rows, columns
 
 
 def filled_depth(measured: SparseDepth, far_m: float = 100.0) -> Tensor:
     """Depth f32[T,1,H,W] with the nearest measured pixel's where nothing was measured; `far_m` in a frame without
     any."""
-    filled = []
-    for image, valid in zip(measured.depth[:, 0].numpy(), measured.valid[:, 0].numpy(), strict=True):
-        filled.append(torch.from_numpy(image[nearest_valid(valid)] if valid.any() else np.full_like(image, far_m)))
+    filled = [
+        image[nearest_pixels(valid)] if bool(valid.any()) else torch.full_like(image, far_m)
+        for image, valid in zip(measured.depth[:, 0], measured.valid[:, 0], strict=True)
+    ]
     return torch.stack(filled)[:, None]
+
+
+def turned_rays(view: View, turn: NDArray[np.float64]) -> list[Tensor]:
+    """x, y and z, f32[H,W] each, of the pixels' rays, of length 1 along the camera's z, turned by a rotation."""
+    camera, m = view.camera, torch.from_numpy(turn.astype(np.float32))
+    columns, rows = (torch.arange(count, dtype=torch.float32) + 0.5 for count in (camera.width, camera.height))
+    u, v = geometry.pinhole_ray(camera.intrinsics, columns, rows)
+    return [m[i, 0] * u[None, :] + m[i, 1] * v[:, None] + m[i, 2] for i in range(3)]
 
 
 def carry(view: View, depth: Tensor, other: View) -> tuple[Tensor, Tensor, Tensor]:
@@ -345,30 +334,15 @@ def carry(view: View, depth: Tensor, other: View) -> tuple[Tensor, Tensor, Tenso
 
     Returns x, y f32[K,H,W] in pixels of the other view and z f32[K,H,W] metres (not positive = behind it).
     """
-    camera, target = view.camera, other.camera
-    columns, rows = (torch.arange(count, dtype=torch.float32) + 0.5 for count in (camera.width, camera.height))
-    u, v = geometry.pinhole_ray(camera.intrinsics, columns, rows)
-    m = torch.from_numpy((other.cam_from_world @ view.world_from_cam).astype(np.float32))
-    turned = [m[i, 0] * u[None, :] + m[i, 1] * v[:, None] + m[i, 2] for i in range(3)]
-    px, py, pz = (turned[i] * depth + m[i, 3] for i in range(3))
-    safe = pz.clamp(min=0.1)
-    return *geometry.pinhole(target.intrinsics, px, py, safe), pz
+    moved = other.cam_from_world @ view.world_from_cam
+    rays, shift = turned_rays(view, moved[:3, :3]), torch.from_numpy(moved[:3, 3].astype(np.float32))
+    px, py, pz = (ray * depth + shift[i] for i, ray in enumerate(rays))
+    return *geometry.pinhole(other.camera.intrinsics, px, py, pz.clamp(min=0.1)), pz
 
 
-def ray_directions(view: View) -> tuple[Tensor, Tensor, Tensor]:
+def ray_directions(view: View) -> list[Tensor]:
     """World x, y and z, f32[H,W] each, of the pixels' rays, of length 1 along the camera's z."""
-    camera = view.camera
-    columns, rows = (torch.arange(count, dtype=torch.float32) + 0.5 for count in (camera.width, camera.height))
-    u, v = geometry.pinhole_ray(camera.intrinsics, columns, rows)
-    turn = torch.from_numpy(view.world_from_cam[:3, :3].astype(np.float32))
-    x, y, z = (turn[i, 0] * u[None, :] + turn[i, 1] * v[:, None] + turn[i, 2] for i in range(3))
-    return x, y, z
-
-
-def below_horizon(view: View, slope: float) -> Tensor:
-    """Which pixels' rays fall by more than `slope` metres per horizontal metre, bool[H,W]."""
-    x, y, z = ray_directions(view)
-    return z < -slope * torch.hypot(x, y)
+    return turned_rays(view, view.world_from_cam[:3, :3])
 
 
 def look_up(image: Tensor, x: Tensor, y: Tensor, mode: str = "bilinear") -> Tensor:
@@ -429,58 +403,56 @@ def build_conditions(
     render_at: RenderAt | None = None,
     vacated_at: VacatedAt | None = None,
     *,
-    recolor: Recolor | None = None,
+    recolor: WeatheredPoints | None = None,
     among: Sequence[Sequence[int]] | None = None,
 ) -> tuple[Condition, Condition]:
     """The model's condition for `views` (any path, any size; resized to the rules' size), and the same on the fine
-    grid.
+    grid: the same object if there is none.
+
+    1. The cloud is projected into every view; far points that shine through gaps between near ones are removed.
+    2. Pixels without a measured depth get the nearest measured one, or that of the render.
+    3. Every pixel is carried by its depth into recorded images of about the same time, and takes their colour where it
+       is not hidden there (`warp`); elsewhere it keeps that of its point, or of the nearest one. Classes travel along.
+    4. The backdrop is the nearest recorded image, carried over as if everything in it were far away.
+
+    The published system's (`ConditionRules.published`) are points alone, zero where nothing is known.
 
     Args:
         cloud: fused points: static ones in the world, objects in their boxes, posed by `tracks` at each view's time.
-        recorded: images of any cameras; the ones nearest in time to a view are warped into it; may be empty.
+        recorded: images of any cameras; may be empty. The reference is that of the first view's camera that is nearest
+            in time (black if there is none).
         sources: cache of prepared images (index into `recorded` -> WarpSource); pass the same dict again for further
-            views. Of `PreparedImages` with a folder, fine conditions of large views lie in files.
-        render_at: renders of a fitted scene. They are part of the condition, and tell how far away is what no point was
-            measured on (not with `published`). Recorded images that `sources` holds must have been prepared with the
-            same renders.
+            views with the same renders. Of `PreparedImages` with a folder, fine conditions of large views lie in files.
+        render_at: renders of a fitted scene, which become part of the condition (not with `published`).
         vacated_at: of an edited drive: where something stood that is not there any more (not with `published`).
         among: for each view the numbers of the recorded images that it may know (None: all).
         recolor: with `published`: changes the colours of the points, at the camera's size, and of the reference.
-
-    Returns:
-        Two conditions (the same object if there is no finer grid): colour and depth filled everywhere (zeros with
-        `published`), `valid` where a point was seen and kept, `warped` where the colour comes from a recorded image,
-        the `backdrop` of step 5, and as reference the recorded image of the first view's camera that is nearest in time
-        (black if there is none).
 
     Raises:
         InputError: no views.
     """
     if not views:
         raise InputError("a condition needs at least one view", where="build_conditions")
-    small = [view.resized(rules.width, rules.height) for view in views]
+    small = [view.resized(*rules.size) for view in views]
     among = [range(len(recorded))] * len(views) if among is None else among
     reference = _reference(small[0], [recorded[n] for n in among[0]], rules, recolor)
     if rules.published:
         condition = _published_condition(cloud, tracks, small, reference, rules, recolor)
         return condition, condition
     sources = {} if sources is None else sources
-    size = (rules.fine_width or rules.width, rules.fine_height or rules.height)
-    fine_views = tuple(view.resized(*size) for view in views)
+    fine_views = tuple(view.resized(*rules.fine) for view in views)
     points = DrawnCloud(cloud, tracks, rules, render_at, vacated_at)
     folder = sources.folder if isinstance(sources, PreparedImages) else None
-    made = (_condition_of_view(points, view, recorded, own, rules, sources) for view, own in zip(fine_views, among))
+    made = (_condition_of_view(points, view, recorded, own, sources) for view, own in zip(fine_views, among))
     rows = ((*part, *(getattr(r, x.name) for x in fields(RenderPlanes) if r is not None)) for part, r in made)
     color, depth, valid, warped, backdrop, ids, far_ids, *planes = stacked(rows, len(fine_views), folder)
     renders = RenderPlanes(*planes) if planes else None
-    same_size = size == (rules.width, rules.height)
-    shown = reference if same_size else backdrop[0]
+    shown = reference if rules.fine == rules.size else backdrop[0]
     fine = Condition(fine_views, color, depth, valid, shown, warped, backdrop, ids, far_ids, renders)
-    if same_size:
+    if rules.fine == rules.size:
         return fine, fine
-    small_size = (rules.height, rules.width)
-    reduced = lambda x: functional.interpolate(x.float(), size=small_size, mode="area")
-    picked = lambda x: functional.interpolate(x, size=small_size, mode="nearest-exact")
+    reduced = lambda x: functional.interpolate(x.float(), size=rules.size[::-1], mode="area")
+    picked = lambda x: functional.interpolate(x, size=rules.size[::-1], mode="nearest-exact")
     if renders is not None:
         how = {"depth": picked, "semantics": picked}
         planes = {x.name: how.get(x.name, reduced)(getattr(renders, x.name)) for x in fields(RenderPlanes)}
@@ -497,30 +469,25 @@ def build_conditions(
 
 
 def _condition_of_view(
-    points: DrawnCloud,
-    view: View,
-    recorded: Sequence[Photo],
-    among: Sequence[int],
-    rules: ConditionRules,
-    sources: dict[int, WarpSource],
+    points: DrawnCloud, view: View, recorded: Sequence[Photo], among: Sequence[int], sources: dict[int, WarpSource]
 ) -> tuple[tuple[Tensor, ...], RenderPlanes | None]:
     """Colour f32[3,H,W], depth f32[1,H,W], valid and warped bool[1,H,W], backdrop f32[3,H,W], classes of the colour and
     of the backdrop u8[1,H,W] of one view, at its size; and its render. Images `among` the recorded ones are used."""
 
     def source(number: int) -> WarpSource:
         if number not in sources:
-            sources[number] = _prepare_source(points, recorded[number], view, rules)
+            sources[number] = _prepare_source(points, recorded[number], view)
         return sources[number]
 
-    shape = (view.camera.height, view.camera.width)
+    rules, shape = points.rules, (view.camera.height, view.camera.width)
     if not (rules.warp and among):
         here = points.look(view, torch.full(shape, palette.UNLABELLED, dtype=torch.uint8))
         found = torch.zeros_like(here.measured)
         here, color, own_ids, found = here.with_hole(here.color, here.ids, found)
         ids = own_ids[None]
         return (color, here.depth[None], here.measured[None], found[None], color, ids, ids), here.render
-    nearest = source(min(among, key=_rank_of_images(view, recorded, rules)))
-    x, y, _ = carry(view, torch.full((1, *shape), rules.backdrop_m), nearest.view)
+    nearest = source(min(among, key=_rank_of_images(view, recorded)))
+    x, y, _ = carry(view, torch.full((1, *shape), BACKDROP_M), nearest.view)
     backdrop, far_ids = look_up(nearest.rgb, x, y)[0], look_up_ids(nearest.semantics, x, y)
     known = None if nearest.usable is None else look_up_ids(nearest.usable, x, y)
     far_ids = far_ids if known is None else torch.where(known, far_ids, palette.UNLABELLED)
@@ -530,7 +497,7 @@ def _condition_of_view(
     backdrop = shown.image_of(view.camera.name, backdrop).clamp(0, 1) if shown.to_common else backdrop
     for number in _order_of_images(view, depth, recorded, among, rules):
         image = source(number)
-        fresh = abs(image.view.time_s - view.time_s) <= rules.same_time_s
+        fresh = abs(image.view.time_s - view.time_s) <= SAME_TIME_S
         surface = image.depth if fresh else torch.where(image.moving, torch.zeros_like(image.depth), image.depth)
         rgb, labels, new = warp(view, depth, image, surface, rules.hidden_share)
         rgb = shown.image_of(view.camera.name, rgb).clamp(0, 1) if shown.to_common else rgb
@@ -544,10 +511,10 @@ def _condition_of_view(
     return (color, depth[None], here.measured[None], found[None], backdrop, ids[None], far_ids), here.render
 
 
-def _among_measured(sparse: ProjectedPoints, depth: Tensor, rules: ConditionRules) -> Tensor:
+def _among_measured(sparse: ProjectedPoints, depth: Tensor) -> Tensor:
     """Which pixels are measured, or have measured ones of their filled depth f32[H,W] to both sides in some direction,
-    at most twice `measured_reach_px` away, bool[H,W]: the surface goes on there, whatever a render with holes shows."""
-    reach = 2 * rules.measured_reach_px
+    at most twice `REACH_PX` away, bool[H,W]: the surface goes on there, whatever a render with holes shows."""
+    reach = 2 * REACH_PX
     own = functional.pad(torch.where(sparse.valid, sparse.depth, torch.inf)[None, None], (reach,) * 4, value=torch.inf)[
         0, 0
     ]
@@ -558,7 +525,7 @@ def _among_measured(sparse: ProjectedPoints, depth: Tensor, rules: ConditionRule
         for step in range(1, reach + 1):
             top, left = reach + step * down, reach + step * right
             there = own[top : top + height, left : left + width]
-            found |= (there - depth).abs() <= rules.another_surface * depth
+            found |= (there - depth).abs() <= ANOTHER_SURFACE * depth
         return found
 
     between = sparse.valid.clone()
@@ -573,10 +540,9 @@ def _published_condition(
     views: Sequence[View],
     reference: Tensor,
     rules: ConditionRules,
-    recolor: Recolor | None,
+    recolor: WeatheredPoints | None,
 ) -> Condition:
-    own = (rules.width, rules.height)
-    native = (rules.fine_width or rules.width, rules.fine_height or rules.height)
+    own, native = rules.size, rules.fine
     seen = views if native == own else [view.resized(*native) for view in views]
     sparse = [rules.project(cloud, tracks, view) for view in seen]
     valid = torch.stack([s.valid for s in sparse])[:, None]
@@ -597,27 +563,28 @@ def _measured(cloud: FusedCloud, tracks: Sequence[Track], views: Sequence[View],
     each pixel takes the cell in its middle: depth is never mixed, and the nearest of many points in a coarse pixel is
     not preferred.
     """
-    own, seen = (rules.width, rules.height), replace(rules, published=False)
+    own, seen = rules.size, replace(rules, published=False)
     grid = max(own[0], rules.fine_width), max(own[1], rules.fine_height)
     points = [seen.project(cloud, tracks, view if grid == own else view.resized(*grid)) for view in views]
     whole = SparseDepth(*(torch.stack([getattr(p, name) for p in points])[:, None] for name in ("depth", "valid")))
     return whole.map(lambda x: functional.interpolate(x.float(), size=own[::-1], mode="nearest-exact").to(x.dtype))
 
 
-def _reference(view: View, recorded: Sequence[Photo], rules: ConditionRules, recolor: Recolor | None) -> Tensor:
+def _reference(view: View, recorded: Sequence[Photo], rules: ConditionRules, recolor: WeatheredPoints | None) -> Tensor:
     own = [r for r in recorded if r.view.camera.name == view.camera.name] or list(recorded)
     if not own:
-        return torch.zeros(3, rules.height, rules.width)
+        return torch.zeros(3, *rules.size[::-1])
     nearest = min(own, key=lambda r: abs(r.view.time_s - view.time_s))
     rgb = nearest.rgb
     if nearest.usable is not None and not nearest.usable.all():
-        rgb = rgb[nearest_valid(nearest.usable)]
+        rows, columns = nearest_pixels(torch.from_numpy(nearest.usable))
+        rgb = rgb[rows.numpy(), columns.numpy()]
     if recolor is not None:
         rgb = to_bytes(recolor.photo(nearest.view, image_tensor(rgb)))
     if rules.published and rules.fine_width:
-        size = (rules.height, rules.width)
+        size = rules.size[::-1]
         return functional.interpolate(image_tensor(rgb)[None], size=size, mode="bilinear", align_corners=False)[0]
-    return image_tensor(resize_area(rgb, rules.width, rules.height))
+    return image_tensor(resize_area(rgb, *rules.size))
 
 
 def image_tensor(rgb: NDArray[np.uint8]) -> Tensor:
@@ -625,16 +592,15 @@ def image_tensor(rgb: NDArray[np.uint8]) -> Tensor:
     return torch.from_numpy(rgb.copy()).permute(2, 0, 1).float().div(255.0).contiguous()
 
 
-def _rank_of_images(
-    view: View, recorded: Sequence[Photo], rules: ConditionRules
-) -> Callable[[int], tuple[float, bool, float]]:
-    """What sorts recorded images by how well they serve a view (see `_order_of_images`)."""
+def _rank_of_images(view: View, recorded: Sequence[Photo]) -> Callable[[int], tuple[float, bool, float]]:
+    """What sorts recorded images by how well they serve a view: nearest in time first (steps of 20 ms), the same camera
+    before others, then by distance."""
 
     def rank(number: int) -> tuple[float, bool, float]:
         other = recorded[number].view
         distance_m = float(np.linalg.norm(other.center_world - view.center_world))
         elsewhere = other.camera.name != view.camera.name
-        return round((abs(other.time_s - view.time_s) + rules.other_camera_s * elsewhere) / 0.02), elsewhere, distance_m
+        return round((abs(other.time_s - view.time_s) + OTHER_CAMERA_S * elsewhere) / 0.02), elsewhere, distance_m
 
     return rank
 
@@ -642,22 +608,22 @@ def _rank_of_images(
 def _order_of_images(
     view: View, depth: Tensor, recorded: Sequence[Photo], among: Sequence[int], rules: ConditionRules
 ) -> list[int]:
-    """The images to try for a view of depth f32[H,W]: nearest in time first (steps of 20 ms; see `other_camera_s`), the
-    same camera before others, then by distance. Images that hardly overlap the view are left out, but for the first."""
+    """The images to try for a view of depth f32[H,W], best first; without those that hardly overlap it, but for the
+    first."""
     columns, rows = min(view.camera.width, OVERLAP_GRID[0]), min(view.camera.height, OVERLAP_GRID[1])
     coarse = view.resized(columns, rows)
     there = functional.interpolate(depth[None, None], size=(rows, columns), mode="nearest-exact")[0]
     chosen: list[int] = []
-    for number in sorted(among, key=_rank_of_images(view, recorded, rules)):
+    for number in sorted(among, key=_rank_of_images(view, recorded)):
         if len(chosen) == rules.images_per_view:
             break
         other = recorded[number].view
-        if not chosen or float(inside(other, *carry(coarse, there, other)).float().mean()) >= rules.least_overlap:
+        if not chosen or float(inside(other, *carry(coarse, there, other)).float().mean()) >= LEAST_OVERLAP:
             chosen.append(number)
     return chosen
 
 
-def _prepare_source(points: DrawnCloud, recorded: Photo, target: View, rules: ConditionRules) -> WarpSource:
+def _prepare_source(points: DrawnCloud, recorded: Photo, target: View) -> WarpSource:
     """A recorded image brought to about as many pixels as the target view, with its depth."""
     camera = recorded.view.camera
     scale = (target.camera.width * target.camera.height / (camera.width * camera.height)) ** 0.5
@@ -676,6 +642,49 @@ def _prepare_source(points: DrawnCloud, recorded: Photo, target: View, rules: Co
     return WarpSource(view, common, here.depth, here.moving, ids, usable)
 
 
+# views in other weather or light ------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class InWeather:
+    """Weather for the views of a drive: settings, light and ground of the drive, seed of drops and patches, and the
+    velocity of the cameras at a time."""
+
+    settings: Conditions
+    drive: DriveFacts
+    seed: int
+    velocity_at: Callable[[float], tuple[float, float, float]]
+
+    def image(self, view: View, rgb: Tensor, depth: Tensor, ids: Tensor) -> Tensor:
+        """Colours f32[3,H,W] in this weather, from depth f32[1,H,W] and classes u8[1,H,W]; sky has no depth."""
+        metres = torch.where(ids == palette.ID["sky"], torch.zeros_like(depth), depth)[0].numpy().astype(np.float32)
+        shown = ShownView(view, rgb.permute(1, 2, 0).numpy(), metres, ids[0].numpy())
+        made = weather.edited_view(shown, self.settings, self.seed, self.drive, self.velocity_at(view.time_s))
+        return torch.from_numpy(np.ascontiguousarray(made.transpose(2, 0, 1), np.float32)).clamp(0, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class WeatheredPoints:
+    """What the published system is given of a drive in weather: points and recorded images, edited at the camera's
+    size, with the surfaces of a fitted scene between and behind them. Geometry and classes stay."""
+
+    how: InWeather
+    render_at: RenderAt
+
+    def points(self, view: View, seen: ProjectedPoints) -> Tensor:
+        """Colours f32[3,H,W] of projected points in this weather, each at its own distance; meaningless where there are
+        none."""
+        shown = self.render_at(view)
+        ids = torch.where(seen.valid & (shown.semantics == palette.ID["sky"]), palette.UNLABELLED, shown.semantics)
+        depth = torch.where(seen.valid, seen.depth, shown.depth)
+        return self.how.image(view, torch.where(seen.valid, seen.rgb, shown.color), depth, ids.to(torch.uint8))
+
+    def photo(self, view: View, rgb: Tensor) -> Tensor:
+        """A recorded image f32[3,H,W] in this weather."""
+        shown = self.render_at(view)
+        return self.how.image(view, rgb, shown.depth, shown.semantics)
+
+
 # planes of all views, in memory or in files -------------------------------------------------------
 
 
@@ -685,11 +694,8 @@ LARGE_PIXELS = 2_500_000
 
 class PreparedImages(dict[int, WarpSource]):
     """Recorded images made ready for warping, by their numbers, for all windows and trajectories that a process makes;
-    colours as bytes where that is exact.
-
-    Args:
-        folder: where large conditions are kept while they are used, in files without names; None: in memory.
-    """
+    colours as bytes where that is exact. folder: where large conditions are kept while they are used, in files without
+    names; None: in memory."""
 
     def __init__(self, folder: Path | None = None) -> None:
         super().__init__()
@@ -707,22 +713,18 @@ class PreparedImages(dict[int, WarpSource]):
 
 
 def stacked(rows: Iterable[Sequence[Tensor]], count: int, folder: Path | None) -> list[Tensor]:
-    """``torch.stack`` of every column of ``count`` rows, of which only one is in memory besides.
+    """``torch.stack`` of every column of ``count`` rows, of which only one is in memory besides. rows: planes ``[...,
+    H, W]`` of one view each. folder: where large ones are put into files; None: all stay in memory."""
 
-    Args:
-        rows: planes ``[..., H, W]`` of one view each. folder: where large ones are put into files; None: all stay in
-            memory.
-    """
+    def empty(like: Tensor) -> Tensor:
+        if folder is None or like.shape[-2] * like.shape[-1] <= LARGE_PIXELS:
+            return like.new_empty((count, *like.shape))
+        return torch.from_numpy(memory.mapped_array(folder, (count, *like.shape), like.numpy().dtype))
+
     stacks: list[Tensor] = []
     for number, row in enumerate(rows):
-        stacks = stacks or [_empty((count, *x.shape), x.dtype, folder) for x in row]
+        stacks = stacks or [empty(x) for x in row]
         for stack, x in zip(stacks, row, strict=True):
             stack[number] = x
         memory.rest_mapped()
     return stacks
-
-
-def _empty(shape: tuple[int, ...], dtype: torch.dtype, folder: Path | None) -> Tensor:
-    if folder is None or shape[-2] * shape[-1] <= LARGE_PIXELS:
-        return torch.empty(shape, dtype=dtype)
-    return torch.from_numpy(memory.mapped_array(folder, shape, torch.empty(0, dtype=dtype).numpy().dtype))

@@ -1,9 +1,7 @@
 """convert: a published checkpoint -> a model folder that `synthesize` and training read.
 
-The checkpoint is a pickle from elsewhere. It is opened in a process of its own, under a memory limit, by torch's
-restricted unpickler; its names and shapes are compared with the network's, strictly; its caption is embedded once, so
-that the text tower need not be kept. Checkpoints of DynamiCrafter (8 input channels, no modality label) are widened as
-the paper says.
+The checkpoint is a pickle from elsewhere: it is opened in a process of its own, under a memory limit, by torch's
+restricted unpickler.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ from torch import Tensor
 from mudg.base import log, processes, store, weights
 from mudg.base.errors import InputError, UsageError
 from mudg.base.run_folder import Replacement, all_names, refuse_overlap
-from mudg.diffusion import published
+from mudg.diffusion import model_files
 from mudg.diffusion.published import SCALE_ENTRIES, PublishedConfig, PublishedMDM
 from mudg.diffusion.settings import ConvertConfig
 from mudg.networks import clip
@@ -31,8 +29,6 @@ from mudg.networks.clip import TextTower
 _UNET = "model.diffusion_model."
 _ENTER = _UNET + "input_blocks.0.0.weight"
 DTYPES = {"keep": None, "float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
-SHARD_BYTES = 2**30
-"""Largest size of one weight file."""
 LICENCE = (
     "Weights keep the terms of those who published them; read the page they came from before any use. The code of MuDG"
     " and of DynamiCrafter is Apache-2.0; the data they were trained on have licences of their own (the Waymo Open"
@@ -46,21 +42,12 @@ Conversion = Callable[[Path], tuple[Work, int]]
 
 
 def run(config: ConvertConfig, checkpoint: Path, to: Path, conversion: Conversion, *, overwrite: bool = False) -> Path:
-    """Convert one checkpoint; returns `to`, which is complete or not there.
-
-    Args:
-        config: see `ConvertConfig`. checkpoint: a .ckpt, .pt or .safetensors file; or the folder around DepthLab's
-            files.
-        to: folder of the model; replaced only with `overwrite`.
-        conversion: of this kind of checkpoint.
-
-    Raises:
-        UsageError: the folder exists, or the resolution is not known. InputError: not such a checkpoint; nothing is
-            written.
-        ResourceError: memory limit or disk.
-    """
+    """Convert one checkpoint; returns `to`, which is complete or not there. config: see `ConvertConfig`. checkpoint: a
+    .ckpt, .pt or .safetensors file; or the folder around DepthLab's files. to: folder of the model; replaced only with
+    `overwrite`. conversion: of this kind of checkpoint. UsageError: the folder exists, or the resolution is not known.
+    InputError: not such a checkpoint; nothing is written. ResourceError: memory limit or disk."""
     checkpoint, to = Path(checkpoint), Path(to)
-    refuse_overlap(to, {"checkpoint": checkpoint, "towers": config.towers})
+    refuse_overlap(to, {"checkpoint": checkpoint})
     replacement = Replacement.at(to)
     replacement.recover(lambda folder: bool(own_names(folder)), own_names)
     replaces = to.exists()
@@ -103,17 +90,13 @@ def own_names(folder: Path) -> list[str]:
 def of_diffusion(
     config: ConvertConfig, checkpoint: Path, to: Path, network: PublishedConfig | None = None
 ) -> tuple[Work, int]:
-    """The conversion of a diffusion model, and the address space it may take.
-
-    Args:
-        network: sizes of the network the checkpoint should hold (None: the published ones).
-    """
+    """The conversion of a diffusion model, and the address space it may take. network: sizes of the network the
+    checkpoint should hold (None: the published ones)."""
     if not checkpoint.is_file():
         raise InputError("no such checkpoint", where=str(checkpoint))
     height, width = resolution(config, checkpoint)
     network = replace(network or PublishedConfig(), height=height, width=width)
-    towers = [Path(config.towers)] if config.towers and Path(config.towers).is_file() else []
-    return functools.partial(convert_file, config, checkpoint, to, network), memory_limit(config, checkpoint, *towers)
+    return functools.partial(convert_file, config, checkpoint, to, network), memory_limit(config, checkpoint)
 
 
 def resolution(config: ConvertConfig, checkpoint: Path) -> tuple[int, int]:
@@ -125,12 +108,9 @@ def resolution(config: ConvertConfig, checkpoint: Path) -> tuple[int, int]:
         for mark, size in (("1024", (576, 1024)), ("512", (320, 512))):
             if mark in part:
                 return size
-    raise UsageError(
-        "the training resolution is not in the file's name",
-        where=str(checkpoint),
-        expected="512 or 1024 in the name",
-        remedy="add --resolution 320x512 or --resolution 576x1024",
-    )
+    what = "the training resolution is not in the file's name"
+    remedy = "add --resolution 320x512 or --resolution 576x1024"
+    raise UsageError(what, where=str(checkpoint), expected="512 or 1024 in the name", remedy=remedy)
 
 
 def memory_limit(config: ConvertConfig, *files: Path) -> int:
@@ -142,15 +122,12 @@ def memory_limit(config: ConvertConfig, *files: Path) -> int:
     if config.memory_gb:
         return int(config.memory_gb * 1e9)
     read = sum(path.stat().st_size * (1 if zipfile.is_zipfile(path) else 2) for path in files)
-    return read + 2 * SHARD_BYTES + 3 * processes.GIB
+    return read + 2 * model_files.SHARD_BYTES + 3 * processes.GIB
 
 
 def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: PublishedConfig) -> None:
     """The conversion itself, in this process (see `run` for errors)."""
-    found = weights.read_checkpoint(checkpoint)
-    if config.towers:
-        found = weights.with_towers(found, weights.read_checkpoint(Path(config.towers)))
-    found, adapted = widen(found)
+    found, adapted = widen(weights.read_checkpoint(checkpoint))
     tensors = weights.match(found, wanted_shapes(network), str(checkpoint))
     _check_values(found, tensors, checkpoint)
     base_scale = float(tensors["scale"][-1])
@@ -168,8 +145,7 @@ def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: Pub
         "caption": clip.CAPTION,
         "licence": LICENCE,
     }
-    dtype = DTYPES[config.dtype]
-    published.save(to, network, tensors, facts, _card(network, facts), dtype=dtype, shard_bytes=SHARD_BYTES)
+    model_files.save_published(to, network, tensors, facts, _card(network, facts), DTYPES[config.dtype])
 
 
 def widen(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
@@ -209,20 +185,13 @@ def _check_values(state: Mapping[str, Tensor], tensors: Mapping[str, Tensor], wh
     weights.refuse_bad_values(tensors, str(where))
     scale, alpha_bar = tensors["scale"].float(), state.get("alphas_cumprod")
     if float(scale.min()) <= 0 or float(scale.max()) > 1 + 1e-6:
-        raise InputError(
-            "the dynamic rescale table is out of range",
-            where=f"{where}: scale_arr",
-            expected="0 < value <= 1",
-            got=f"{float(scale.min())} .. {float(scale.max())}",
-        )
+        what, got = "the dynamic rescale table is out of range", f"{float(scale.min())} .. {float(scale.max())}"
+        raise InputError(what, where=f"{where}: scale_arr", expected="0 < value <= 1", got=got)
     if alpha_bar is not None and abs(float(alpha_bar.flatten()[-1])) > 1e-6:
-        raise InputError(
-            "the checkpoint's noise schedule keeps signal at its last step",
-            where=f"{where}: alphas_cumprod[-1]",
-            expected="0",
-            got=str(float(alpha_bar.flatten()[-1])),
-            remedy="take a MuDG or DynamiCrafter checkpoint; this is another model",
-        )
+        what = "the checkpoint's noise schedule keeps signal at its last step"
+        remedy = "take a MuDG or DynamiCrafter checkpoint; this is another model"
+        got = str(float(alpha_bar.flatten()[-1]))
+        raise InputError(what, where=f"{where}: alphas_cumprod[-1]", expected="0", got=got, remedy=remedy)
 
 
 @torch.no_grad()

@@ -1,17 +1,7 @@
 """learn: train a multi-modal diffusion model on generated cities or recorded logs, on one process or many.
 
-Read from `train`: open the clips, train the latent codec (`models.py`), train the denoising network, score, export. The
-training loop is in full view in `_train_network`; from the disk to the loss it goes through `clips.py` and `model.py`
-(`MDM.loss`). Every draw is a function of (seed, step) and of a clip's place in the step's batch, so a run that was
-interrupted and continued equals one that was not: bit for bit at a fixed number of threads and processes, up to
-rounding if the number of processes or the layout changed meanwhile.
-
-OUT/clips/    one shard per city or clip of a log (or the folder `data.clips` of the configuration)
-OUT/codec/    checkpoints of the codec         OUT/steps/   checkpoints of the network, its moving average, the
-              optimiser
-OUT/samples/  picture grids during training    OUT/log.jsonl, OUT/metrics.json
-OUT/model/    the exported model: fp16 weights, model.json, MODEL_CARD.md
-OUT/cache/    clips that were fetched or made when they were drawn; removed at the end
+Read from `train`; the loop is in full view in `_train_network`. Every draw is a function of (seed, step) and of a
+clip's place in the step's batch, so a continued run equals an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -23,7 +13,6 @@ import os
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -32,23 +21,31 @@ import torch
 from torch import Tensor
 
 from mudg.base import log, store
+from mudg.base.checkpoint import Checkpoint
 from mudg.base.config import to_dict
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.location import Location
 from mudg.base.processes import Interruption, calls_beside, run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput
 from mudg.base.types import Clip
-from mudg.diffusion import city_clips, log_clips, model_files, models, parallel, score
+from mudg.diffusion import city_clips, log_clips, model_files, models, parallel
 from mudg.diffusion.city_clips import CityClipRules
-from mudg.diffusion.clips import TrainingClips, class_weights, clips_at, shard_path
+from mudg.diffusion.clips import ShardFolder, TrainingClips, class_weights, counts_at, shard_path
 from mudg.diffusion.log_clips import LogClipRules, LogSource
-from mudg.diffusion.memory_plan import choose_bf16
 from mudg.diffusion.model import MDM, BatchPart, LossSettings
 from mudg.diffusion.models import Model, starting_model
-from mudg.diffusion.parallel import SAME_SIGNAL_S, Ranks, Spread, TrainingState, agreed_terms, mean_of
-from mudg.diffusion.requests import SampleRequest, sized_to_area
+from mudg.diffusion.parallel import (
+    SAME_SIGNAL_S,
+    Ranks,
+    TrainingState,
+    agreed_terms,
+    mean_of,
+    newest_checkpoint,
+    read_group,
+)
+from mudg.diffusion.requests import SampleRequest, half_format, sized_to_area
 from mudg.diffusion.settings import LearnConfig
-from mudg.diffusion.shard_sources import ListedClips, ListedShards, ShardCache, StreamedShards, is_list, read_list
+from mudg.diffusion.shard_sources import ListedClips, ListedShards, ShardCache, is_list, read_list
 from mudg.scene.read import read_scene
 
 WEIGHT_DECAY = 0.01
@@ -60,14 +57,9 @@ def train(config: LearnConfig, out: Path, output: VerbOutput, open_work: Callabl
 
     Under `torchrun` every process calls this with the same arguments; `out` lies on a file system that all see.
 
-    Args:
-        open_work: opens the folder, in the leader alone; a finished result is verified and used again.
-
-    Raises:
-        NumericsError: a loss or gradient is not finite (names the term, the step and the process; parameters are
-            untouched).
-        InputError: logs or clips that cannot be used. ResourceError, UsageError: see `RunDir.open`.
-    """
+    open_work: opens the folder, in the leader alone; a finished result is verified and used again. NumericsError: a
+    loss or gradient is not finite (names the term, the step and the process; parameters are untouched). InputError:
+    logs or clips that cannot be used. ResourceError, UsageError: see `RunDir.open`."""
     torch.set_num_threads(config.threads)
     with parallel.join_processes(config.compute.device) as ranks:
         model, fresh = starting_model(config)
@@ -113,20 +105,20 @@ def files_read(config: LearnConfig, out: Path, overwrite: bool) -> dict[str, Pat
         listed = [text for scene in read_list(config.data.scenes[0]).scenes for text in scene.path.split("=")]
         read |= {f"scene {text}": text for text in listed if Location.of(text).local is not None}
         read["list"] = config.data.scenes[0] if Location.of(config.data.scenes[0]).local is not None else ""
-    clips = "" if clips_at_address(config) else config.data.clips
-    own_clips = not overwrite and Path(clips).resolve() == (out / "clips").resolve()
-    return {**read, "clips": "" if own_clips else clips}
+    own_clips = not overwrite and Path(config.data.clips).resolve() == (out / "clips").resolve()
+    return {**read, "clips": "" if own_clips else config.data.clips}
 
 
 def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir, ranks: Ranks) -> None:
     """Clips, codec, network, scores."""
     out = directory.path
-    bf16 = choose_bf16(config.precision, ranks.device)
+    bf16 = half_format(config.precision, ranks.device) is not None
     source, making = open_clips(config, model, out, ranks)
     with making:
         if "codec" in fresh and isinstance(model, MDM):
             ranks.leader_does(lambda: models.train_codec(model.codec, source, directory, bf16, ranks.device))
-            models.load_trained_codec(model.codec, out, ranks)
+            trained = cast("Checkpoint", newest_checkpoint(out / "codec", ranks))  # the leader's, in every process
+            read_group(trained, "net", torch.nn.ModuleDict({"codec": model.codec}).state_dict())
             models.draw_weights(model.net, config.seed, "weights")
         for name in ("refiner", "finisher"):
             part = getattr(model, name, None)
@@ -143,7 +135,7 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
         if isinstance(made, MDM) and made.refiner is not None and config.loss.class_balance:
             made.refiner.take_back(class_weights(source.shards, source.weighed(), config.loss.class_balance))
         request = SampleRequest(config.score.steps, config.seed, bf16=bf16)
-        scores = score.score(made, source.to_score(), source.shards, request)
+        scores = models.score(made, source.to_score(), source.shards, request)
         store.write_json(out / "metrics.json", scores)
         facts: dict[str, Any] = {"recipe": to_dict(config), "held_out": scores}
         if config.start:
@@ -151,7 +143,7 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
         models.save(made, out / "model", models.model_card(made, source, scores), facts)
         shutil.rmtree(out / CACHE, ignore_errors=True)
         directory.finish({"held_out": scores["average"]})
-        log.info(*score.table(scores).splitlines())
+        log.info(*models.table(scores).splitlines())
 
     ranks.leader_does(finish)
 
@@ -163,36 +155,18 @@ CACHE = "cache"
 """Where in the output folder clips are kept that are fetched or made when they are needed, while training runs."""
 
 
-def clips_at_address(config: LearnConfig) -> bool:
-    """Whether the setting `clips` is an address in an object store."""
-    return bool(config.data.clips) and Location.of(config.data.clips).local is None
-
-
 def check_clips(config: LearnConfig) -> None:
     """UsageError for settings of clips that do not go together."""
-    if config.data.scenes and clips_at_address(config):
-        raise UsageError(
-            "logs and clips at an address are given",
-            where="--data.scenes, --data.clips",
-            got=config.data.clips,
-            remedy="leave one out; a list of scenes may name folders of clips at addresses",
-        )
     if config.data.clips and is_list(config.data.scenes):
-        raise UsageError(
-            "a list of scenes says where the clips are",
-            where="--data.clips",
-            got=config.data.clips,
-            remedy="leave it out; --compute.cache chooses where clips that were made or fetched are kept",
-        )
+        what = "a list of scenes says where the clips are"
+        remedy = "leave it out; --compute.cache chooses where clips that were made or fetched are kept"
+        raise UsageError(what, where="--data.clips", got=config.data.clips, remedy=remedy)
 
 
 def open_clips(
     config: LearnConfig, model: Model, out: Path, ranks: Ranks
 ) -> tuple[TrainingClips, contextlib.AbstractContextManager[None]]:
-    """The clips of a training, those of logs made; and a block while which processes make the missing ones of cities.
-
-    A model that uses no renders needs no fitted cities.
-    """
+    """The clips of a training, those of logs made; and a block in which processes make the missing ones of cities."""
     check_clips(config)
     data, points_alone = config.data, model.points_alone
     folder, nothing = Path(data.clips) if data.clips else out / "clips", contextlib.nullcontext()
@@ -204,15 +178,7 @@ def open_clips(
         return clips_of_logs(config, rules, folder, *counts), nothing
     fitted = data.renders and isinstance(model, MDM) and model.config.renders
     source = clips_of_cities(config, folder, points_alone)
-    if clips_at_address(config):
-        shards = StreamedShards(Location.of(data.clips), _cache(config, out), data.clips_per_city)
-        return replace(source, shards=shards), nothing
-    return source, making_clips(source, city_rules(config, points_alone, fitted)) if ranks.leads else nothing
-
-
-def _cache(config: LearnConfig, out: Path) -> ShardCache:
-    compute = config.compute
-    return ShardCache(Path(compute.cache) if compute.cache else out / CACHE, int(compute.cache_gb * 1e9))
+    return source, making_clips(source, folder, city_rules(config, points_alone, fitted)) if ranks.leads else nothing
 
 
 def clips_of_cities(config: LearnConfig, folder: Path, points_alone: bool = False) -> TrainingClips:
@@ -222,8 +188,7 @@ def clips_of_cities(config: LearnConfig, folder: Path, points_alone: bool = Fals
     if data.realism != "plain" and not points_alone:
         sizes = [city_clips.size_of(city_rules(config), city) for city in range(city_clips.SIZES)]
     held_out = [city_clips.HELD_OUT + n for n in range(data.held_out)]
-    numbers = range(data.skip_cities, data.skip_cities + data.cities)
-    return TrainingClips(config, folder, size, sizes, numbers, data.first_cities, held_out)
+    return TrainingClips(config, ShardFolder(folder), size, sizes, range(data.cities), data.first_cities, held_out)
 
 
 def city_rules(config: LearnConfig, points_alone: bool = False, fitted: bool = False) -> CityClipRules:
@@ -239,19 +204,17 @@ def city_rules(config: LearnConfig, points_alone: bool = False, fitted: bool = F
         realism=data.realism,
         textures=data.textures,
         fitted=fitted,
-        log_frames=data.log_frames,
-        side_cameras=data.side_cameras,
-        fit_steps=data.fit_steps,
     )
 
 
-def making_clips(source: TrainingClips, rules: CityClipRules) -> contextlib.AbstractContextManager[None]:
+def making_clips(source: TrainingClips, folder: Path, rules: CityClipRules) -> contextlib.AbstractContextManager[None]:
     """A block while which processes make the missing clips of cities, held-out ones first (see ``calls_beside``)."""
-    folder, workers = cast("Path", source.shards), source.config.compute.workers
-    wanted = [*source.scored, *source.numbers]
-    missing = [n for n in wanted if not shard_path(folder, n).is_file()]
-    for number in set(wanted).difference(missing):
-        clips_at(shard_path(folder, number))  # a damaged one is found before the training begins
+    workers, missing = source.config.compute.workers, list[int]()
+    for number in (*source.scored, *source.numbers):
+        if source.shards.has(number):
+            counts_at(shard_path(folder, number))  # a damaged one is found before the training begins
+        else:
+            missing.append(number)
     if not missing or workers == 0:
         return contextlib.nullcontext()
     store.make_folder(folder)
@@ -260,8 +223,7 @@ def making_clips(source: TrainingClips, rules: CityClipRules) -> contextlib.Abst
             "training clips cannot be written here", where=str(folder), remedy="choose another --data.clips"
         )
     log.info(f"learn: {len(missing)} cities to generate into {folder}, {workers} processes")
-    fit = city_clips.fit_city if rules.fitted else None
-    return calls_beside(city_clips.write_city, [(rules, n, folder, fit) for n in missing], workers)
+    return calls_beside(city_clips.write_city, [(rules, n, folder) for n in missing], workers)
 
 
 def log_rules(config: LearnConfig, multiple: int, points_alone: bool = False) -> LogClipRules:
@@ -272,12 +234,8 @@ def log_rules(config: LearnConfig, multiple: int, points_alone: bool = False) ->
     data, scene = config.data, read_scene(log_clips.log_source(config.data.scenes[0]).scene)
     names = data.cameras or tuple(scene.cameras)
     if names[0] not in scene.cameras:
-        raise InputError(
-            "the scene has no such camera",
-            where=f"--data.cameras, {scene.root}",
-            expected=", ".join(scene.cameras),
-            got=names[0],
-        )
+        what = "the scene has no such camera"
+        raise InputError(what, where=f"--data.cameras, {scene.root}", expected=", ".join(scene.cameras), got=names[0])
     camera, size = scene.cameras[names[0]], (data.width, data.height)
     if not points_alone:
         size = sized_to_area(data.width * data.height, camera.width / camera.height, multiple)
@@ -309,11 +267,7 @@ def make_log_clips(config: LearnConfig, rules: LogClipRules, folder: Path) -> tu
         for source in dict.fromkeys(sources)
     ]
     with log.task("clips of logs", len(jobs)) as bar:
-        if workers < 2 or len(jobs) == 1:
-            made = (log_clips.write_log(*job) for job in jobs)
-        else:
-            made = run_in_processes(log_clips.write_log, jobs, workers)
-        for _ in made:
+        for _ in run_in_processes(log_clips.write_log, jobs, max(1, min(workers, len(jobs)))):
             bar.advance()
     scored = sum(window.held_out for _, _, window in rows)
     return len(rows) - scored, scored
@@ -333,12 +287,12 @@ def clips_of_logs(config: LearnConfig, rules: LogClipRules, folder: Path, train:
         f" means every {data.held_out_every}. window of these logs."
     )
     to_score = [city_clips.HELD_OUT + n for n in range(scored)] if data.held_out_every else [0]
-    return TrainingClips(config, folder, size, [size], range(train), train, to_score, about)
+    return TrainingClips(config, ShardFolder(folder), size, [size], range(train), train, to_score, about)
 
 
 def listed_clips(config: LearnConfig, multiple: int, points_alone: bool, out: Path) -> ListedClips:
     """Clips of listed scenes, of the configuration's size, which is rounded to what the model takes."""
-    data, size = config.data, (config.data.width, config.data.height)
+    data, compute, size = config.data, config.compute, (config.data.width, config.data.height)
     if not points_alone:
         size = round(data.width / multiple) * multiple, round(data.height / multiple) * multiple
     scenes = read_list(data.scenes[0], data.held_out)
@@ -348,7 +302,8 @@ def listed_clips(config: LearnConfig, multiple: int, points_alone: bool, out: Pa
         f"clips of {data.window} frames of {len(scenes.scenes)} listed scenes at {size[0]}x{size[1]} pixels\n"
         f"({shares}). {len(scenes.scored)} scenes were held out for scoring."
     )
-    shards = ListedShards(scenes, _cache(config, out), rules_of_size(config, size, 0, points_alone), data.bad_scenes)
+    cache = ShardCache(Path(compute.cache) if compute.cache else out / CACHE, int(compute.cache_gb * 1e9))
+    shards = ListedShards(scenes, cache, rules_of_size(config, size, 0, points_alone), data.bad_scenes)
     return ListedClips(config, shards, size, [size], range(0), 0, (), about)
 
 
@@ -357,13 +312,9 @@ Drawn = list[list[Clip]]
 
 
 class DrawingAhead:
-    """Threads that draw the clips of the next steps while a step is computed.
-
-    Args:
-        draw: the clips of a step, by portions. ready: whether nothing has to be waited for to draw them.
-        depth: so many steps ahead. 0: none.
-        steps: of the training.
-    """
+    """Threads that draw the clips of the next steps while a step is computed. draw: the clips of a step, by portions.
+    ready: whether nothing has to be waited for to draw them. depth: so many steps ahead. 0: none. steps: of the
+    training."""
 
     def __init__(self, draw: Callable[[int], Drawn], ready: Callable[[int], bool], depth: int, steps: int) -> None:
         self._draw, self._ready, self._depth, self._steps = draw, ready, depth, steps
@@ -402,8 +353,9 @@ def frames_at(config: LearnConfig, step: int) -> int:
     return config.data.window if late else max(1, config.data.window // 2)
 
 
-def _begin(model: Model, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[TrainingState, Spread]:
-    """Freeze, spread over the processes, make the optimiser, and take up the newest checkpoint."""
+def _begin(model: Model, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[TrainingState, torch.nn.Module]:
+    """Freeze, spread over the processes, make the optimiser, and take up the newest checkpoint. Returns what to call in
+    place of the model, too."""
     models.freeze(model, config.frozen)
     model.to(ranks.device)
     trained = model.trained_part()
@@ -411,7 +363,7 @@ def _begin(model: Model, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[
     if config.compute.recompute:
         for part in trained.values():
             parallel.recompute(part)
-    spread = Spread(model, trained, ranks, config.compute.parallel)
+    network = parallel.spread(model, ranks)
     rules, moving = config.optimizer, [p for p in trained.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(moving, lr=rules.lr, betas=rules.betas, weight_decay=WEIGHT_DECAY, fused=True)
     average = None
@@ -421,8 +373,8 @@ def _begin(model: Model, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[
     if state.resume(out, ranks):
         log.info(f"learn: resuming at step {state.step}")
     if ranks.size > 1:
-        log.info(f"learn: {ranks.size} processes, {config.compute.parallel}")
-    return state, spread
+        log.info(f"learn: {ranks.size} processes")
+    return state, network
 
 
 def _batch(config: LearnConfig, ranks: Ranks, step: int) -> tuple[int, int, list[slice]]:
@@ -433,32 +385,32 @@ def _batch(config: LearnConfig, ranks: Ranks, step: int) -> tuple[int, int, list
 
 
 def _train_network(model: Model, source: TrainingClips, run_dir: RunDir, bf16: bool, ranks: Ranks) -> dict[str, Tensor]:
-    """Train what the model names; returns the weights to use (the moving average), whole, in the leader."""
+    """Train what the model names; returns the weights to use (the moving average)."""
     config, out = source.config, run_dir.path / "steps"
-    state, spread = _begin(model, config, out, ranks)
-    weights = class_weights(source.shards, source.weighed(), config.loss.class_balance).to(ranks.device)
-    settings = loss_settings(config, weights)
+    state, network = _begin(model, config, out, ranks)
+    balance = class_weights(source.shards, source.weighed(), config.loss.class_balance).to(ranks.device)
+    settings = LossSettings(balance, config.loss.refined_share, config.data.reference_dropout)
+    picture_of = lambda step: run_dir.path / "samples" / f"{step:07d}.png"
 
     def draw(step: int) -> Drawn:
         frames, count, parts = _batch(config, ranks, step)
         return [source.draw(step, count, frames, "batch", part) for part in parts]
 
-    def watch(weights: dict[str, Tensor], step: int) -> None:
-        """Score the model with these weights on a few held-out clips and draw a grid of what it makes."""
-        shards, picture = source.to_score()[: config.score.watched], _picture(run_dir, step)
+    def watch() -> None:
+        """Score the model as it is on a few held-out clips and draw a grid of what it makes."""
+        shards, made = source.to_score()[: config.score.watched], models.rebuilt(model, state.weights())
         request = SampleRequest(config.score.steps, config.seed, bf16=bf16)
-        scores = score.score(models.rebuilt(model, weights), shards, source.shards, request, picture=picture)
-        run_dir.log(step=step, held_out=scores["average"])
-        log.info(f"step {step}", *score.table(scores).splitlines())
+        scores = models.score(made, shards, source.shards, request, picture=picture_of(state.step))
+        run_dir.log(step=state.step, held_out=scores["average"])
+        log.info(f"step {state.step}", *models.table(scores).splitlines())
 
     def is_watched(step: int) -> bool:
         return step % config.score.every == 0 or step == config.steps
 
-    done = state.step  # a training may have been stopped between a checkpoint and its picture
-    if done and is_watched(done) and not ranks.leader_does(lambda: _picture(run_dir, done).is_file()):
-        made = state.export_weights(ranks)
-        ranks.leader_does(partial(watch, made, done))
-    facts = {"seed": config.seed, "layout": config.compute.parallel}
+    # a training may have been stopped between a checkpoint and its picture
+    if state.step and is_watched(state.step):
+        ranks.leader_does(lambda: None if picture_of(state.step).is_file() else watch())
+    facts = {"seed": config.seed}
     recent: list[dict[str, float]] = []
     begun, clock, saved_at = state.step, time.monotonic(), state.step
     with (
@@ -474,15 +426,15 @@ def _train_network(model: Model, source: TrainingClips, run_dir: RunDir, bf16: b
             state.optimizer.zero_grad(set_to_none=True)
             for part, drawn in zip(parts, ahead.take(step), strict=True):
                 clips = [clip.to(ranks.device) for clip in drawn]
-                with spread.portion(last=part is parts[-1]):
+                with parallel.portion(network, last=part is parts[-1]):
                     with torch.autocast(ranks.device.type, torch.bfloat16, enabled=bf16):
-                        loss = spread.network(clips, BatchPart(config.seed, step, part.start, count), settings)
+                        loss = network(clips, BatchPart(config.seed, step, part.start, count), settings)
                     (loss.total / len(parts)).backward()
                 for name, value in {**loss.terms, "total": float(loss.total.detach())}.items():
                     terms[name] = terms.get(name, 0.0) + value
             terms, stop = agreed_terms(ranks, terms, len(parts), step, "network", stop=interruption.requested)
             limit = config.optimizer.clip_norm or float("inf")
-            norm = float(parallel.gathered(torch.nn.utils.clip_grad_norm_(state.trained.parameters(), limit)))
+            norm = float(torch.nn.utils.clip_grad_norm_(state.trained.parameters(), limit))
             agreed_terms(ranks, {"gradient norm": norm}, 1, step, "network")
             state.optimizer.step()
             state.step = done = step + 1
@@ -498,22 +450,12 @@ def _train_network(model: Model, source: TrainingClips, run_dir: RunDir, bf16: b
                     run_dir.log(step=done, **values)
                 recent = []
             if done % config.compute.checkpoint_every == 0 or last or stop:
-                took_s = state.save(out, ranks, facts, config.compute.checkpoints_kept)
+                took_s = state.save(out, ranks, facts)
                 log.info(f"learn: checkpoint of step {done} in {took_s:.2f} s")
                 saved_at = done
             if is_watched(done):
-                made = state.export_weights(ranks)
-                ranks.leader_does(partial(watch, made, done))
+                ranks.leader_does(watch)
             if stop and not last:
                 log.info(f"learn: stopped after step {saved_at}, which is saved")
                 interruption.stop_now()
-    return state.export_weights(ranks)
-
-
-def _picture(run_dir: RunDir, step: int) -> Path:
-    return run_dir.path / "samples" / f"{step:07d}.png"
-
-
-def loss_settings(config: LearnConfig, weights: Tensor) -> LossSettings:
-    """What a configuration says about the loss."""
-    return LossSettings(weights, config.loss.refined_share, config.data.reference_dropout)
+    return state.weights()

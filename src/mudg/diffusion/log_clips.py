@@ -1,18 +1,8 @@
-"""Training clips from recorded logs: a scene, its fused cloud, and whatever labels it has.
+"""Training clips from recorded logs: windows of consecutive frames of one camera, seen from where they were recorded.
 
-A clip is a window of consecutive frames of one camera, seen from where they were recorded:
-
-* **truth**: the recorded images; depth of the LiDAR sweep taken with each image, where it measured, and elsewhere the
-  depth labels of the scene, where there are such, with their confidence; classes where labels exist and are trusted;
-* **condition**: what `synthesize` would build for these views without their own images. Every view gets only images
-  that are at least some moments away, so that the model has to complete something: between one and `farthest` moments,
-  drawn per window. A random share of the cloud's points is left out, so that depth is more than copying.
-
-The points of the cloud keep the colours that fusing gave them, also where those came from the very image that is the
-truth; so it is in the published system.
-
-Held-out frames of the scene are never read. Every n-th window is for scoring, and training windows that show a moment
-of one of these are left out.
+Truth is what was recorded; the condition is what `synthesize` would build for these views without their own images, and
+with a share of the points left out. Points keep the colours that fusing gave them, as in the published system. Held-out
+frames of the scene are never read, and no training window shows a moment of a window for scoring.
 """
 
 from __future__ import annotations
@@ -33,14 +23,16 @@ from mudg.base.types import Clip, Condition, Frame, FusedCloud, Photo, PointClou
 from mudg.core.pictures import resize_area, resize_nearest
 from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import project_points, seen_pixels
-from mudg.diffusion.clips import FAR_M, pack_clips, shard_path, write_shard
-from mudg.diffusion.condition import ConditionRules, build_conditions, filled_depth, image_tensor
+from mudg.diffusion.clips import FAR_M, shard_path, write_shard
+from mudg.diffusion.condition import SAME_TIME_S, ConditionRules, build_conditions, filled_depth, image_tensor
 from mudg.scene.clouds import read_fused
 from mudg.scene.labels import photographs, read_label, read_trusted_classes
 from mudg.scene.read import read_image, read_points, read_scene
 
 INDEX = "log_clips.json"
 SKY = palette.ID["sky"]
+FINE = 2
+"""Colours are gathered at so many times the clip's size."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +44,6 @@ class LogClipRules:
     window: int = 8
     stride: int = 4
     """Frames from one window's start to the next one's."""
-    frame_step: int = 1
-    """Take every n-th frame only."""
     cameras: tuple[str, ...] = ()
     """Cameras to take clips from (empty = all of the scene)."""
     held_out_every: int = 5
@@ -62,10 +52,6 @@ class LogClipRules:
     """Nearest usable image of a view: up to so many moments away (held-out windows: always 2, or this if less)."""
     least_points: float = 0.3
     """Smallest share of the cloud's points that a training window keeps."""
-    label_confidence: float = 0.5
-    """Labels with less confidence than this are no truth."""
-    fine: int = 2
-    """Colours are gathered at so many times the clip's size."""
     seed: int = 0
     published: bool = False
     """The published system's condition: points alone, 0 where nothing was seen, projected at the camera's size; the
@@ -91,11 +77,7 @@ class LogSource:
 
 def log_source(text: str) -> LogSource:
     """The log that SCENE=FUSED names, or the output folder of `mudg run` (labels of annotate are taken if there are
-    some).
-
-    Raises:
-        InputError: no scene or no cloud there.
-    """
+    some). InputError: no scene or no cloud there."""
     scene, separator, fused = text.partition("=")
     if separator:
         found = LogSource(Path(scene), Path(fused))
@@ -104,39 +86,27 @@ def log_source(text: str) -> LogSource:
         labelled = run / "annotate"
         found = LogSource(labelled if (labelled / "scene.json").is_file() else run / "scene", run / "fuse")
     if not (found.fused / "fuse.json").is_file() or not found.scene.exists():
-        raise InputError(
-            "no scene with a fused cloud here",
-            where=text,
-            expected="SCENE=FUSED, or an output folder of mudg run",
-            remedy="make the cloud with `mudg fuse`",
-        )
+        what, remedy = "no scene with a fused cloud here", "make the cloud with `mudg fuse`"
+        raise InputError(what, where=text, expected="SCENE=FUSED, or an output folder of mudg run", remedy=remedy)
     return found
 
 
 def log_windows(scene: Scene, rules: LogClipRules) -> list[LogWindow]:
     """All windows of a scene, camera by camera in time order. Frames held out for scoring the scene, and images that
-    are rendered in part (of an edited drive), are passed over.
-
-    Raises:
-        InputError: unknown camera, or no camera has enough frames.
-    """
+    are rendered in part (of an edited drive), are passed over. InputError: unknown camera, or no camera has enough
+    frames."""
     usable = {frame.id for frame in photographs(scene)}
-    reach = (rules.window - 1) * rules.frame_step + 1
     found: list[LogWindow] = []
     for camera in rules.cameras or tuple(scene.cameras):
         frames = sorted((f for f in scene.frames_of(camera) if f.id in usable), key=lambda f: f.view.time_s)
-        for start in range(0, len(frames) - reach + 1, rules.stride):
+        for start in range(0, len(frames) - rules.window + 1, rules.stride):
             number = start // rules.stride
             kept = rules.held_out_every > 0 and number % rules.held_out_every == rules.held_out_every // 2
-            chosen = frames[start : start + reach : rules.frame_step]
-            found.append(LogWindow(camera, tuple(f.id for f in chosen), kept))
+            found.append(LogWindow(camera, tuple(f.id for f in frames[start : start + rules.window]), kept))
     if not found:
-        raise InputError(
-            "a log is too short for a training clip",
-            where=scene.root,
-            expected=f"{reach} frames of a camera",
-            remedy="give a shorter --data.window, or ingest with --test-every 0",
-        )
+        what = "a log is too short for a training clip"
+        remedy = "give a shorter --data.window, or ingest with --test-every 0"
+        raise InputError(what, where=scene.root, expected=f"{rules.window} frames of a camera", remedy=remedy)
     time_of = {frame.id: frame.view.time_s for frame in scene.frames}
     scored = {time_of[name] for window in found if window.held_out for name in window.frames}
     return [w for w in found if w.held_out or not scored & {time_of[name] for name in w.frames}]
@@ -150,7 +120,7 @@ class OpenLog:
         self._frames = sorted(photographs(self.scene), key=lambda f: f.view.time_s)
         self.place = {frame.id: number for number, frame in enumerate(self._frames)}
         times = np.array([f.view.time_s for f in self._frames])
-        apart = np.diff(times) > ConditionRules(1, 1).same_time_s
+        apart = np.diff(times) > SAME_TIME_S
         self.moment: list[int] = np.concatenate([[0], np.cumsum(apart)]).tolist()
         self._read: dict[int, Photo] = {}
 
@@ -166,7 +136,7 @@ class OpenLog:
 
     def _recorded(self, number: int) -> Photo:
         frame = self._frames[number]
-        classes = read_trusted_classes(self.scene, frame, self.rules.label_confidence)
+        classes = read_trusted_classes(self.scene, frame)
         return Photo(frame.view, read_image(self.scene, frame), classes)
 
 
@@ -178,8 +148,7 @@ def make_clip(log: OpenLog, window: LogWindow, number: int) -> Clip:
     share = 1.0 if window.held_out else rng.uniform(rules.least_points, 1.0)
     cloud = log.cloud if share == 1.0 else thinned_cloud(log.cloud, share, rng)
     places = [log.place[name] for name in window.frames]
-    build = _published_condition if rules.published else _condition
-    condition, images = build(log, cloud, places, gap)
+    condition, images = _condition(log, cloud, places, gap)
     truths = [
         _truth(log, log.frame(name), images[place], view)
         for name, place, view in zip(window.frames, places, condition.views)
@@ -193,28 +162,22 @@ def make_clip(log: OpenLog, window: LogWindow, number: int) -> Clip:
 
 
 def _condition(log: OpenLog, cloud: FusedCloud, places: Sequence[int], gap: int) -> tuple[Condition, dict[int, Photo]]:
-    """The condition of some frames from images at least `gap` moments away, and all images read, by place in time."""
-    rules = log.rules
-    conditions = ConditionRules(rules.width, rules.height, rules.width * rules.fine, rules.height * rules.fine)
-    margin = gap + conditions.images_per_view  # at a log's end all images come from one side
-    images = log.images(log.moment[places[0]] - margin, log.moment[places[-1]] + margin)
-    moments = [log.moment[n] for n in images]
-    among = [[n for n, moment in enumerate(moments) if abs(moment - log.moment[place]) >= gap] for place in places]
-    views, recorded = [images[place].view for place in places], list(images.values())
-    return build_conditions(cloud, log.scene.tracks, views, recorded, conditions, among=among)[0], images
-
-
-def _published_condition(
-    log: OpenLog, cloud: FusedCloud, places: Sequence[int], gap: int
-) -> tuple[Condition, dict[int, Photo]]:
-    """The published model's condition; of the images only the reference is used, the first frame's own."""
-    del gap
-    rules = log.rules
-    images = log.images(log.moment[places[0]], log.moment[places[-1]])
+    """The condition of some frames from images at least `gap` moments away (the published one: from the first frame's
+    own), and all images read, by place in time."""
+    rules, (first, last) = log.rules, (log.moment[places[0]], log.moment[places[-1]])
+    size = rules.width, rules.height
+    conditions = ConditionRules(*size, rules.width * FINE, rules.height * FINE)
+    margin = 0 if rules.published else gap + conditions.images_per_view  # at a log's end all are of one side
+    images = log.images(first - margin, last + margin)
+    recorded, among = list(images.values()), None
+    if rules.published:
+        camera, recorded = images[places[0]].view.camera, [images[places[0]]]
+        conditions = ConditionRules(*size, camera.width, camera.height, published=True)
+    else:
+        moments = [log.moment[n] for n in images]
+        among = [[n for n, moment in enumerate(moments) if abs(moment - log.moment[place]) >= gap] for place in places]
     views = [images[place].view for place in places]
-    camera = views[0].camera
-    conditions = ConditionRules(rules.width, rules.height, camera.width, camera.height, published=True)
-    return build_conditions(cloud, log.scene.tracks, views, [images[places[0]]], conditions)[0], images
+    return build_conditions(cloud, log.scene.tracks, views, recorded, conditions, among=among)[0], images
 
 
 def thinned_cloud(cloud: FusedCloud, share: float, rng: np.random.Generator) -> FusedCloud:
@@ -253,8 +216,7 @@ def _truth(log: OpenLog, frame: Frame, recorded: Photo, view: View) -> tuple[Ten
 
 def measured_depth(scene: Scene, view: View) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Depth f32[H,W] of the sweep taken with an image and where it measured; points seen through gaps are left out."""
-    near = ConditionRules(1, 1).same_time_s
-    sweeps: list[Sweep] = [s for s in scene.sweeps if abs(s.time_s - view.time_s) <= near]
+    sweeps: list[Sweep] = [s for s in scene.sweeps if abs(s.time_s - view.time_s) <= SAME_TIME_S]
     if not sweeps:
         empty = np.zeros((view.camera.height, view.camera.width), np.float32)
         return empty, empty > 0
@@ -276,11 +238,7 @@ def plan_shards(
     sources: Sequence[LogSource], rules: LogClipRules, first_held_out: int
 ) -> list[tuple[int, LogSource, LogWindow]]:
     """What shards there will be, one clip each: (number, log, window); numbers from 0 to train on, from
-    `first_held_out` to score.
-
-    Raises:
-        InputError: a log is too short, or holding out leaves nothing to train on.
-    """
+    `first_held_out` to score. InputError: a log is too short, or holding out leaves nothing to train on."""
     rows: list[tuple[int, LogSource, LogWindow]] = []
     counts = {False: 0, True: 0}
     for source in sources:
@@ -304,8 +262,7 @@ def write_log(source: LogSource, rules: LogClipRules, windows: Sequence[tuple[in
     if missing:
         log = OpenLog(source, rules)
         for number, window in missing:
-            clip = make_clip(log, window, number)
-            write_shard(folder, number, pack_clips([clip], gaps=True))
+            write_shard(folder, number, [make_clip(log, window, number)], gaps=True)
     return len(missing)
 
 
@@ -318,12 +275,8 @@ def claim_folder(folder: Path, rules: LogClipRules, sources: Sequence[LogSource]
     if path.is_file():
         found = store.read_json(path)
         if found != wanted:
-            raise UsageError(
-                "the folder holds training clips of other logs or settings",
-                where=str(folder),
-                got="; ".join(differences(found, wanted)[:4]),
-                remedy="give another --data.clips",
-            )
+            what, remedy = "the folder holds training clips of other logs or settings", "give another --data.clips"
+            raise UsageError(what, where=str(folder), got="; ".join(differences(found, wanted)[:4]), remedy=remedy)
         return
     if folder.is_dir() and any(folder.glob("*.safetensors")):
         raise UsageError("the folder holds other training clips", where=str(folder), remedy="give another --data.clips")

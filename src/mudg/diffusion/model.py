@@ -1,13 +1,5 @@
 """The multi-modal diffusion model: from a sparse, projected point cloud to dense colour, depth and semantic video.
 
-Read from the bottom up: `MDM` holds the codec, the noise schedule and the denoising network, and has three things to
-do, `encode_condition`, `loss` and `sample`. The networks are in `network.py`, reading and writing in
-`model_files.py`.
-
-The network's input is, per latent cell, [noisy latents of all modalities | colour condition | depth condition |
-backdrop | masks of what was seen | classes of the condition]. It states the clean latents of all modalities at once,
-and may copy the condition's own.
-
 Layouts: conditions and samples [T,C,H,W] of one clip; inside the model [B,T,C,h,w], with (h, w) the latent size; inside
 the UNet [B*T,C,h,w] stored channels-last.
 """
@@ -96,27 +88,13 @@ class BatchPart:
 
 @dataclass(frozen=True)
 class LossSettings:
-    """What a training run says about the loss.
-
-    class_weights      f32[19], weights of the classes in the cross-entropy; None = all 1
-    refined_share      share of each side of the image on which the refiner is trained at a step
-    reference_dropout  share of the clips that go without their reference image; the published kind
-    """
+    """What a training run says about the loss: weights f32[19] of the classes in the cross-entropy (None = all 1),
+    share of each side of the image on which the refiner is trained at a step, and share of the clips that go without
+    their reference image (published kind)."""
 
     class_weights: Tensor | None
     refined_share: float
     reference_dropout: float
-
-
-@dataclass(frozen=True)
-class EncodedTruth:
-    """Encoded truth of a batch: latents [B,T,C,h,w]; class shares [B,T,19,h,w]; depth_known f32[B,T,1,h,w], share of
-    the cell with valid depth; and all of it at pixel resolution."""
-
-    latents: dict[Modality, Tensor]
-    shares: Tensor
-    depth_known: Tensor
-    pixels: PixelTruth
 
 
 @dataclass(frozen=True)
@@ -149,8 +127,11 @@ LOSS_SHARES: dict[Modality, float] = {"rgb": 1.0, "depth": 1.0, "semantics": 0.3
 
 
 class MDM(nn.Module):
-    """The multi-modal diffusion model (see the module text). Weights are random until `files.load` or `learn` sets
-    them."""
+    """Codec, noise schedule and denoising network, and what may follow them, refiner and finisher.
+
+    The network's input is, per latent cell, the noisy latents of all modalities and `ConditionLatents.planes`. It
+    states the clean latents of all modalities at once, and may copy the condition's own.
+    """
 
     points_alone = False
     """The condition is filled, and recorded images are warped into it."""
@@ -179,14 +160,10 @@ class MDM(nn.Module):
 
     # inputs ---------------------------------------------------------------------------------------
 
-    def check_size(self, height: int, width: int) -> None:
-        """UsageError unless an image of this size fits the network's strides."""
-        check_image_size(height, width, self.config.pixel_multiple)
-
     def check_clip(self, frames: int, height: int, width: int) -> None:
         """UsageError unless the model can make clips of this image size; any number of frames will do."""
         del frames
-        self.check_size(height, width)
+        check_image_size(height, width, self.config.pixel_multiple)
 
     def encode_condition(self, condition: Condition | Sequence[Condition]) -> ConditionLatents:
         """Latents and mask planes of one clip's condition, or of several of the same shape (see `ConditionLatents`).
@@ -196,7 +173,7 @@ class MDM(nn.Module):
         """
         given = Stacked.of([condition] if isinstance(condition, Condition) else list(condition))
         color, depth, valid, warped, ids = given.color, given.depth, given.valid, given.warped, given.ids
-        self.check_size(*color.shape[-2:])
+        check_image_size(*color.shape[-2:], self.config.pixel_multiple)
         factor = self.codec.factor
         copy: dict[Modality, Tensor] = {
             "rgb": self.codec.encode_rgb(color),
@@ -268,27 +245,34 @@ class MDM(nn.Module):
         """
         with torch.no_grad():
             encoded = self.encode_condition([clip.condition for clip in clips])
-            truth = self.encode_truth(clips)
+            rgb, depth, ids = (torch.stack([getattr(c, name) for c in clips]) for name in ("rgb", "depth", "semantics"))
+            latents: dict[Modality, Tensor] = {
+                "rgb": self.codec.encode_rgb(rgb),
+                "depth": self.codec.encode_depth(depth),
+                "semantics": self.codec.encode_semantics(ids),
+            }
+            pixels, shares = self.pixel_truth(clips), semantic_shares(ids)
+            known = functional.avg_pool2d(pixels.depth_known, self.codec.factor).unflatten(0, rgb.shape[:2])
         generator = seeds.torch_generator(part.seed, part.step, "noise")
         steps = noise.stratified_steps(part.count, len(self.schedule), generator)
-        t = steps[part.first : part.first + len(clips)].to(truth.shares.device)
+        t = steps[part.first : part.first + len(clips)].to(shares.device)
         weight = noise.loss_weight(self.schedule, t).view(-1, 1, 1, 1, 1)
         eps = {}
-        for m, z in truth.latents.items():  # clip by clip: that of a clip depends on its number alone
+        for m, z in latents.items():  # clip by clip: that of a clip depends on its number alone
             draws = (seeds.torch_generator(generator.initial_seed(), part.first + i, m) for i in range(len(z)))
             own = [noise.video_noise((1, *z.shape[1:]), draw, self.config.shared_noise) for draw in draws]
             eps[m] = torch.cat(own).to(z.device)
-        x = {m: self.schedule.add_noise(truth.latents[m], eps[m], t) for m in MODALITIES}
+        x = {m: self.schedule.add_noise(latents[m], eps[m], t) for m in MODALITIES}
         stated, log_shares = self.predict(x, encoded, t)
         errors = {
-            "rgb": losses.latent_error(stated["rgb"], truth.latents["rgb"], weight),
-            "depth": losses.latent_depth_error(stated["depth"], truth.latents["depth"], weight, truth.depth_known),
-            "semantics": losses.share_cross_entropy(log_shares, truth.shares, settings.class_weights),
+            "rgb": losses.latent_error(stated["rgb"], latents["rgb"], weight),
+            "depth": losses.latent_depth_error(stated["depth"], latents["depth"], weight, known),
+            "semantics": losses.share_cross_entropy(log_shares, shares, settings.class_weights),
         }
         terms = {m: float(error.detach()) for m, error in errors.items()}
         total = sum(LOSS_SHARES[m] * errors[m] for m in MODALITIES)
         if self.refiner is not None:
-            errors = self._refiner_terms(stated, encoded, truth.pixels, part, settings)
+            errors = self._refiner_terms(stated, encoded, pixels, part, settings)
             errors |= self._finisher_terms(stated, encoded, clips, settings)
             terms |= {name: float(error.detach()) for name, error in errors.items()}
             total = total + sum(errors.values())
@@ -296,18 +280,6 @@ class MDM(nn.Module):
 
     forward = loss
     """What `DistributedDataParallel` calls, to exchange gradients behind it."""
-
-    def encode_truth(self, clips: Sequence[Clip]) -> EncodedTruth:
-        """What `loss` compares with."""
-        rgb, depth, ids = (torch.stack([getattr(c, name) for c in clips]) for name in ("rgb", "depth", "semantics"))
-        pixels = self.pixel_truth(clips)
-        latents: dict[Modality, Tensor] = {
-            "rgb": self.codec.encode_rgb(rgb),
-            "depth": self.codec.encode_depth(depth),
-            "semantics": self.codec.encode_semantics(ids),
-        }
-        cells = functional.avg_pool2d(pixels.depth_known, self.codec.factor).unflatten(0, rgb.shape[:2])
-        return EncodedTruth(latents, semantic_shares(ids), cells, pixels)
 
     def pixel_truth(self, clips: Sequence[Clip]) -> PixelTruth:
         """What the refiner should give for clips or patches of one size."""
@@ -360,7 +332,11 @@ class MDM(nn.Module):
         frames, cells = stated["rgb"].shape[1], stated["rgb"].shape[-2:]
         factor, own = self.codec.factor, slice(number, number + 1)
         starts, sides = (patch.row, patch.column), (side // patch.scale for side in patch.clip.rgb.shape[-2:])
-        around = [_around(start, side, factor, count) for start, side, count in zip(starts, sides, cells, strict=True)]
+        around = []
+        for start, side, count in zip(starts, sides, cells, strict=True):
+            first = max(0, start // factor - SURROUNDINGS)
+            last = min(count, -(-(start + side) // factor) + SURROUNDINGS)
+            around.append(slice(first - first % 2, last + last % 2))  # the refiner's inner blocks take whole pairs
         tall, wide = (slice(cut.start * factor, cut.stop * factor) for cut in around)
         latents = {m: z[own, ..., around[0], around[1]].flatten(0, 1) for m, z in stated.items()}
         pixels = encoded.pixels.map(lambda x: x[number * frames : (number + 1) * frames]).crop(tall, wide)
@@ -412,11 +388,7 @@ class MDM(nn.Module):
         return nn.ModuleDict({name: part for name, part in parts.items() if part is not None})
 
     def temporal_parameters(self, which: Literal["transformers", "all"]) -> set[str]:
-        """Names in `trained_part` of the parameters that mix frames: of the temporal attentions, or of `all` temporal
-        layers.
-
-        This network has no temporal layers with parameters besides its attentions.
-        """
+        """Names in `trained_part` of the parameters that mix frames. There are none besides those of the attentions."""
         del which
         layers = [x for x in self.trained_part().named_modules() if isinstance(x[1], TemporalAttention)]
         return {f"{owner}.{name}" for owner, layer in layers for name, _ in layer.named_parameters()}
@@ -427,12 +399,8 @@ class MDM(nn.Module):
     def check_request(request: SampleRequest) -> None:
         """UsageError for a setting that does not apply to this kind of model."""
         if request.guidance is not None or request.guidance_rescale is not None:
-            raise UsageError(
-                "only published-type models have guidance",
-                where="guidance, guidance_rescale",
-                got=f"{request.guidance}, {request.guidance_rescale}",
-                remedy="leave them out",
-            )
+            what, got = "only published-type models have guidance", f"{request.guidance}, {request.guidance_rescale}"
+            raise UsageError(what, where="guidance, guidance_rescale", got=got, remedy="leave them out")
 
     def image_size(self, width: int, height: int, width_px: int = 0) -> tuple[int, int]:
         """Width and height the model works at for a camera of width x height: about the area it was trained at, or
@@ -477,9 +445,7 @@ class MDM(nn.Module):
 
         Measured depth replaces generated depth, as in `sample`; latents and depth fits stay those of the clip.
 
-        Raises:
-            UsageError: the model has no finisher, or `clip` does not come from `sample`.
-        """
+        UsageError: the model has no finisher, or `clip` does not come from `sample`."""
         if self.finisher is None or clip.log_error is None:
             raise UsageError("this model has no finisher, or the clip is another model's", where="MDM.finish")
         code = self.codec.linear_depth_code(clip.depth)
@@ -536,14 +502,6 @@ class MDM(nn.Module):
         return dict(zip(MODALITIES, x.split(sizes, 2))), mean_change([color(e) for e in estimates], color(x))
 
 
-def _around(start_px: int, side_px: int, factor: int, count: int) -> slice:
-    """The latent cells, of `count`, of a span of pixels with `SURROUNDINGS`; whole pairs, as the refiner's inner blocks
-    take them."""
-    first = max(0, start_px // factor - SURROUNDINGS)
-    last = min(count, -(-(start_px + side_px) // factor) + SURROUNDINGS)
-    return slice(first - first % 2, last + last % 2)
-
-
 def _expected_error(log_error: Tensor) -> Tensor:
     """Expected absolute error of colour in [0, 1] from the logarithm of that of codes in [-1, 1]."""
     return log_error.clamp(-6, 1).exp() / 2
@@ -573,10 +531,8 @@ class Stacked:
     @classmethod
     def of(cls, batch: Sequence[Condition]) -> Stacked:
         """Of conditions of one shape."""
-        unknown, nothing = (
-            torch.full_like(batch[0].valid, palette.UNLABELLED, dtype=torch.uint8),
-            torch.zeros_like(batch[0].depth),
-        )
+        unknown = torch.full_like(batch[0].valid, palette.UNLABELLED, dtype=torch.uint8)
+        nothing = torch.zeros_like(batch[0].depth)
         no_render = lambda c: RenderPlanes(c.color, c.depth, nothing + NO_RENDER, nothing, unknown)
         renders = [no_render(c) if c.renders is None else c.renders for c in batch]
         return cls(

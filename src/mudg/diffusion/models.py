@@ -1,8 +1,7 @@
 """The models that `learn` can train, what is particular to each, and with which weights a training starts.
 
-The loop (draws, layouts, checkpoints, averages) uses three methods that both models have: `loss(clips, part,
-settings)`, also as `forward`; `trained_part()`, the modules that change; `temporal_parameters(which)`, those that a
-later stage may freeze. Clips for the published-type model show points alone, as it was trained.
+Both have what the loop uses: `loss(clips, part, settings)`, also as `forward`, `trained_part()`, and
+`temporal_parameters(which)`, those that a later stage may freeze.
 """
 
 from __future__ import annotations
@@ -13,22 +12,26 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import html, log, palette, seeds
-from mudg.base.errors import ResourceError, UsageError
+from mudg.base import html, log, palette, seeds, store
+from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Clip
-from mudg.core import losses
-from mudg.diffusion import model_files, published
-from mudg.diffusion.clips import TrainingClips
+from mudg.core import losses, metrics
+from mudg.core.metrics import TrueFrame, flicker
+from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
+from mudg.diffusion import model_files
+from mudg.diffusion.clips import FAR_M, Shards, TrainingClips, counts_at
+from mudg.diffusion.condition import filled_depth
 from mudg.diffusion.model import MDM
 from mudg.diffusion.network import MDMConfig
-from mudg.diffusion.parallel import Ranks, TrainingState, agreed_terms, mean_of, newest_checkpoint, read_rows
-from mudg.diffusion.published import PublishedMDM, WorkSplit, is_published
-from mudg.diffusion.score import table
+from mudg.diffusion.parallel import Ranks, TrainingState, agreed_terms, mean_of
+from mudg.diffusion.published import PublishedMDM, WorkSplit
+from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated
 from mudg.diffusion.settings import LearnConfig
 from mudg.networks.codec import Modality, PatchCodec
 
@@ -64,7 +67,7 @@ def save(model: Model, folder: Path, card: str, facts: Mapping[str, Any]) -> Non
     handed_on = {name: before[name] for name in ("licence", "caption", "base_scale") if name in before}
     licence = f"\n## Licence\n\n{handed_on['licence']}\n" if "licence" in handed_on else ""
     tensors = {name: value.cpu() for name, value in model.state_dict().items()}
-    published.save(folder, model.config, tensors, {**facts, **handed_on}, card + licence)
+    model_files.save_published(folder, model.config, tensors, {**facts, **handed_on}, card + licence)
 
 
 def model_card(model: Model, source: TrainingClips, scores: Mapping[str, Any]) -> str:
@@ -91,29 +94,6 @@ def model_card(model: Model, source: TrainingClips, scores: Mapping[str, Any]) -
 # start --------------------------------------------------------------------------------------------
 
 
-def _published_start(config: LearnConfig) -> PublishedMDM:
-    """The published-type model of `config.start` in float32, to be trained at the configured size; nothing of it is
-    drawn anew. UsageError: clips of another length than the image tokens are made for, or of a size that does not fit
-    the strides."""
-    model = published.load(Path(config.start), dtype=torch.float32)
-    frames = model.config.window
-    if config.data.window != frames or config.optimizer.full_window_share < 1:
-        raise UsageError(
-            "a published-type model needs clips of exactly the length of its image tokens",
-            where="--data.window, --optimizer.full-window-share",
-            expected=f"{frames} frames in all steps",
-            got=f"{config.data.window} frames in {config.optimizer.full_window_share:.0%} of the steps",
-            remedy=f"--data.window {frames} --optimizer.full-window-share 1",
-        )
-    model.check_size(config.data.height, config.data.width)
-    with torch.no_grad():  # out of the mapped files: training writes in place
-        for value in (*model.parameters(), *model.buffers()):
-            value.data = value.data.clone()
-    model.config = replace(model.config, width=config.data.width, height=config.data.height)
-    model.split = WorkSplit(frames_at_once=1)
-    return model
-
-
 def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
     """The model to train, and which of its parts ("codec", "refiner", "finisher") have no weights yet.
 
@@ -122,29 +102,43 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
     it is. Clips may be of another size and length than before. Inputs for renders and a finisher are learned from
     generated cities with renders; from other clips no model gets any that it does not have.
 
-    Raises:
-        UsageError: the settings ask for another network than the earlier model has, or for clips that it cannot take.
-    """
+    UsageError: the settings ask for another network than the earlier model has, or for clips that it cannot take."""
     wanted = model_config(config)
     usual = wanted == model_config(LearnConfig(data=config.data))  # the network is left as it is by default
     can_grow = config.data.renders and not config.data.scenes
     if not config.start:
-        return MDM(wanted if can_grow else _with_renders_of(wanted, None)), {"codec", "refiner", "finisher"}
-    if is_published(config.start):
+        wanted = wanted if can_grow else replace(wanted, renders=False, finish_widths=(), finish_blocks=())
+        return MDM(wanted), {"codec", "refiner", "finisher"}
+    if model_files.is_published(config.start):
         if not usual:
+            what = "the shape of a published-type network cannot be changed"
+            raise UsageError(what, where="--start", remedy="leave out the settings of the group network")
+        model = model_files.load_published(config.start, dtype=torch.float32)
+        frames = model.config.window
+        if config.data.window != frames or config.optimizer.full_window_share < 1:
             raise UsageError(
-                "the shape of a published-type network cannot be changed",
-                where="--start",
-                remedy="leave out the settings of the group network",
+                "a published-type model needs clips of exactly the length of its image tokens",
+                where="--data.window, --optimizer.full-window-share",
+                expected=f"{frames} frames in all steps",
+                got=f"{config.data.window} frames in {config.optimizer.full_window_share:.0%} of the steps",
+                remedy=f"--data.window {frames} --optimizer.full-window-share 1",
             )
-        return _published_start(config), set()
+        model.check_clip(frames, config.data.height, config.data.width)
+        with torch.no_grad():  # out of the mapped files: training writes in place
+            for value in (*model.parameters(), *model.buffers()):
+                value.data = value.data.clone()
+        model.config = replace(model.config, width=config.data.width, height=config.data.height)
+        model.split = WorkSplit(frames_at_once=1)
+        return model, set()
     before = model_files.load(config.start)
     if before.config.window != config.data.window:
         log.info(
             f"learn: training on clips of {config.data.window} frames; --start was trained on clips of"
             f" {before.config.window}"
         )
-    wanted = wanted if can_grow else _with_renders_of(wanted, before.config)
+    if not can_grow:
+        own = {name: getattr(before.config, name) for name in ("renders", "finish_widths", "finish_blocks")}
+        wanted = replace(wanted, **own)
     resized = replace(before.config, window=wanted.window, area_px=wanted.area_px)
     if wanted != resized and not same_denoiser(resized, wanted) and usual:
         log.info("learn: the network has the shape of --start")
@@ -153,26 +147,14 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
     return extended(before, wanted), set() if wanted == resized else grown
 
 
-def _with_renders_of(wanted: MDMConfig, before: MDMConfig | None) -> MDMConfig:
-    """A network that uses renders, and has a finisher, as `before` does (None: neither)."""
-    own = (before.renders, before.finish_widths, before.finish_blocks) if before is not None else (False, (), ())
-    return replace(wanted, renders=own[0], finish_widths=own[1], finish_blocks=own[2])
-
-
 def hold_finisher(model: Model, fresh: set[str], patches: bool) -> None:
     """Let the finisher keep its weights if the clips have no patches at a higher resolution to learn it from.
-
-    Raises:
-        UsageError: it has no weights yet.
-    """
+    UsageError: it has no weights yet."""
     if patches or not isinstance(model, MDM) or model.finisher is None:
         return
     if "finisher" in fresh:
-        raise UsageError(
-            "the training clips have no patches at a higher resolution, from which the finisher is learned",
-            where="--data.clips",
-            remedy="choose another folder, or give --data.no-renders",
-        )
+        what = "the training clips have no patches at a higher resolution, from which the finisher is learned"
+        raise UsageError(what, where="--data.clips", remedy="choose another folder, or give --data.no-renders")
     model.finisher.requires_grad_(False)
     log.info("learn: the clips have no patches at a higher resolution; the finisher keeps its weights")
 
@@ -188,10 +170,7 @@ def model_config(config: LearnConfig) -> MDMConfig:
 
 def freeze(model: Model, what: str) -> int:
     """Let a part of the network keep its weights (see `LearnConfig.frozen`); returns the number of parameters it has.
-
-    Raises:
-        UsageError: nothing would be frozen: the network has no such layers.
-    """
+    UsageError: nothing would be frozen: the network has no such layers."""
     if what == "nothing":
         return 0
     if what == "denoiser":
@@ -229,14 +208,11 @@ def draw_weights(net: nn.Module, seed: int, purpose: str) -> None:
 # training of the small model's latent codec, before the network: by the leader alone, on whole images -----------------
 
 
-CPU = torch.device("cpu")
 LEARNING_RATE = 2e-3
 FIT_IMAGES = 8
 
 
-def train_codec(
-    codec: PatchCodec, source: TrainingClips, run_dir: RunDir, bf16: bool, device: torch.device = CPU
-) -> None:
+def train_codec(codec: PatchCodec, source: TrainingClips, run_dir: RunDir, bf16: bool, device: torch.device) -> None:
     """Fit the linear parts on the first clips, on the CPU, then train the decoder on noisy latents, on a device."""
     config = source.config
     steps, out, alone = config.codec.steps, run_dir.path / "codec", Ranks(0, 1, device)
@@ -274,18 +250,6 @@ def train_codec(
                 recent = []
             if done % 200 == 0 or done == steps:
                 state.save(out, alone, {})
-
-
-def load_trained_codec(codec: PatchCodec, out: Path, ranks: Ranks) -> None:
-    """The codec that the leader trained, in every process."""
-    saved = newest_checkpoint(out / "codec", ranks)
-    if saved is None:
-        raise ResourceError(
-            "the trained codec that rank 0 wrote is not visible here",
-            where=str(out / "codec"),
-            remedy="choose an --out on a file system that all processes share",
-        )
-    read_rows(saved.path, "net", nn.ModuleDict({"codec": codec}).state_dict())
 
 
 def codec_loss(codec: PatchCodec, clips: Sequence[Clip], generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
@@ -327,31 +291,25 @@ def codec_loss(codec: PatchCodec, clips: Sequence[Clip], generator: torch.Genera
 # models that go on from an earlier, plainer one ---------------------------------------------------
 
 
-_AFTER_DENOISER = {"refine_widths": (), "refine_blocks": (), "finish_widths": (), "finish_blocks": ()}
+_WIDENED = ("net.enter", "refiner.enter", "net.leave", "refiner.leave")
+"""Layers that have further inputs or outputs, behind the others, in a model that uses renders."""
 
 
 def same_denoiser(one: MDMConfig, other: MDMConfig) -> bool:
     """Whether two networks differ at most in what follows the denoiser, in the use of renders, and in the clips trained
     on."""
-    without = lambda config: replace(config, **_AFTER_DENOISER, renders=False, area_px=0, window=0)
+    after = {"refine_widths": (), "refine_blocks": (), "finish_widths": (), "finish_blocks": ()}
+    without = lambda config: replace(config, **after, renders=False, area_px=0, window=0)
     return without(one) == without(other)
 
 
 def extended(before: MDM, config: MDMConfig) -> MDM:
     """A model of `config` with the weights of `before`; a refiner is taken over if `before` has one of the same shape.
     For continuing the training of an earlier, plainer model. What new inputs weigh is 0, so they change nothing at
-    first.
-
-    Raises:
-        UsageError: the two differ in more than the refiner, the use of renders and the clips trained on.
-    """
+    first. UsageError: the two differ in more than the refiner, the use of renders and the clips trained on."""
     if not same_denoiser(before.config, config) or (before.config.renders and not config.renders):
-        raise UsageError(
-            "the model to continue from is of another kind",
-            expected=str(config),
-            got=str(before.config),
-            remedy="give its widths, blocks, attention, patch and renders",
-        )
+        remedy, got = "give its widths, blocks, attention, patch and renders", str(before.config)
+        raise UsageError("the model to continue from is of another kind", expected=str(config), got=got, remedy=remedy)
     model = MDM(config)
     state = model.state_dict()
     for name, old in before.state_dict().items():
@@ -365,5 +323,164 @@ def extended(before: MDM, config: MDMConfig) -> MDM:
     return model
 
 
-_WIDENED = ("net.enter", "refiner.enter", "net.leave", "refiner.leave")
-"""Layers that have further inputs or outputs, behind the others, in a model that uses renders."""
+# scores -------------------------------------------------------------------------------------------
+
+
+SKY = palette.ID["sky"]
+SCORES = (
+    ("psnr", "RGB PSNR dB"),
+    ("psnr_seen", "- where seen"),
+    ("psnr_unseen", "- unseen"),
+    ("psnr_condition", "- of the condition"),
+    ("ssim", "SSIM"),
+    ("sharpness", "sharpness (1 = truth)"),
+    ("abs_rel", "depth AbsRel"),
+    ("delta1", "delta1"),
+    ("abs_rel_nearest", "AbsRel nearest fill"),
+    ("delta1_nearest", "delta1 nearest fill"),
+    ("miou", "mIoU"),
+    ("accuracy", "accuracy"),
+    ("flicker", "flicker (1 = truth)"),
+    ("sky_near", "sky nearer 80 m"),
+    ("edges_agree", "depth edges on class edges"),
+    ("confidence_gap", "confidence AUC"),
+)
+
+
+def score(
+    model: MDM | PublishedMDM,
+    cities: Sequence[int],
+    shards: Shards,
+    request: SampleRequest,
+    *,
+    picture: Path | None = None,
+) -> dict[str, Any]:
+    """Generate all clips of some cities and compare with the truth.
+
+    Returns {"average": scores over the shifted clips, "by_shift": {shift: scores}, "clips": n, "steps": request.steps}.
+    Keys as in `SCORES`; classes are pooled over all clips before the IoU. Draws a grid of up to 6 clips into `picture`.
+    request: how clips are sampled; the index is put in for each."""
+    rows: dict[str, list[dict[str, float]]] = {}
+    counts: dict[str, Tensor] = {}
+    pairs: list[tuple[Clip, GeneratedClip]] = []
+    for city in cities:
+        count, frames = shards.reading(city, counts_at)
+        for number in range(count):
+            clip = shards.clip(city, number, range(min(model.config.window, frames)))
+            sample = generated(model, clip.condition, replace(request, index=city * 16 + number))
+            name = "recorded" if clip.shift_m == 0 else f"{abs(clip.shift_m):.0f} m"
+            row, matrix = score_clip(clip, sample)
+            rows.setdefault(name, []).append(row)
+            counts[name] = counts.get(name, torch.zeros_like(matrix)) + matrix
+            if len(pairs) < 6 and (clip.shift_m != 0 or number == 0):
+                pairs.append((clip, sample))
+    if picture is not None and pairs:
+        save_grid(picture, pairs)
+    by_shift = {name: _average(rows[name], counts[name]) for name in sorted(rows)}
+    shifted = [n for n in rows if n != "recorded"] or list(rows)
+    pooled = _average([r for n in shifted for r in rows[n]], sum(counts[n] for n in shifted))
+    return {"average": pooled, "by_shift": by_shift, "clips": sum(map(len, rows.values())), "steps": request.steps}
+
+
+def score_clip(clip: Clip, sample: GeneratedClip) -> tuple[dict[str, float], Tensor]:
+    """Scores of one clip and its class confusion i64[19,20]."""
+    rgb, ids, given = clip.rgb, clip.semantics, clip.condition
+    # far depth does not count, nor does guessed depth
+    depth = torch.where(clip.depth_weight == 1, clip.depth, FAR_M)
+    seen = given.valid if given.warped is None else given.valid | given.warped
+    frames = [TrueFrame(*one) for one in zip(given.views, depth, ids, strict=True)]
+    solid = (depth < 90.0) & (ids.unsqueeze(1) != SKY)
+    flat = lambda x: x.transpose(0, 1).flatten(1, 2)
+    error = metrics.depth_errors(flat(sample.depth), flat(depth), flat(solid))
+    filled = given.depth if given.measured is None else filled_depth(given.measured)
+    nearest = metrics.depth_errors(flat(filled), flat(depth), flat(solid))
+    matrix = metrics.confusion(sample.semantics.flatten(0, 1), ids.flatten(0, 1))
+    sky = (ids == SKY).unsqueeze(1)
+    wrong = (sample.rgb - rgb).abs().mean(1, keepdim=True)
+    row = {
+        "psnr": metrics.psnr(flat(sample.rgb), flat(rgb)),
+        "psnr_seen": metrics.psnr(flat(sample.rgb), flat(rgb), flat(seen)),
+        "psnr_unseen": metrics.psnr(flat(sample.rgb), flat(rgb), flat(~seen)),
+        "psnr_condition": metrics.psnr(flat(given.color), flat(rgb)),
+        "ssim": float(np.mean([metrics.ssim(a, b) for a, b in zip(sample.rgb, rgb)])),
+        "sharpness": _gradient(sample.rgb) / max(_gradient(rgb), 1e-6),
+        "abs_rel": error.abs_rel,
+        "delta1": error.delta1,
+        "abs_rel_nearest": nearest.abs_rel,
+        "delta1_nearest": nearest.delta1,
+        "flicker": flicker(sample.rgb, rgb, frames),
+        "sky_near": float((sample.depth[sky] < 80).float().mean()) if bool(sky.any()) else math.nan,
+        "edges_agree": edges_agree(sample.depth, sample.semantics),
+        "confidence_gap": auc(sample.confidence.flatten(), wrong.flatten()),
+    }
+    return row, matrix
+
+
+def edges_agree(depth: Tensor, semantics: Tensor) -> float:
+    """Share of depth edges (ratio of neighbours > 1.25) that lie within a pixel of a class edge. NaN without edges."""
+    log_depth = depth.clamp(min=0.1).log()
+    tall = ((log_depth[..., 1:, :] - log_depth[..., :-1, :]).abs() > 0.223)[..., :-1]
+    wide = ((log_depth[..., 1:] - log_depth[..., :-1]).abs() > 0.223)[..., :-1, :]
+    edge = tall | wide
+    ids = semantics.unsqueeze(1)
+    change = (ids[..., 1:, :-1] != ids[..., :-1, :-1]) | (ids[..., :-1, 1:] != ids[..., :-1, :-1])
+    near = torch.nn.functional.max_pool2d(change.float(), 3, stride=1, padding=1) > 0
+    return float((edge & near).sum() / edge.sum()) if bool(edge.any()) else math.nan
+
+
+def auc(confidence: Tensor, error: Tensor) -> float:
+    """Probability that of two pixels the one with more error has less confidence (0.5 = no use, 1 = perfect)."""
+    a, b = torch.randint(len(error), (2, 20000), generator=torch.Generator().manual_seed(0))
+    right = ((error[a] > error[b]) == (confidence[a] < confidence[b])).float()
+    return float(torch.where(confidence[a] == confidence[b], 0.5, right).mean())
+
+
+def _gradient(rgb: Tensor) -> float:
+    return float((rgb[..., 1:] - rgb[..., :-1]).abs().mean() + (rgb[..., 1:, :] - rgb[..., :-1, :]).abs().mean())
+
+
+def _average(rows: Sequence[Mapping[str, float]], counts: Tensor) -> dict[str, float]:
+    result: dict[str, float] = {}
+    for name in rows[0]:
+        values = [r[name] for r in rows if math.isfinite(r[name])]
+        if values:
+            result[name] = round(float(np.mean(values)), 4)
+    if not bool(counts.any()):  # logs without labels
+        return result
+    ious = metrics.iou_of(counts)
+    frequent = {n: v for n, v in ious.items() if float(counts[palette.ID[n]].sum()) > 2e-4 * float(counts.sum())}
+    result["miou"] = round(float(np.mean(list(frequent.values()))), 4)
+    result["miou_all"] = round(float(np.mean(list(ious.values()))), 4)
+    result["accuracy"] = round(float(counts[:, :-1].diagonal().sum() / counts.sum()), 4)
+    return result | {f"iou {n}": round(v, 3) for n, v in ious.items()}
+
+
+def table(scores: Mapping[str, Any]) -> str:
+    """Scores as text, one column per shift."""
+    columns = {**scores["by_shift"], "shifted": scores["average"]}
+    lines = [f"{'':28s}" + "".join(f"{c:>11s}" for c in columns)]
+    for key, title in SCORES:
+        cells = (columns[c].get(key) for c in columns)
+        lines.append(f"{title:28s}" + "".join(f"{'-' if v is None else format(v, '.3f'):>11s}" for v in cells))
+    return "\n".join(lines)
+
+
+# pictures -----------------------------------------------------------------------------------------
+
+
+def save_grid(path: Path, pairs: Sequence[tuple[Clip, GeneratedClip]], frame: int = 4) -> None:
+    """One row per clip: condition, made and true colour; condition, made and true depth; made and true classes;
+    confidence."""
+    rows = []
+    for clip, sample in pairs:
+        t = min(frame, len(sample.confidence) - 1)
+        given = clip.condition
+        measured = torch.where(given.measurement.valid[t], given.measurement.depth[t], 100.0)
+        cells = [
+            *(to_bytes(rgb) for rgb in (given.color[t], sample.rgb[t], clip.rgb[t])),
+            *(depth_colors(depth[0].numpy()) for depth in (measured, sample.depth[t], clip.depth[t])),
+            *(class_colors(ids.numpy()) for ids in (sample.semantics[t], clip.semantics[t])),
+            gray(sample.confidence[t, 0].numpy()),
+        ]
+        rows.append(np.concatenate(cells, 1))
+    store.write_image(path, np.concatenate(rows, 0))

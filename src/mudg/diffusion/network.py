@@ -1,22 +1,5 @@
-"""The networks of the small models: the denoiser, the refiner from latents to pixels, the finisher to full size.
-
-`UNet` is a U of residual blocks with attention over the cells of a patched latent video; `UNetStage` is one block with
-the attentions of its level. Frames of a clip are told apart by a free temporal shift of channels in every block, keys
-and values from frame 0, and temporal attention at the lowest level.
-
-The latent code has a quarter of the image's places and loses texture, one axis of hue and whatever is one pixel wide;
-the condition has all of it wherever something was seen. The `Refiner` reads both and states, for every pixel, how much
-of the condition's colour, depth and class to take over, what to add, and how wrong the colour will probably be. It runs
-once per clip, after the last denoising step, and is trained together with the denoiser, on what the denoiser makes. All
-its maps are held at the latent resolution, the 2x2 pixels of a cell as channels (`functional.pixel_unshuffle`).
-
-The denoiser and the refiner work on some 25,000 pixels per frame; a camera has up to a hundred times as many. The
-`Finisher` reads the enlarged clip and the condition at the new size. For every pixel it states how much to take of each
-source (clip, warped images, measured depth, backdrop, render), what colour to add, and how wrong the colour will
-probably be. It is small, so that a full-size image costs about as much as the clip it comes from. `finish_in_tiles`
-bounds the memory: a tile's margin is wider than the receptive field, so the result equals that of one pass.
-
-`MDMConfig` is all that distinguishes one model from another.
+"""The networks of the small models: the denoiser `UNet`, the `Refiner` from latents to pixels, the `Finisher` to the
+camera's size. `MDMConfig` is all that distinguishes one model from another.
 """
 
 from __future__ import annotations
@@ -24,6 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Self
 
 import torch
@@ -355,12 +339,8 @@ def joined(planes: list[Tensor], dtype: torch.dtype) -> Tensor:
 
 class CellNet(nn.Module):
     """What refiner and finisher have in common: residual blocks on cells of 2x2 pixels, around others on cells of 4x4.
-
-    Args:
-        inside, outside: channels that go in and come out, per cell of 2x2 pixels.
-        widths: channels in the outer and the inner blocks; blocks: how many before and after, and within.
-        reach: side of the first convolution, cells.
-    """
+    inside, outside: channels that go in and come out, per cell of 2x2 pixels. widths: channels in the outer and the
+    inner blocks; blocks: how many before and after, and within. reach: side of the first convolution, cells."""
 
     def __init__(self, inside: int, outside: int, widths: tuple[int, int], blocks: tuple[int, int], reach: int) -> None:
         super().__init__()
@@ -393,10 +373,12 @@ class CellNet(nn.Module):
 
 
 class Refiner(CellNet):
-    """See the module text. `widths`: channels at the latent resolution and at half of it; `blocks`: residual blocks
-    there.
+    """From latents and condition to pixels, once per clip, after the last denoising step.
 
-    With `renders` it also reads what a fitted scene shows.
+    The latent code has a quarter of the image's places and loses texture; the condition has all of it wherever
+    something was seen. For every pixel this states how much of the condition's colour, depth and class to take over,
+    what to add, and how wrong the colour will probably be. `widths`: channels at the latent resolution and at half of
+    it; `blocks`: residual blocks there. With `renders` it also reads what a fitted scene shows.
     """
 
     SIZES = (12, 4, 4, 4, 4, 4 * CLASSES, 4, 4, 4)
@@ -495,9 +477,12 @@ class Made(PixelPlanes):
     def enlarged(self, size: tuple[int, int], rows: tuple[int, int], columns: tuple[int, int]) -> Made:
         """The clip enlarged to `size` (height, width), of that only the rectangle rows x columns, which may reach
         beyond its borders: colour and error bilinearly, depth and class from the nearest pixel."""
-        grid = sampling_grid(size, rows, columns, self.rgb)
-        smooth = _sampled(torch.cat([self.rgb.float(), self.log_error.float()], 1), grid, "bilinear")
-        sharp = _sampled(torch.cat([self.depth_code.float(), self.ids.float()], 1), grid, "nearest")
+        y = (torch.arange(*rows, device=self.rgb.device) + 0.5) * (2.0 / size[0]) - 1.0
+        x = (torch.arange(*columns, device=self.rgb.device) + 0.5) * (2.0 / size[1]) - 1.0
+        grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).expand(len(self.rgb), -1, -1, -1)
+        sampled = partial(functional.grid_sample, grid=grid, padding_mode="border", align_corners=False)
+        smooth = sampled(torch.cat([self.rgb.float(), self.log_error.float()], 1), mode="bilinear")
+        sharp = sampled(torch.cat([self.depth_code.float(), self.ids.float()], 1), mode="nearest")
         return Made(smooth[:, :3], sharp[:, :1], sharp[:, 1:].to(torch.uint8), smooth[:, 3:])
 
 
@@ -512,42 +497,30 @@ class Finished:
     weights: Tensor
     log_error: Tensor
 
-    @property
-    def shares(self) -> Tensor:
+    def shares(self, frames: slice = slice(None)) -> Tensor:
         """Share of each class f32[N,19,H,W]; they sum to at most 1."""
-        return _shares(self.weights, self.sources)
+        weights, sources = self.weights[frames], self.sources[frames]
+        shares = weights[:, :1] * one_hot(sources[:, 0])
+        for k in range(1, weights.shape[1]):
+            shares = torch.addcmul(shares, weights[:, k : k + 1], one_hot(sources[:, k]))
+        return shares
 
     def ids(self) -> Tensor:
         """The class with the largest share u8[N,1,H,W]; frame by frame, for the shares of all are large.
 
         (``max`` finds the first of several equal ones, as ``argmax`` does, in half of the time.)
         """
-        shares = (_shares(w[None], s[None]) for w, s in zip(self.weights, self.sources, strict=True))
+        shares = (self.shares(slice(n, n + 1)) for n in range(len(self.weights)))
         return torch.cat([one.max(1, keepdim=True).indices.to(torch.uint8) for one in shares])
 
 
-def _shares(weights: Tensor, sources: Tensor) -> Tensor:
-    shares = weights[:, :1] * one_hot(sources[:, 0])
-    for k in range(1, weights.shape[1]):
-        shares = torch.addcmul(shares, weights[:, k : k + 1], one_hot(sources[:, k]))
-    return shares
-
-
-def sampling_grid(size: tuple[int, int], rows: tuple[int, int], columns: tuple[int, int], like: Tensor) -> Tensor:
-    """Where the pixels of a rectangle of an image of `size` lie in another image of the same view, for `grid_sample`:
-    f32[N,h,w,2]."""
-    y = (torch.arange(*rows, device=like.device) + 0.5) * (2.0 / size[0]) - 1.0
-    x = (torch.arange(*columns, device=like.device) + 0.5) * (2.0 / size[1]) - 1.0
-    return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).expand(len(like), -1, -1, -1)
-
-
-def _sampled(image: Tensor, grid: Tensor, mode: str) -> Tensor:
-    return functional.grid_sample(image, grid, mode=mode, padding_mode="border", align_corners=False)
-
-
 class Finisher(CellNet):
-    """See the module text. `widths`: channels at half and at a quarter of the resolution; `blocks`: residual blocks
-    there (`CellNet`)."""
+    """From an enlarged clip and the condition at the camera's size to a clip of that size.
+
+    For every pixel it states how much to take of each source, what colour to add, and how wrong it will probably be.
+    It is small, so that a full-size image costs about as much as the clip it comes from. `widths`: channels at half
+    and at a quarter of the resolution; `blocks`: residual blocks there (`CellNet`).
+    """
 
     SOURCES = 4
     """Of colour: the enlarged clip, images warped in, the backdrop, the render. Of depth and class: the clip, the
@@ -578,12 +551,8 @@ class Finisher(CellNet):
             self.leave.bias.copy_(torch.cat([*starts, torch.zeros(16)]))
 
     def forward(self, generated: Made, condition: ConditionPixels, frames: int, scale: Tensor) -> Finished:
-        """Finish clips (N = clips times frames, frames innermost).
-
-        Args:
-            generated: the generated clip, enlarged to the size of `condition`; sides are multiples of `STRIDE_PX`.
-            scale: f32[N], how many times smaller the clip was.
-        """
+        """Finish clips (N = clips times frames, frames innermost). generated: the generated clip, enlarged to the size
+        of `condition`; sides are multiples of `STRIDE_PX`. scale: f32[N], how many times smaller the clip was."""
         colors = torch.stack([generated.rgb, condition.color, condition.backdrop, condition.render], 1)
         depths = torch.stack([generated.depth_code, condition.depth_code, condition.render_code], 1)
         ids = torch.stack([generated.ids, condition.ids, condition.backdrop_ids, condition.render_ids], 1)
@@ -602,7 +571,7 @@ class Finisher(CellNet):
 
 def class_scores(finished: Finished) -> Tensor:
     """Logarithms of the class shares f32[N,19,H,W], for a cross-entropy."""
-    return finished.shares.clamp(min=LEAST_SHARE).log()
+    return finished.shares().clamp(min=LEAST_SHARE).log()
 
 
 def with_detail(rgb: Tensor, condition: ConditionPixels) -> Tensor:
@@ -635,14 +604,10 @@ def finish_in_tiles(
     *,
     detail: bool = False,
 ) -> Made:
-    """Finish one clip at any size.
-
-    Args:
-        generated: the clip as generated, [N,..,h,w]. size: height and width that are wanted.
-        crop: makes a rectangle, rows x columns, of the clip's condition at that size; asked tile by tile.
-        tile_px: longest side of a tile's core; memory depends on it, the result does not.
-        detail: colours get the finest structure of what was warped in (`with_detail`).
-    """
+    """Finish one clip at any size. generated: the clip as generated, [N,..,h,w]. size: height and width that are
+    wanted. crop: makes a rectangle, rows x columns, of the clip's condition at that size; asked tile by tile. tile_px:
+    longest side of a tile's core; memory depends on it, the result does not. detail: colours get the finest structure
+    of what was warped in (`with_detail`)."""
     frames, small, device = len(generated.rgb), generated.rgb.shape[-2:], generated.rgb.device
     scale = torch.full((frames,), (size[0] * size[1] / (small[0] * small[1])) ** 0.5, device=device)
     margin = finisher.margin_px
@@ -655,7 +620,8 @@ def finish_in_tiles(
                 for first, last, length in ((top, bottom, size[0]), (left, right, size[1]))
             )
             bare = crop(slice(*rows), slice(*columns))
-            part = _padded(bare)
+            wide = (0, -bare.color.shape[-1] % STRIDE_PX, 0, -bare.color.shape[-2] % STRIDE_PX)
+            part = bare.map(lambda x, wide=wide: functional.pad(x.float(), wide, mode="replicate").to(x.dtype))
             reach = (rows[0], rows[0] + part.color.shape[-2]), (columns[0], columns[0] + part.color.shape[-1])
             found = finisher(generated.enlarged((size[0], size[1]), *reach), part, frames, scale)
             rgb = found.rgb[..., : rows[1] - rows[0], : columns[1] - columns[0]]
@@ -666,12 +632,3 @@ def finish_in_tiles(
             whole.ids[target] = found.ids()[core]
             whole.log_error[target] = found.log_error[core]
     return whole
-
-
-def _padded(condition: ConditionPixels) -> ConditionPixels:
-    """The condition with sides that are multiples of `STRIDE_PX`: its last row and column are repeated."""
-    height, width = condition.color.shape[-2:]
-    below, right = -height % STRIDE_PX, -width % STRIDE_PX
-    if not (below or right):
-        return condition
-    return condition.map(lambda x: functional.pad(x.float(), (0, right, 0, below), mode="replicate").to(x.dtype))

@@ -1,39 +1,30 @@
 """The published multi-modal diffusion model, full size: the same thing as `MDM`, of other parts.
 
-    conditions -> latents          autoencoder; frame 0 of the colour condition is the dense reference
-    reference  -> image tokens     image tower (`clip`) and resampler, 16 tokens for each of 16 frames
-    one pass per modality          v-prediction with classifier-free guidance, told apart by the modality label
-    latents    -> pixels           autoencoder
-
-`encode_condition`, `loss` and `sample` mean what they mean in `diffusion/model.py`. Where model and paper differ from
-each other the defaults follow the released weights; docs/research/published.md lists the differences.
+One pass per modality, told apart by a label; v-prediction with classifier-free guidance. Where model and paper differ
+the defaults follow the released weights (docs/research/published.md).
 """
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import checkpoint, palette, records, seeds, store, weights
+from mudg.base import palette, seeds
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Clip, Condition
 from mudg.core import noise
 from mudg.core.depth import DepthFit, align_depth
 from mudg.core.noise import Schedule, ScheduleConfig
 from mudg.diffusion.model import BatchPart, Losses, LossSettings
-from mudg.diffusion.model_files import MODEL_FILE, folder_of, read_description
 from mudg.diffusion.published_network import (
     Autoencoder,
     AutoencoderConfig,
-    ContextKeys,
     Resampler,
     ResamplerConfig,
     SeededDropout,
@@ -140,19 +131,6 @@ class WorkSplit:
     guidance_together: bool = True
     frames_at_once: int = 16
     """Frames per pass of the autoencoder."""
-    offload: bool = False
-    """Keep the image tower on the CPU, except while it reads a reference."""
-
-
-@dataclass(frozen=True)
-class _Told:
-    """What the network is told beside the latents: modality labels i64[N], caption tokens [N,77,D], image tokens
-    [N,T,16,D], and keys and values of both in every layer if they are needed more than once."""
-
-    label: Tensor
-    text: Tensor
-    tokens: Tensor
-    keys: list[ContextKeys] | None
 
 
 @dataclass(frozen=True)
@@ -217,17 +195,9 @@ class PublishedMDM(nn.Module):
 
     # inputs ---------------------------------------------------------------------------------------
 
-    def check_size(self, height: int, width: int) -> None:
-        """UsageError unless an image of this size fits the network's strides."""
-        check_image_size(height, width, self.config.pixel_multiple)
-
     def check_clip(self, frames: int, height: int, width: int) -> None:
-        """UsageError unless the model can make clips of this many frames and this image size."""
-        self.check_frames(frames)
-        self.check_size(height, width)
-
-    def check_frames(self, frames: int) -> None:
-        """UsageError unless a clip has exactly the number of frames that the image tokens are made for."""
+        """UsageError unless the model can make clips of this image size and exactly this many frames."""
+        check_image_size(height, width, self.config.pixel_multiple)
         own = self.config.window
         if frames != own:
             raise UsageError(
@@ -245,21 +215,16 @@ class PublishedMDM(nn.Module):
         known: Tensor | None = None,
     ) -> PublishedLatents:
         """Latents of the conditions of clips of one shape, and image features of their references (see
-        `PublishedLatents`).
-
-        Args:
-            generator: noise of the autoencoder's posterior; needed unless the configuration names its mean.
-            known: colour f32[k,3,H,W] in [0,1] generated for the first k frames by the window before: they replace the
-                sparse colour there (of every clip), frame 0 excepted.
-        """
+        `PublishedLatents`). generator: noise of the autoencoder's posterior; needed unless the configuration names its
+        mean. known: colour f32[k,3,H,W] in [0,1] generated for the first k frames by the window before: they replace
+        the sparse colour there (of every clip), frame 0 excepted."""
         batch = [condition] if isinstance(condition, Condition) else list(condition)
         color, depth, valid, reference = (
             torch.stack([getattr(c, name) for c in batch]).to(self.device)
             for name in ("color", "depth", "valid", "reference")
         )
         valid = valid.float()
-        self.check_size(*color.shape[-2:])
-        self.check_frames(color.shape[1])
+        self.check_clip(color.shape[1], *color.shape[-2:])
         # missing is black and 0 m, as in the published training
         color, depth, seen = color * valid, depth * valid, valid
         in_frame, in_tokens = (
@@ -275,18 +240,9 @@ class PublishedMDM(nn.Module):
         generator, images = self._posterior(generator), (color * 2 - 1, self.codec.depth_image(depth))
         planes = torch.cat([self._encode(image, generator) for image in images], 2)
         shown = torch.where(in_tokens, reference * 2 - 1, 0.0)
-        features = self._features(torch.cat([shown, torch.zeros_like(reference[:1])]))
-        return PublishedLatents(planes, features[:-1], features[-1:], self._share_of_cells(seen))
-
-    def _features(self, images: Tensor) -> Tensor:
-        """What the image tower, which lies on the CPU if `split` says so, makes of images on the model's device."""
-        if self.split.offload:
-            self.image.to(self.device)
         with torch.no_grad():
-            features = self.image(images)
-        if self.split.offload:
-            self.image.to("cpu")
-        return features
+            features = self.image(torch.cat([shown, torch.zeros_like(reference[:1])]))
+        return PublishedLatents(planes, features[:-1], features[-1:], self._share_of_cells(seen))
 
     def encode_truth(
         self, rgb: Tensor, depth: Tensor, semantics: Tensor, generator: torch.Generator | None = None
@@ -309,11 +265,8 @@ class PublishedMDM(nn.Module):
         if self.config.codec.posterior == "mean":
             return None
         if generator is None:
-            raise UsageError(
-                "encoding draws from the posterior and needs a generator",
-                where="PublishedMDM",
-                remedy='or use posterior = "mean"',
-            )
+            what = "encoding draws from the posterior and needs a generator"
+            raise UsageError(what, where="PublishedMDM", remedy='or use posterior = "mean"')
         return generator
 
     # network --------------------------------------------------------------------------------------
@@ -326,42 +279,24 @@ class PublishedMDM(nn.Module):
 
         planes [N,T,8,h,w]; text [N,77,D]; tokens [N,T,16,D].
         """
-        return self._velocity(x, planes, t, self._told(names, text, tokens))
-
-    def _told(self, names: Sequence[Modality], text: Tensor, tokens: Tensor, *, ahead: bool = False) -> _Told:
-        """What the network is told beside the latents; `ahead`: with keys and values of caption and image tokens, for
-        many steps."""
-        text, tokens = text.to(self.dtype), tokens.to(self.dtype)
-        label = torch.tensor([LABELS[m] for m in names], device=text.device)
-        return _Told(label, text, tokens, self.net.context_keys(text, tokens) if ahead else None)
-
-    def _velocity(self, x: Tensor, planes: Tensor, t: Tensor, conditioning: _Told) -> Tensor:
-        """As `predict`."""
         inputs = torch.cat([x, planes], 2).to(self.dtype)
+        label = torch.tensor([LABELS[m] for m in names], device=inputs.device)
         fps = torch.full_like(t, self.config.fps)
-        return self.net(
-            inputs, t, conditioning.label, fps, conditioning.text, conditioning.tokens, conditioning.keys
-        ).float()
+        return self.net(inputs, t, label, fps, text.to(self.dtype), tokens.to(self.dtype)).float()
 
     # training -------------------------------------------------------------------------------------
 
     def loss(self, clips: Sequence[Clip], part: BatchPart, settings: LossSettings) -> Losses:
         """`velocity_loss` of clips of one size; all that is drawn comes from `part`, the autoencoder's posterior clip
-        by clip.
-
-        Raises:
-            InputError: the clips' condition is not the published one.
-        """
+        by clip. InputError: the clips' condition is not the published one."""
         encoded, truths, dropout = [], [], ContextDropout.for_reference(settings.reference_dropout)
         with torch.no_grad():
             for number, clip in enumerate(clips, part.first):
                 if clip.condition.warped is not None and bool(clip.condition.warped.any()):
-                    raise InputError(
-                        "the training clips show warped images in their condition",
-                        where=f"step {part.step}",
-                        expected="points alone, as the published-type model is given",
-                        remedy="give another folder of clips; they are made anew",
-                    )
+                    what = "the training clips show warped images in their condition"
+                    remedy = "give another folder of clips; they are made anew"
+                    expected = "points alone, as the published-type model is given"
+                    raise InputError(what, where=f"step {part.step}", expected=expected, remedy=remedy)
                 draws = seeds.torch_generator(part.seed, part.step, f"posterior, clip {number}")
                 encoded.append(self.encode_condition(clip.condition, draws))
                 truths.append(self.encode_truth(clip.rgb[None], clip.depth[None], clip.semantics[None], draws))
@@ -406,22 +341,24 @@ class PublishedMDM(nn.Module):
 
         Args:
             truth: latents of `encode_truth`, each [B,T,4,h,w].
-            encoded: where the reference is left out the image tokens go grey, as in the released code; frame 0 is as it
-                was encoded.
-            generator: of all draws: modality, noise step, noise, which context is left out, dropout inside the network.
-            known: f32[B,T,1,h,w] share of the cell whose truth is known, of any modality; one not named is known
-                everywhere.
-            first: number of the first of these clips in the batch of a training step.
-            batch_clips: clips of that batch (0 = just these); what is drawn for a clip does not depend on how the batch
-                is divided.
+            encoded: where the reference is left out the image tokens go grey, as in the released code.
+            generator: of all draws.
+            known: f32[B,T,1,h,w] share of the cell whose truth is known; a modality not named is known everywhere.
+            first, batch_clips: number of the first of these clips in the batch of a training step, and clips of that
+                batch (0 = just these). What is drawn for a clip does not depend on how the batch is divided.
 
-        Returns:
-            A term for each modality that any clip of the batch shows, so that all parts have the same terms; scaled so
-            that the mean over equal parts is the mean over the clips that show it.
+        Returns a term for each modality that any clip of the batch shows, so that all parts have the same terms; the
+        mean over equal parts is the mean over the clips that show it.
         """
         count = encoded.planes.shape[0]
         batch_clips, own = batch_clips or count, slice(first, first + count)
-        steps, drawn, no_text, no_reference = self._batch_draws(batch_clips, generator, dropout)
+        steps = noise.stratified_steps(batch_clips, len(self.schedule), generator)
+        u = torch.rand(batch_clips, generator=generator, dtype=torch.float64)
+        limits = torch.tensor(list(MODALITY_SHARES.values()), dtype=torch.float64).cumsum(0)[:-1]
+        drawn = [list(MODALITY_SHARES)[int(n)] for n in torch.bucketize(u, limits, right=True)]
+        u = torch.rand(batch_clips, generator=generator)
+        no_reference = (u >= dropout.text) & (u < dropout.text + dropout.both + dropout.reference)
+        no_text = u < dropout.text + dropout.both
         t, no_text, no_reference = (draw[own].to(self.device) for draw in (steps, no_text, no_reference))
         names = drawn[own]
         x0 = torch.stack([truth[m][n] for n, m in enumerate(names)])
@@ -446,30 +383,13 @@ class PublishedMDM(nn.Module):
         }
         return Losses(errors.mean(), {m: total * batch_clips / (count * drawn.count(m)) for m, total in sums.items()})
 
-    def _batch_draws(
-        self, count: int, generator: torch.Generator, dropout: ContextDropout
-    ) -> tuple[Tensor, list[Modality], Tensor, Tensor]:
-        """Of the clips of a batch: noise steps i64[N], modalities, and bool[N] each: without the caption, without the
-        reference."""
-        steps = noise.stratified_steps(count, len(self.schedule), generator)
-        u = torch.rand(count, generator=generator, dtype=torch.float64)
-        limits = torch.tensor(list(MODALITY_SHARES.values()), dtype=torch.float64).cumsum(0)[:-1]
-        names = [list(MODALITY_SHARES)[int(n)] for n in torch.bucketize(u, limits, right=True)]
-        u = torch.rand(count, generator=generator)
-        no_reference = (u >= dropout.text) & (u < dropout.text + dropout.both + dropout.reference)
-        return steps, names, u < dropout.text + dropout.both, no_reference
-
     def trained_part(self) -> nn.ModuleDict:
         """What training changes, by attribute name: the denoising network and the resampler of the image tokens."""
         return nn.ModuleDict({"net": self.net, "image_tokens": self.image_tokens})
 
     def temporal_parameters(self, which: Literal["transformers", "all"]) -> set[str]:
-        """Names in `trained_part` of the parameters that mix frames.
-
-        Those of the temporal transformers inside the blocks, which is what the published second stage froze; or of
-        `all` temporal layers, that after the input convolution and the temporal convolutions included, which is what
-        its text says.
-        """
+        """Names in `trained_part` of the parameters that mix frames: of the temporal transformers inside the blocks,
+        which the published second stage froze; or of `all` temporal layers, as its text says."""
         kinds = (TemporalTransformer, TemporalConv) if which == "all" else TemporalTransformer
         layers = [m for m in self.net.modules() if isinstance(m, kinds) and (which == "all" or m is not self.net.first)]
         ids = {id(parameter) for layer in layers for parameter in layer.parameters()}
@@ -495,7 +415,6 @@ class PublishedMDM(nn.Module):
         the sparse colour: the published way to continue a video. Depth and semantics are not continued. Without
         `align`, depth is what the model says.
         """
-        self.check_frames(len(condition.views))
         frames_at_once = self.split.frames_at_once
         half = request.bf16 and self.dtype == torch.float32
         with torch.autocast(self.device.type, torch.bfloat16) if half else contextlib.nullcontext():
@@ -539,101 +458,76 @@ class PublishedMDM(nn.Module):
     def _guided(
         self, encoded: PublishedLatents, names: tuple[Modality, ...], tokens: Tensor, request: SampleRequest
     ) -> noise.Denoise:
-        """The denoiser for `names` in one batch: velocity with classifier-free guidance.
-
-        What is the same at every step is computed here, once: the condition's planes, and keys and values of caption
-        and image.
-        """
+        """The denoiser for `names` in one batch: velocity with classifier-free guidance."""
         guidance = GUIDANCE if request.guidance is None else request.guidance
         rescale = GUIDANCE_RESCALE if request.guidance_rescale is None else request.guidance_rescale
         count, both = len(names), slice(0, 1 if guidance == 1 else 2)  # 0: with caption and reference, 1: without
         halves = [both] if self.split.guidance_together or guidance == 1 else [slice(0, 1), slice(1, 2)]
-        twice = lambda x, half: x[half].repeat_interleave(count, 0)
-        told = [
-            self._told(names * len(self.text[half]), twice(self.text, half), twice(tokens, half), ahead=True)
-            for half in halves
-        ]
 
-        def passed(x: Tensor, t: int, about: _Told) -> Tensor:
-            n = len(about.label)
+        def passed(x: Tensor, t: int, half: slice) -> Sequence[Tensor]:
+            text, seen = (told[half].repeat_interleave(count, 0) for told in (self.text, tokens))
+            n = len(text)
             planes, at = encoded.planes.expand(n, -1, -1, -1, -1), torch.full((n,), t, device=x.device)
-            return self._velocity(x.repeat(n // count, 1, 1, 1, 1), planes, at, about)
+            wanted = names * (n // count)
+            return self.predict(x.repeat(n // count, 1, 1, 1, 1), planes, at, wanted, text, seen).split(count)
 
         def velocity(x: Tensor, t: int) -> Tensor:
-            found = [half for about in told for half in passed(x, t, about).split(count)]
+            found = [one for half in halves for one in passed(x, t, half)]
             return found[0] if guidance == 1 else noise.guide(found[0], found[1], guidance, rescale)
 
         return velocity
 
 
-# files --------------------------------------------------------------------------------------------
+# memory plan --------------------------------------------------------------------------------------
 #
-# Folders that hold a published-type diffusion model (see `diffusion/model_files.py` for what is in such a folder).
+# How much memory the model needs, and how to cut its work to fit. The needs were counted once, on torch's meta device:
+# what an eager pass holds at its worst moment, with fused attention, which stores no scores. All of it grows linearly
+# with the image. Not counted: the device's own context and the workspace of convolutions; `RESERVE_BYTES` stands for
+# them.
 
 
-KIND = "published"
+RESERVE_BYTES = 1_000_000_000
+CUTS = ((True, True), (True, False), (False, True), (False, False))
+"""(modalities together, guidance together), fastest first."""
+FRAMES_AT_ONCE = (16, 8, 4, 2, 1)
 
 
-def is_published(path: Path | str) -> bool:
-    """Whether a folder holds a published-type model (by its description; a missing one is no)."""
-    where = folder_of(path) / MODEL_FILE
-    content = store.read_json(where) if where.is_file() else None
-    return isinstance(content, dict) and content.get("kind") == KIND
+def meta_model(config: PublishedConfig, dtype: torch.dtype) -> PublishedMDM:
+    """The model without memory behind its weights."""
+    with torch.device("meta"):
+        return PublishedMDM(config).to(dtype).eval()
 
 
-def window_of(path: Path | str) -> int:
-    """Frames of a clip of the model in a folder, from its description alone.
+class Needs(NamedTuple):
+    """What the parts of the work take at the model's own size, in bytes: weights; activations of the denoising network
+    for one latent video; activations of the autoencoder for one frame; what a clip holds beside them (condition,
+    latents, decoded images)."""
 
-    Raises:
-        InputError: not such a folder.
-    """
-    content, where = read_description(Path(path)), str(Path(path) / MODEL_FILE)
-    return records.parse_dataclass(PublishedConfig, content.get("config"), f"{where}: config").window
-
-
-def save(
-    folder: Path,
-    config: PublishedConfig,
-    tensors: Mapping[str, Tensor],
-    facts: Mapping[str, Any],
-    card: str,
-    *,
-    dtype: torch.dtype | None = None,
-    shard_bytes: int = 1 << 30,
-) -> None:
-    """Write a model folder under a temporary name and rename it when it is complete.
-
-    Args:
-        tensors: everything `PublishedMDM(config).state_dict()` names.
-        dtype: number format of the weights (None: as given); the table `scale` stays float32.
-    """
-    with store.atomic_directory(folder) as partial:
-        small = {"scale": tensors["scale"].float()}
-        files = checkpoint.write_shards(partial, {n: t for n, t in tensors.items() if n != "scale"}, shard_bytes, dtype)
-        store.write_safetensors(partial / "scale.safetensors", small)
-        files["scale.safetensors"] = store.sha256_file(partial / "scale.safetensors")
-        store.write_text(partial / "MODEL_CARD.md", card)
-        description = {"schema": 1, "kind": KIND, "config": dataclasses.asdict(config)}
-        store.write_json(partial / MODEL_FILE, {**description, "files": files, "facts": dict(facts)})
-        store.sync_tree(partial)
+    parameters: int
+    one_video: int
+    one_frame: int
+    clip: int
 
 
-def load(folder: Path, device: torch.device | str = "cpu", dtype: torch.dtype | None = None) -> PublishedMDM:
-    """Read a model folder; weights are mapped from the files and converted to `dtype` (None: as stored).
+def needs_of(config: PublishedConfig, bytes_per_value: int) -> Needs:
+    """The needs of a model whose weights and activations take 2 (bfloat16) or 4 (float32) bytes a number. Activations
+    are those of the published network and its 16 frames."""
+    model = meta_model(config, torch.bfloat16 if bytes_per_value == 2 else torch.float32)
+    pixels = config.height * config.width
+    return Needs(
+        sum(x.numel() * x.element_size() for x in (*model.parameters(), *model.buffers())),
+        one_video=bytes_per_value * (2512 * pixels + 8_332_160),
+        one_frame=bytes_per_value * 12289 * pixels // 16,
+        clip=(692 + bytes_per_value) * pixels + bytes_per_value * 1_182_208,
+    )
 
-    Raises:
-        InputError: not such a folder, or its weights do not fit its configuration. IntegrityError: a file was altered.
-    """
-    content, where = read_description(folder), str(Path(folder) / MODEL_FILE)
-    if content.get("kind") != KIND:
-        raise InputError("not a published-type model of this version", where=where, expected=f"schema 1, kind {KIND}")
-    with torch.device("meta"), records.understood("a published-type model", where):
-        model = PublishedMDM(records.parse_dataclass(PublishedConfig, content.get("config"), f"{where}: config"))
-    state = checkpoint.read_shards(Path(folder), content["files"], remedy="convert the checkpoint again")
-    weights.match_exactly(state, weights.shapes_of(model), str(folder), "its configuration")
-    model.load_state_dict(state, assign=True)
-    model.adopt_scale()
-    table = model.scale
-    model = model.to(device=device, dtype=dtype).eval()
-    model.scale = table.to(device)  # exact in any number format: it is part of the schedule
-    return model
+
+def choose(needs: Needs, budget_bytes: int, *, guidance: bool = True) -> tuple[WorkSplit, int]:
+    """The fastest way to cut the work of one clip that fits the budget, or the thriftiest if none does, and its peak in
+    bytes: what stays, the worst moment of all, and the reserve."""
+    ways, stays = [], needs.parameters + needs.clip + RESERVE_BYTES
+    for together in CUTS:
+        videos = needs.one_video * (len(MODALITIES) if together[0] else 1) * (2 if together[1] and guidance else 1)
+        frames = next((n for n in FRAMES_AT_ONCE if needs.one_frame * n <= budget_bytes - stays), 1)
+        ways.append((WorkSplit(*together, frames), stays + max(videos, needs.one_frame * frames)))
+    return next((way for way in ways if way[1] <= budget_bytes), ways[-1])

@@ -1,20 +1,10 @@
 """The networks of the published model: autoencoder, image-token resampler, and the denoiser, a latent-video UNet.
 
-Everything except the temporal layers works on frames, [B*T,C,h,w]. A frame sees the others in three places: in the four
-1-D convolutions over time inside each residual block, in the temporal transformers (self-attention over the T frames at
-one cell; order is known only through the convolutions and the image tokens), and in `first`, one more temporal
-transformer right after the input convolution. Cross-attention looks at the caption's tokens and, with keys and values
-of its own, at the 16 image tokens that belong to the frame.
-
-The vector that modulates the residual blocks is time(t) + label(modality) + fps(rate), all through sinusoids.
-
-Source: paper of MuDG, section on the multi-modal diffusion model; architecture of DynamiCrafter (Xing et al.) with a
-modality label added.
+Source: paper of MuDG; architecture of DynamiCrafter (Xing et al.) with a modality label added.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -30,10 +20,8 @@ from mudg.networks.codec import Decoded, Modality
 
 # autoencoder --------------------------------------------------------------------------------------
 #
-# A convolutional encoder gives mean and log-variance of a Gaussian over 4 latent channels, 1/8 the size; a decoder
-# inverts it (Rombach et al., "High-resolution image synthesis with latent diffusion models"). Colour, depth and
-# semantics all pass as three-channel images in [-1, 1]: depth as its linear code repeated three times, classes as
-# colours of the published palette. No 8-bit step. As a codec it has the members that `networks/codec.py` asks for.
+# Rombach et al., "High-resolution image synthesis with latent diffusion models". All modalities pass as three-channel
+# images in [-1, 1]: depth as its linear code three times, classes as colours of the palette. No 8-bit step.
 
 
 GROUPS = 32
@@ -167,7 +155,8 @@ class Decoder(nn.Module):
 
 
 class Autoencoder(nn.Module):
-    """The codec (see the module text)."""
+    """The codec, with the members that `networks/codec.py` asks for: mean and log-variance of a Gaussian over 4 latent
+    channels, 1/8 the size, and back."""
 
     def __init__(self, config: AutoencoderConfig) -> None:
         super().__init__()
@@ -249,10 +238,8 @@ def nearest_class(image: Tensor) -> Tensor:
 
 # resampler ----------------------------------------------------------------------------------------
 #
-# The image-token resampler: from all tokens of the image tower to 16 tokens for each of 16 frames.
-#
-# Learned queries read from the image's tokens and from each other, layer by layer (Perceiver: Jaegle et al.; its use in
-# video: Alayrac et al., "Flamingo"). Queries belong to frames, so the number of frames is part of the weights.
+# From all tokens of the image tower to 16 for each of 16 frames: learned queries read from the image's tokens and from
+# each other (Perceiver: Jaegle et al.; in video: Alayrac et al., "Flamingo"). The frames are part of the weights.
 
 
 @dataclass(frozen=True)
@@ -310,7 +297,7 @@ class ResamplerLayer(nn.Module):
 
 
 class Resampler(nn.Module):
-    """The resampler (see the module text)."""
+    """The image-token resampler."""
 
     def __init__(self, config: ResamplerConfig) -> None:
         super().__init__()
@@ -331,9 +318,6 @@ class Resampler(nn.Module):
 
 
 # video unet ---------------------------------------------------------------------------------------
-
-
-GROUPS = 32
 
 
 @dataclass(frozen=True)
@@ -359,20 +343,13 @@ class VideoUNetConfig:
                 "multipliers and attention need one entry per level", got=f"{self.multipliers}, {self.attention}"
             )
         if self.width % GROUPS:
-            raise UsageError(
-                "the width is no multiple of the normalisation groups",
-                expected=f"multiple of {GROUPS}",
-                got=str(self.width),
-            )
+            what = "the width is no multiple of the normalisation groups"
+            raise UsageError(what, expected=f"multiple of {GROUPS}", got=str(self.width))
 
 
 class SeededDropout(nn.Module):
-    """Dropout that draws for each clip from a seed of its own; the caller sets `seeds`, one per clip, before a training
-    step.
-
-    What is drawn depends on the layer's seeds alone: neither on the other clips of the batch nor on when the layer is
-    run, so that a second computation in the backward pass draws the same.
-    """
+    """Dropout that draws for each clip from a seed of its own, `seeds`, which the caller sets before a training step: a
+    second computation in the backward pass, or in another division of the batch, draws the same."""
 
     seeds: tuple[int, ...] = ()
 
@@ -385,13 +362,9 @@ class SeededDropout(nn.Module):
         if not self.training or self.share == 0:
             return x
         if not self.seeds or len(x) % len(self.seeds):
-            raise UsageError(
-                "dropout needs a seed for every clip",
-                where="SeededDropout",
-                expected=f"a divisor of {len(x)} seeds",
-                got=str(len(self.seeds)),
-                remedy="call PublishedMDM.loss, or eval()",
-            )
+            what, remedy = "dropout needs a seed for every clip", "call PublishedMDM.loss, or eval()"
+            expected = f"a divisor of {len(x)} seeds"
+            raise UsageError(what, where="SeededDropout", expected=expected, got=str(len(self.seeds)), remedy=remedy)
         shape = (len(x) // len(self.seeds), *x.shape[1:])
         draws = [
             torch.rand(shape, generator=torch.Generator(x.device).manual_seed(s), device=x.device) for s in self.seeds
@@ -404,15 +377,6 @@ class Context(NamedTuple):
 
     text: Tensor
     image: Tensor
-
-
-class ContextKeys(NamedTuple):
-    """Keys and values of a context in one layer: of caption tokens [B,77,C], of image tokens [B*T,16,C]."""
-
-    key: Tensor
-    value: Tensor
-    image_key: Tensor
-    image_value: Tensor
 
 
 class Attention(nn.Module):
@@ -430,21 +394,16 @@ class Attention(nn.Module):
         self.out = nn.Linear(width, width)
         self.dropout = SeededDropout(dropout)
 
-    def forward(self, tokens: Tensor, context: Context | ContextKeys | None = None) -> Tensor:
+    def forward(self, tokens: Tensor, context: Context | None = None) -> Tensor:
         """`tokens` [N,L,C]; `context` of the same clips, None for self-attention -> [N,L,C]."""
         query = self.query(tokens)
         if context is None:
             return self.dropout(self.out(attend(query, self.key(tokens), self.value(tokens), self.heads)))
-        seen = self.keys(context) if isinstance(context, Context) else context
-        repeats = len(tokens) // len(seen.key)
-        key, value = (x.repeat_interleave(repeats, 0) for x in (seen.key, seen.value))
-        mixed = attend(query, key, value, self.heads) + attend(query, seen.image_key, seen.image_value, self.heads)
+        repeats = len(tokens) // len(context.text)
+        key, value = (layer(context.text).repeat_interleave(repeats, 0) for layer in (self.key, self.value))
+        mixed = attend(query, key, value, self.heads)
+        mixed = mixed + attend(query, self.image_key(context.image), self.image_value(context.image), self.heads)
         return self.dropout(self.out(mixed))
-
-    def keys(self, context: Context) -> ContextKeys:
-        """Keys and values of a context; of layers that have those of an image."""
-        text, image = context
-        return ContextKeys(self.key(text), self.value(text), self.image_key(image), self.image_value(image))
 
 
 class GatedFeedForward(nn.Module):
@@ -472,7 +431,7 @@ class TransformerBlock(nn.Module):
         self.attention2 = Attention(width, context_width or width, heads, context_width is not None, dropout)
         self.feed = GatedFeedForward(width, dropout)
 
-    def forward(self, x: Tensor, context: Context | ContextKeys | None = None) -> Tensor:
+    def forward(self, x: Tensor, context: Context | None = None) -> Tensor:
         """`x` [N,L,C] -> the same."""
         x = x + self.attention1(self.norm1(x))
         x = x + self.attention2(self.norm2(x), context)
@@ -495,7 +454,7 @@ class SpatialTransformer(nn.Module):
         self.block = TransformerBlock(width, width // config.head_width, config.context_width, config.dropout)
         self.out = _zero(nn.Linear(width, width))
 
-    def forward(self, x: Tensor, context: Context | ContextKeys) -> Tensor:
+    def forward(self, x: Tensor, context: Context) -> Tensor:
         """`x` [B*T,C,h,w] -> the same."""
         tokens = self.enter(self.norm(x).flatten(2).transpose(1, 2))
         tokens = self.out(self.block(tokens, context))
@@ -587,7 +546,7 @@ class Stage(nn.Module):
         self.temporal = TemporalTransformer(outside, outside, heads, config.dropout) if attention else None
         self.grow = nn.Conv2d(outside, outside, 3, padding=1) if grow else None
 
-    def forward(self, x: Tensor, embedding: Tensor, context: Context | ContextKeys, frames: int) -> Tensor:
+    def forward(self, x: Tensor, embedding: Tensor, context: Context, frames: int) -> Tensor:
         """`x` [B*T,inside,h,w] -> [B*T,outside,h',w']."""
         if self.conv is not None:
             return self.conv(x)
@@ -610,7 +569,7 @@ class Middle(nn.Module):
         self.temporal = TemporalTransformer(width, width, width // config.head_width, config.dropout)
         self.res2 = ResBlock(width, width, 4 * config.width, config.dropout)
 
-    def forward(self, x: Tensor, embedding: Tensor, context: Context | ContextKeys, frames: int) -> Tensor:
+    def forward(self, x: Tensor, embedding: Tensor, context: Context, frames: int) -> Tensor:
         """[B*T,C,h,w] -> the same."""
         x = self.temporal(self.spatial(self.res1(x, embedding, frames), context), frames)
         return self.res2(x, embedding, frames)
@@ -621,7 +580,12 @@ def _embedding(width: int) -> nn.Sequential:
 
 
 class VideoUNet(nn.Module):
-    """The network (see the module text)."""
+    """The denoiser. What modulates the residual blocks is time(t) + label(modality) + fps(rate), all through sinusoids.
+
+    Everything except the temporal layers works on frames, [B*T,C,h,w]. A frame sees the others in the convolutions over
+    time inside each residual block, in the temporal transformers, and in `first`, one more of these right after the
+    input convolution.
+    """
 
     def __init__(self, config: VideoUNetConfig) -> None:
         super().__init__()
@@ -654,49 +618,23 @@ class VideoUNet(nn.Module):
         self.norm = nn.GroupNorm(GROUPS, inside)
         self.leave = _zero(nn.Conv2d(inside, config.channels_out, 3, padding=1))
 
-    def context_keys(self, text: Tensor, image: Tensor) -> list[ContextKeys]:
-        """Keys and values of caption tokens [B,77,D] and image tokens [B,T,16,D] in every layer that looks at them, in
-        the order of `forward`. They are the same at every noise step."""
-        spatial = [stage.spatial for stage in (*self.down, self.middle, *self.up) if stage.spatial is not None]
-        context = Context(text, image.flatten(0, 1))
-        return [layer.block.attention2.keys(context) for layer in spatial]
-
-    def forward(
-        self,
-        x: Tensor,
-        t: Tensor,
-        label: Tensor,
-        fps: Tensor,
-        text: Tensor,
-        image: Tensor,
-        keys: Sequence[ContextKeys] | None = None,
-    ) -> Tensor:
-        """One denoiser pass.
-
-        Args:
-            x: [B,T,channels_in,h,w], noisy latent, latent of the colour condition, latent of the depth condition.
-            t: i64[B] noise step. label: i64[B] modality. fps: i64[B] frames per second.
-            text: [B,77,D] caption tokens. image: [B,T,16,D] image tokens of each frame.
-            keys: `context_keys` of text and image, where they are computed already.
-
-        Returns:
-            Velocity [B,T,channels_out,h,w].
-        """
+    def forward(self, x: Tensor, t: Tensor, label: Tensor, fps: Tensor, text: Tensor, image: Tensor) -> Tensor:
+        """One denoiser pass. x: [B,T,channels_in,h,w], noisy latent, latent of the colour condition, latent of the
+        depth condition. t: i64[B] noise step. label: i64[B] modality. fps: i64[B] frames per second. text: [B,77,D]
+        caption tokens. image: [B,T,16,D] image tokens of each frame. Returns velocity [B,T,channels_out,h,w]."""
         batch, frames = x.shape[:2]
         wave = lambda value: sinusoid(value, self.config.width).to(x.dtype)
         embedding = self.time(wave(t)) + self.label(wave(label)) + self.fps(wave(fps))
         embedding = embedding.repeat_interleave(frames, 0)
         context = Context(text, image.flatten(0, 1))
-        ready = iter(keys or ())
-        seen = lambda stage: context if keys is None or stage.spatial is None else next(ready)
         h = x.flatten(0, 1)
         skips = []
         for number, stage in enumerate(self.down):
-            h = stage(h, embedding, seen(stage), frames)
+            h = stage(h, embedding, context, frames)
             if number == 0:
                 h = self.first(h, frames)
             skips.append(h)
-        h = self.middle(h, embedding, seen(self.middle), frames)
+        h = self.middle(h, embedding, context, frames)
         for stage in self.up:
-            h = stage(torch.cat([h, skips.pop()], 1), embedding, seen(stage), frames)
+            h = stage(torch.cat([h, skips.pop()], 1), embedding, context, frames)
         return self.leave(functional.silu(self.norm(h))).unflatten(0, (batch, frames))

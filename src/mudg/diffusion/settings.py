@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from mudg.base.config import Limits, setting, settings
 from mudg.base.devices import DeviceName
-
-#  -------------------------------------------------------------------------------------------------
-#
-# Settings of ``mudg synthesize``.
 
 
 @settings
@@ -69,9 +65,7 @@ class SynthesizeConfig:
     """Seed of the noise."""
 
 
-#  -------------------------------------------------------------------------------------------------
-#
-# Settings of ``mudg convert``.
+# mudg convert -------------------------------------------------------------------------------------
 
 
 @settings
@@ -85,16 +79,12 @@ class ConvertConfig:
     """Image height x width that the checkpoint was trained at. auto: from 512 or 1024 in the file's name."""
     dtype: Literal["keep", "float32", "float16", "bfloat16"] = "keep"
     """Number format of the written weights. keep: as in the checkpoint. bfloat16 halves the size of float32 weights."""
-    towers: str = ""
-    """OpenCLIP ViT-H/14 weights, for a checkpoint that lacks them (empty = the checkpoint has its own)."""
     memory_gb: float = setting(default=0.0, ge=0)
     """Limit, in GB, of the address space of the process that reads the checkpoint, beyond the program's own (0 =
     derived from the file's size). Raise it if the conversion runs out of memory."""
 
 
-#  -------------------------------------------------------------------------------------------------
-#
-# Settings of ``mudg learn``.
+# mudg learn ---------------------------------------------------------------------------------------
 
 
 BelowOne = Annotated[float, Limits(ge=0, lt=1)]
@@ -104,8 +94,6 @@ BelowOne = Annotated[float, Limits(ge=0, lt=1)]
 class LearnData:
     """Training clips: from recorded logs if `scenes` is given, else from generated cities."""
 
-    STREAMED: ClassVar[tuple[str, ...]] = ("clips",)
-    """Settings that may be addresses of an object store."""
     width: int = setting(default=192, ge=32)
     """Width of the training images in pixels."""
     height: int = setting(default=128, ge=32)
@@ -115,8 +103,7 @@ class LearnData:
     """Frames per clip."""
     clips: str = ""
     """Folder of training clips to read; missing clips are added to it (empty = a folder inside the output). Give an
-    earlier run's folder to reuse its clips. At an address such as s3://bucket/clips all clips must be there; they are
-    fetched when needed."""
+    earlier run's folder to reuse its clips."""
     augment: bool = True
     """Vary the training clips: change colours, mirror, and corrupt the classes in the condition."""
     reference_dropout: float = setting(default=0.2, ge=0, le=1)
@@ -124,26 +111,16 @@ class LearnData:
     0.2, released code: 0.1)."""
     cities: int = setting(default=240, ge=1)
     """Number of generated cities to train on."""
-    skip_cities: int = setting(default=0, ge=0)
-    """Generated cities to leave out before the first one, for example those of an earlier run whose `clips` this run
-    uses and adds to."""
     first_cities: int = setting(default=40, ge=1)
     """Number of cities in use from the first step. The others are generated and join while training runs."""
     all_cities_at: float = setting(default=0.6, ge=0, le=1)
     """Share of the steps after which all cities are in use, 0 to 1."""
     clips_per_city: int = setting(default=4, ge=1)
     """Clips taken from each generated city."""
-    realism: Literal["plain", "varied", "mixed"] = "plain"
-    """Generated cities: varied = cities, cameras, LiDARs and their faults as in recorded logs (docs/training.md). mixed
-    = half of them are. The small model then also learns five aspect ratios, all of about the area width x height.
-    Cities for scoring stay plain."""
-    log_frames: int = setting(default=12, ge=12)
-    """Generated cities: frames of each log. Longer logs, with fits of more steps, give better renders."""
-    side_cameras: float | None = setting(default=None, ge=0, le=1)
-    """Generated cities: share with two cameras beside the front one (not given: 0.4 of plain cities, 0.35 of varied
-    ones)."""
-    fit_steps: tuple[Annotated[int, Limits(ge=1)], Annotated[int, Limits(ge=1)]] = (100, 300)
-    """Generated cities: fewest and most steps of the fit to each city; cities for scoring have the middle of them."""
+    realism: Literal["plain", "varied"] = "plain"
+    """Generated cities: varied = cities, cameras, LiDARs and their faults as in recorded logs (docs/training.md). The
+    small model then also learns five aspect ratios, all of about the area width x height. Cities for scoring stay
+    plain."""
     renders: bool = True
     """Generated cities: fit a scene to each city's images for a few hundred steps and give its renders in the
     condition, with patches at the camera's resolution. Takes about half a minute per city. Not done for models that use
@@ -258,9 +235,6 @@ class LearnCompute:
     device: DeviceName = "auto"
     """Device on which the networks are trained and scored: auto (CUDA if there is one), cpu, cuda, cuda:N, mps. Under
     torchrun cuda is one device for each process. Clips are made on the CPU."""
-    parallel: Literal["ddp", "fsdp"] = "ddp"
-    """Under torchrun: ddp keeps the whole network in every process; fsdp shards parameters and optimizer state over all
-    processes."""
     accumulate: int = setting(default=1, ge=1)
     """Gradient accumulation: each process computes its share of a step in this many portions. Larger needs less memory
     and gives the same result."""
@@ -272,11 +246,9 @@ class LearnCompute:
     Clips of logs are made before training starts, by this process if 0."""
     checkpoint_every: int = setting(default=100, ge=1)
     """Steps between checkpoints; an interrupted training resumes at the last one."""
-    checkpoints_kept: int = setting(default=2, ge=2)
-    """Newest checkpoints to keep; older ones are removed."""
     cache: str = ""
-    """Folder for training clips that are fetched or made when they are needed; several runs and processes may share it
-    (empty = a folder inside the output)."""
+    """Lists of scenes: folder for training clips that are fetched or made when they are needed; several runs and
+    processes may share it (empty = a folder inside the output)."""
     cache_gb: float = setting(default=50.0, gt=0)
     """Largest size of that folder in GB. The clips that were not used for the longest time are removed first."""
     read_ahead: int = setting(default=4, ge=0)

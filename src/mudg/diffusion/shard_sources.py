@@ -1,21 +1,22 @@
-"""Where training clips come from when they are not in one folder of this machine: an object store, through a bounded
-cache.
+"""Training on thousands of scenes: what a list says, which clip is drawn, and scenes that cannot be used.
 
-What is in the cache is a copy, or can be made again. Several processes may share it: files appear under their names
-complete, and one that another process removed meanwhile is brought once more.
+A list is a file in YAML or JSON; nothing of a scene is read before it is drawn.
+
+    data_sets: {nuscenes: 3.0, kitti: 1.0}              shares of the clips (left out: by the number of scenes)
+    scenes:
+      - s3://bucket/clips/0001                          a folder of clips, or
+      - {path: runs/0002, data_set: kitti, weight: 2, held_out: true}
 """
 
 from __future__ import annotations
 
-import collections
 import contextlib
+import functools
 import hashlib
 import os
-import shutil
-import tempfile
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Final, NamedTuple
 
@@ -25,192 +26,19 @@ from pydantic import BeforeValidator, Field
 from mudg.base import log, plain_yaml, seeds, store
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.location import Location
-from mudg.base.records import StrictRecord, parse_record, understood
+from mudg.base.records import StrictRecord, parse_record
 from mudg.base.types import Clip
 from mudg.diffusion import log_clips
 from mudg.diffusion.city_clips import HELD_OUT
-from mudg.diffusion.clips import Result, TrainingClips, clips_at, shard_path
-from mudg.diffusion.log_clips import LogClipRules, LogSource
+from mudg.diffusion.clips import Result, Shards, TrainingClips, shard_path
+from mudg.diffusion.log_clips import LogClipRules
 from mudg.scene.read import read_scene
-
-_TRIES = 3
-
-
-class ShardCache:
-    """A folder of shards of at most `limit` bytes. Those used longest ago are removed first; the newest one always
-    stays.
-
-    The time of a file's last change says when it was last used.
-    """
-
-    def __init__(self, folder: Path, limit: int) -> None:
-        self.folder, self.limit = folder, limit
-        self.made = 0
-        """How often this process brought a shard."""
-        self._locks: dict[str, threading.Lock] = {}
-        self._own = threading.Lock()
-
-    def get(self, name: str, make: Callable[[Path], None]) -> Path:
-        """The file `name` below the folder; `make` brings it if it is not there. Threads wait for each other's."""
-        path = self.folder / name
-        with self._own:
-            lock = self._locks.setdefault(name, threading.Lock())
-        with lock:
-            if not path.is_file():
-                make(path)
-                with self._own:
-                    self.made += 1
-                    self._evict(path)
-        with self._own:
-            self._locks.pop(name, None)
-        with contextlib.suppress(OSError):
-            os.utime(path)
-        return path
-
-    def _evict(self, newest: Path) -> None:
-        """Remove files until the rest is within the limit."""
-        found: list[tuple[int, int, Path]] = []
-        for path in self.folder.rglob("*.safetensors"):
-            with contextlib.suppress(OSError):  # another process removed it
-                facts = path.stat()
-                found.append((facts.st_mtime_ns, facts.st_size, path))
-        total = sum(size for _, size, _ in found)
-        for _, size, path in sorted(found):
-            if total <= self.limit:
-                return
-            if path != newest:
-                store.remove(path)
-                total -= size
-
-
-@dataclass(frozen=True)
-class FolderOfShards:
-    """A folder of shards at an address, with the sums that its upload recorded (empty: they are not known)."""
-
-    place: Location
-    sums: dict[str, str]
-
-    @classmethod
-    def open(cls, place: Location) -> FolderOfShards:
-        """The folder, or one inside a folder that was uploaded as a whole, such as the output of a training."""
-        head = place.text.rpartition("/")[0]
-        parent = [(Location.of(head), f"{place.name}/")] if head and not head.endswith("/") else []
-        for above, prefix in ((place, ""), *parent):
-            upload = above.uploaded()
-            if upload is not None:
-                files = upload.files.items()
-                return cls(place, {n[len(prefix) :]: one.sha256 for n, one in files if n.startswith(prefix)})
-        return cls(place, {})
-
-    @property
-    def key(self) -> str:
-        """A name for the folder in a cache, by its address and content."""
-        said = store.json_text([self.place.text, sorted(self.sums.items())], indent=None)
-        return hashlib.sha256(said.encode()).hexdigest()[:24]
-
-    def numbers(self) -> tuple[int, ...]:
-        """Numbers of all shards, sorted."""
-        names = sorted(self.sums) or self.place.names()
-        found = (n[5:-12] for n in names if n.startswith("city_") and n.endswith(".safetensors"))
-        return tuple(sorted(int(n) for n in found if n.isdecimal()))
-
-    def bring(self, number: int, path: Path) -> None:
-        """Write a shard to `path`, verified.
-
-        Raises:
-            InputError: it is not there. IntegrityError: it is not what was uploaded, twice. ResourceError: no
-                connection.
-        """
-        name = shard_path(Path(), number).name
-        wanted = self.sums.get(name, "")
-        for last in (False, True):
-            content = (self.place / name).load()
-            got = hashlib.sha256(content).hexdigest()
-            if not wanted or got == wanted:
-                store.atomic_write(path, content)
-                return
-            if last:
-                raise IntegrityError(
-                    "what came is not what was uploaded",
-                    where=f"{self.place}/{name}",
-                    expected=f"sha256 {wanted[:16]}...",
-                    got=f"sha256 {got[:16]}...",
-                    remedy="upload the clips again",
-                )
-
-
-class StreamedShards:
-    """The clips of a training, at an address: fetched when they are needed.
-
-    Args:
-        clips: how many clips each shard to train on has. Draws are made from it before a shard is here.
-    """
-
-    def __init__(self, place: Location, cache: ShardCache, clips: int) -> None:
-        self._folder, self._cache, self._clips = FolderOfShards.open(place), cache, clips
-
-    def path(self, number: int) -> Path:
-        """The shard, on this machine.
-
-        Raises:
-            InputError: it has another number of clips, or is not there. IntegrityError: it is damaged.
-        """
-        return self._cache.get(f"{self._folder.key}/{number:07d}.safetensors", lambda path: self._bring(number, path))
-
-    def _bring(self, number: int, path: Path) -> None:
-        self._folder.bring(number, path)
-        found = clips_at(path)
-        if number < HELD_OUT and found != self._clips:
-            store.remove(path)
-            raise InputError(
-                "the training clips have another number of clips in each shard",
-                where=str(self._folder.place),
-                expected=str(self._clips),
-                got=str(found),
-                remedy=f"--data.clips-per-city {found}",
-            )
-
-    def clips_in(self, number: int) -> int:
-        """Clips in a shard; of those to train on without fetching it."""
-        return self._clips if number < HELD_OUT else self.reading(number, clips_at)
-
-    def reading(self, number: int, read: Callable[[Path], Result]) -> Result:
-        """What `read` makes of a shard's file, which another process may remove at any time."""
-        return read_present(lambda: self.path(number), read)
-
-
-def read_present(find: Callable[[], Path], read: Callable[[Path], Result]) -> Result:
-    """What `read` makes of the file that `find` brings; again, if the file was removed in between."""
-    for _ in range(_TRIES - 1):
-        path = find()
-        try:
-            return read(path)
-        except InputError:
-            if path.is_file():
-                raise
-    return read(find())
-
-
-# lists of scenes ----------------------------------------------------------------------------------
-#
-# Training on thousands of scenes: what a list says, which clip is drawn, and scenes that cannot be used. A list is a
-# file in YAML or JSON,
-#
-#     data_sets: {nuscenes: 3.0, kitti: 1.0}              shares of the clips (left out: by the number of scenes)
-#     scenes:
-#       - s3://bucket/clips/0001                          a folder of clips, or
-#       - {path: runs/0002, data_set: kitti, weight: 2, held_out: true}
-#
-# Nothing of a scene is read before it is drawn.
-
 
 SUFFIXES: Final = (".yaml", ".yml", ".json")
 LARGEST_LIST: Final = 4_000_000
 """Bytes of a list in YAML; one in JSON may be larger."""
 SPAN: Final = 100_000_000
 """Shard k of the list's n-th scene has the number n * SPAN + k + 1."""
-_OPEN: Final = 512
-"""Scenes whose facts are kept in memory."""
 
 
 class ListedScene(StrictRecord):
@@ -233,13 +61,9 @@ class _Listed(StrictRecord):
 
 
 class SceneList:
-    """The scenes of a list and how they are drawn.
-
-    Args:
-        scenes: in the list's order, which numbers them.
-        weights: of data sets; each left out counts as its scenes' weights together.
-        held_out: if no scene is marked for scoring, so many are set apart, chosen by their paths alone.
-    """
+    """The scenes of a list and how they are drawn. scenes: in the list's order, which numbers them. weights: of data
+    sets; each left out counts as its scenes' weights together. held_out: if no scene is marked for scoring, so many are
+    set apart, chosen by their paths alone."""
 
     def __init__(self, scenes: Sequence[ListedScene], weights: dict[str, float], held_out: int, where: str) -> None:
         self.scenes, self.where = scenes, where
@@ -254,12 +78,8 @@ class SceneList:
                 self.members.setdefault(scene.data_set, []).append(n)
         unknown = sorted(set(weights) - {scene.data_set for scene in scenes})
         if unknown:
-            raise InputError(
-                "a weight is given for a data set without scenes",
-                where=where,
-                got=", ".join(unknown[:8]),
-                expected=f"one of {', '.join(list(self.members)[:20])}",
-            )
+            what, got = "a weight is given for a data set without scenes", ", ".join(unknown[:8])
+            raise InputError(what, where=where, got=got, expected=f"one of {', '.join(list(self.members)[:20])}")
         self._sums = {name: np.cumsum([scenes[n].weight for n in of]) for name, of in self.members.items()}
         shares = np.array([weights.get(name, float(self._sums[name][-1])) for name in self.members], np.float64)
         if not len(shares) or shares.sum() <= 0:
@@ -291,16 +111,96 @@ def is_list(scenes: Sequence[str]) -> bool:
 
 
 def read_list(text: str, held_out: int = 0) -> SceneList:
-    """Read a list. Relative paths are relative to the working directory.
-
-    Raises:
-        InputError: it is not there, or no list; names the record and the field.
-    """
+    """Read a list. Relative paths are relative to the working directory. InputError: it is not there, or no list; names
+    the record and the field."""
     suffix = PurePosixPath(text).suffix.lower()
     content = Location.of(text).load()
     value = store.parse_json(content, text) if suffix == ".json" else plain_yaml.parse_yaml(content, text, LARGEST_LIST)
     listed = parse_record(_Listed, {"scenes": value} if isinstance(value, list) else value, f"{text}: ")
     return SceneList(listed.scenes, listed.data_sets, held_out, text)
+
+
+# clips from elsewhere -----------------------------------------------------------------------------
+
+
+class ShardCache:
+    """A folder of shards of at most `limit` bytes, which several processes may share. Those used longest ago, by the
+    time of their last change, are removed first; the newest one always stays."""
+
+    def __init__(self, folder: Path, limit: int) -> None:
+        self.folder, self.limit = folder, limit
+        self._locks: dict[str, threading.Lock] = {}
+        self._own = threading.Lock()
+
+    def get(self, name: str, make: Callable[[Path], None]) -> Path:
+        """The file `name` below the folder; `make` brings it if it is not there. Threads wait for each other's."""
+        path = self.folder / name
+        with self._own:
+            lock = self._locks.setdefault(name, threading.Lock())
+        with lock:
+            if not path.is_file():
+                make(path)
+                with self._own:
+                    self._evict(path)
+        with contextlib.suppress(OSError):
+            os.utime(path)
+        return path
+
+    def _evict(self, newest: Path) -> None:
+        found: list[tuple[int, int, Path]] = []
+        for path in self.folder.rglob("*.safetensors"):
+            with contextlib.suppress(OSError):  # another process removed it
+                facts = path.stat()
+                found.append((facts.st_mtime_ns, facts.st_size, path))
+        total = sum(size for _, size, _ in found)
+        for _, size, path in sorted(found):
+            if total > self.limit and path != newest:
+                store.remove(path)
+                total -= size
+
+
+class FolderOfShards:
+    """A folder of shards at an address: their `numbers`, sorted, and the sums that its upload recorded, or that of a
+    folder around it such as the output of a training (none: they are not known)."""
+
+    def __init__(self, place: Location) -> None:
+        self.place, self.sums = place, dict[str, str]()
+        head = place.text.rpartition("/")[0]
+        parent = [(Location.of(head), f"{place.name}/")] if head and not head.endswith("/") else []
+        for above, prefix in () if place.local is not None else ((place, ""), *parent):
+            upload = above.uploaded()
+            if upload is not None:
+                files = upload.files.items()
+                self.sums = {n[len(prefix) :]: one.sha256 for n, one in files if n.startswith(prefix)}
+                break
+        names = sorted(self.sums) or place.names()
+        found = (n[5:-12] for n in names if n.startswith("city_") and n.endswith(".safetensors"))
+        self.numbers = sorted(int(n) for n in found if n.isdecimal())
+        said = store.json_text([place.text, sorted(self.sums.items())], indent=None)
+        self.key = hashlib.sha256(said.encode()).hexdigest()[:24]
+        """A name for the folder in a cache, by its address and content."""
+
+    def find(self, cache: ShardCache, number: int) -> Path:
+        """A shard's file, on this machine."""
+        if self.place.local is not None:
+            return shard_path(self.place.local, number)
+        return cache.get(f"{self.key}/{number:07d}.safetensors", functools.partial(self.bring, number))
+
+    def bring(self, number: int, path: Path) -> None:
+        """Write a shard to `path`; IntegrityError: it is not what was uploaded."""
+        name = shard_path(Path(), number).name
+        content = (self.place / name).load()
+        got = hashlib.sha256(content).hexdigest()
+        wanted = self.sums.get(name, got)
+        if got != wanted:
+            raise IntegrityError(
+                "what came is not what was uploaded",
+                where=f"{self.place}/{name}",
+                expected=f"sha256 {wanted[:16]}...",
+                got=f"sha256 {got[:16]}...",
+                remedy="upload the clips again",
+            )
+        store.atomic_write(path, content)
 
 
 # shards of listed scenes --------------------------------------------------------------------------
@@ -313,30 +213,26 @@ class _OpenScene(NamedTuple):
     find: Callable[[int], Path]
 
 
-class ListedShards:
+class ListedShards(Shards):
     """Clips of the scenes of a list, fetched or made when they are drawn.
 
     Scenes and shards that are missing or damaged are named once and left out; others are drawn in their place.
 
-    Args:
-        rules: how clips are cut from scenes that are logs.
-        limit: share of the scenes that may be left out.
-    """
+    rules: how clips are cut from scenes that are logs. limit: share of the scenes that may be left out."""
 
     def __init__(self, scenes: SceneList, cache: ShardCache, rules: LogClipRules, limit: float) -> None:
         self.scenes, self._cache, self._limit = scenes, cache, limit
         self._rules = replace(rules, held_out_every=0)
-        self._open: collections.OrderedDict[int, _OpenScene] = collections.OrderedDict()
+        self.opened = functools.lru_cache(maxsize=512)(self._opened)
+        """The facts of a scene, by its number. Raises InputError or IntegrityError: it is missing or damaged, or there
+        is no clip in it."""
         self.bad: dict[int, str] = {}
         """What is left out, and why, by number of the shard; n * SPAN is the whole n-th scene."""
         self._lock = threading.Lock()
 
     def draw(self, rng: np.random.Generator, take: Callable[[int], Result]) -> Result:
-        """What `take` makes of a shard drawn with `rng`: a function of `rng` and of what the scenes hold.
-
-        Raises:
-            InputError: too many scenes are missing or damaged.
-        """
+        """What `take` makes of a shard drawn with `rng`: a function of `rng` and of what the scenes hold. UsageError:
+        too many scenes are missing or damaged."""
         while True:
             scene, place = self.scenes.draw(rng), rng.random()
             number = scene * SPAN
@@ -344,15 +240,9 @@ class ListedShards:
                 continue
             try:
                 shards = self.opened(scene).shards
-                chosen = shards[min(int(place * len(shards)), len(shards) - 1)]
-            except (InputError, IntegrityError) as error:
-                self._leave_out(number, error)
-                continue
-            number += chosen + 1
-            if number in self.bad:
-                continue
-            try:
-                return take(number)
+                number += shards[min(int(place * len(shards)), len(shards) - 1)] + 1
+                if number not in self.bad:
+                    return take(number)
             except (InputError, IntegrityError) as error:
                 self._leave_out(number, error)
 
@@ -378,11 +268,7 @@ class ListedShards:
 
     def scored(self) -> list[int]:
         """The first shard of every held-out scene, or of one trained on where none is. Those that cannot be used are
-        left out.
-
-        Raises:
-            InputError: none can be used.
-        """
+        left out; InputError where none can."""
         found = []
         for scene in self.scenes.scored or [next(iter(self.scenes.members.values()))[0]]:
             try:
@@ -395,117 +281,50 @@ class ListedShards:
             raise InputError("no held-out scene of the list can be used", where=self.scenes.where)
         return found
 
-    def clips_in(self, number: int) -> int:
-        """Clips in a shard."""
-        return self.reading(number, clips_at)
-
-    def reading(self, number: int, read: Callable[[Path], Result]) -> Result:
-        """What `read` makes of a shard's file."""
-        return read_present(lambda: self.path(number), read)
-
     def path(self, number: int) -> Path:
-        """The shard, on this machine."""
+        """A shard's file, on this machine."""
         scene, shard = divmod(number, SPAN)
         return self.opened(scene).find(shard - 1)
 
-    def opened(self, scene: int) -> _OpenScene:
-        """The facts of a scene. Those of the scenes used longest ago are forgotten.
+    def reading(self, number: int, read: Callable[[Path], Result]) -> Result:
+        """What `read` makes of a shard's file; once more if another process removed the file in between."""
+        path = self.path(number)
+        try:
+            return read(path)
+        except InputError:
+            if path.is_file():
+                raise
+        return read(self.path(number))
 
-        Raises:
-            InputError, IntegrityError: it is missing or damaged, or there is no clip in it.
-        """
-        with self._lock:
-            found = self._open.get(scene)
-            if found is not None:
-                self._open.move_to_end(scene)
-                return found
-        found = self._look(self.scenes.scenes[scene].path, scene in self.scenes.scored)
+    def _opened(self, scene: int) -> _OpenScene:
+        text = self.scenes.scenes[scene].path
+        folder = None if "=" in text else FolderOfShards(Location.of(text))
+        if folder is None or not (folder.numbers or folder.place.local is None):
+            found = self._of_log(text, scene in self.scenes.scored)
+        else:
+            numbers = [n for n in folder.numbers if n < HELD_OUT] or folder.numbers
+            found = _OpenScene(numbers, functools.partial(folder.find, self._cache))
         if not found.shards or found.shards[-1] >= SPAN - 1:
-            raise InputError("no training clips in a scene", where=self.scenes.scenes[scene].path)
-        with self._lock:
-            self._open[scene] = found
-            while len(self._open) > _OPEN:
-                self._open.popitem(last=False)
+            raise InputError("no training clips in a scene", where=text)
         return found
 
-    def _look(self, text: str, scored: bool) -> _OpenScene:
-        given, separator, fused = text.partition("=")
-        if not separator:
-            place = Location.of(text)
-            folder = FolderOfShards.open(place) if place.local is None else FolderOfShards(place, {})
-            numbers = folder.numbers()
-            if numbers:
-                chosen = [n for n in numbers if n < HELD_OUT] or numbers
-                if place.local is not None:
-                    return _OpenScene(chosen, lambda n: shard_path(Path(place.text), n))
-                name = f"{folder.key}/{{:07d}}.safetensors"
-                return _OpenScene(chosen, lambda n: self._cache.get(name.format(n), lambda at: folder.bring(n, at)))
-        places = [Location.of(given), Location.of(fused)] if separator else [Location.of(given)]
-        if all(place.local is not None for place in places):
-            return self._of_log(log_clips.log_source(text), scored, lambda make: make(log_clips.log_source(text)))
-        return self._of_remote_log(places, scored)
+    def _of_log(self, text: str, scored: bool) -> _OpenScene:
+        """A log's clips, all made when the first one is wanted, and kept in the cache by the log's content."""
+        source, rules = log_clips.log_source(text), self._rules
+        windows = [replace(w, held_out=scored) for w in log_clips.log_windows(read_scene(source.scene), rules)]
+        said = store.json_text([store.digest(source.scene), store.digest(source.fused), asdict(rules), scored])
+        folder = hashlib.sha256(said.encode()).hexdigest()[:24]
 
-    def _of_log(
-        self,
-        source: LogSource | None,
-        scored: bool,
-        with_log: Callable[[Callable[[LogSource], None]], None],
-        key: str = "",
-    ) -> _OpenScene:
-        """A log's clips, all made when the first one is wanted. How many there are is kept in the cache, by the log's
-        content."""
-        rules = self._rules
-        if source is not None:
-            key = f"{store.digest(source.scene)} {store.digest(source.fused)}"
-        said = store.json_text([key, asdict(rules), scored], indent=None)
-        folder = self._cache.folder / hashlib.sha256(said.encode()).hexdigest()[:24]
-        index = folder / "clips.json"
-
-        def make(of: LogSource) -> None:
-            windows = [replace(w, held_out=scored) for w in log_clips.log_windows(read_scene(of.scene), rules)]
-            if index.is_file():
-                log_clips.write_log(of, rules, list(enumerate(windows)), folder)
-            else:
-                store.write_json(index, {"clips": len(windows)})
-
-        if not index.is_file():
-            with_log(make)
-        with understood("the number of a log's clips", str(index)):
-            count = int(store.read_json(index)["clips"])
-
-        def find(number: int) -> Path:
-            def bring(path: Path) -> None:
-                try:
-                    with_log(make)
-                except (InputError, IntegrityError):
-                    if not path.is_file():  # else another clip of the log is at fault
-                        raise
-
-            return self._cache.get(f"{folder.name}/{shard_path(Path(), number).name}", bring)
-
-        return _OpenScene(range(count), find)
-
-    def _of_remote_log(self, places: Sequence[Location], scored: bool) -> _OpenScene:
-        def with_log(make: Callable[[LogSource], None]) -> None:
-            store.make_folder(self._cache.folder)
-            staged = Path(tempfile.mkdtemp(prefix=".log-", dir=self._cache.folder))
+        def bring(path: Path) -> None:
             try:
-                for place, name in zip(places, ("scene", "fused"), strict=False):
-                    place.fetch(staged / name)
-                text = f"{staged / 'scene'}={staged / 'fused'}" if len(places) == 2 else str(staged / "scene")
-                make(log_clips.log_source(text))
-            finally:
-                shutil.rmtree(staged, ignore_errors=True)
+                log_clips.write_log(source, rules, list(enumerate(windows)), path.parent)
+            except (InputError, IntegrityError):
+                if not path.is_file():  # else another clip of the log is at fault
+                    raise
 
-        facts = []
-        for place in places:
-            records = (place / name for name in ("_contents.json", store.MANIFEST, "scene.json"))
-            record = next((one for one in records if one.exists()), None)
-            if record is None:
-                remedy = "check the address, and whether its upload was finished"
-                raise InputError("no clips and no log here", where=place.text, remedy=remedy)
-            facts.append(hashlib.sha256(record.load()).hexdigest())
-        return self._of_log(None, scored, with_log, " ".join(facts))
+        return _OpenScene(
+            range(len(windows)), lambda n: self._cache.get(f"{folder}/{shard_path(Path(), n).name}", bring)
+        )
 
 
 class ListedClips(TrainingClips):
@@ -528,11 +347,6 @@ class ListedClips(TrainingClips):
             return self.read(shard, clip, range(first, first + frames), self.size)
 
         return self.shards.draw(seeds.numpy_rng(seed, step, f"{purpose}, scene {place}"), take)
-
-    def ready(self, step: int) -> bool:
-        """Nothing is being made elsewhere."""
-        del step
-        return True
 
     def have_patches(self) -> bool:
         """Whether the clips have patches at a higher resolution."""

@@ -1,38 +1,159 @@
-"""Windows of generated views: the condition of each, its sample, and the observations made of it.
+"""synthesize: dense colour, depth and semantics on trajectories that were never driven.
 
-Whoever generates along a path (``synthesize``, repairs of edited views) asks a `ViewMaker` for the windows `along` it.
+Whoever generates along a path, also repairs of edited views, asks a `ViewMaker`.
+OUT/<trajectory>/state/ holds what an interrupted run needs to continue after the last finished window.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+import functools
+import math
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from mudg.base import log, palette
+from mudg import native
+from mudg.base import log, memory, palette, store
 from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.errors import ResourceError, UsageError
-from mudg.base.types import Condition, Frame, Observation, Photo, Scene, View
+from mudg.base.processes import run_in_processes
+from mudg.base.records import understood
+from mudg.base.run_folder import RunDir
+from mudg.base.types import Condition, FusedCloud, Observation, Photo, RenderPlanes, Scene, Track, Trajectory, View
+from mudg.core import trajectory
+from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
 from mudg.core.raster.cpu import release_memory
-from mudg.diffusion import memory_plan, model_files, published
-from mudg.diffusion.condition import PreparedImages
-from mudg.diffusion.inputs import ConditionParts, ConditionSources, conditions_of
-from mudg.diffusion.memory_plan import half_format
+from mudg.diffusion import model_files, published
+from mudg.diffusion.condition import (
+    FAR_M,
+    ConditionRules,
+    InWeather,
+    PreparedImages,
+    RenderAt,
+    VacatedAt,
+    WarpSource,
+    WeatheredPoints,
+    build_conditions,
+)
 from mudg.diffusion.model import MDM
-from mudg.diffusion.published import PublishedMDM, WorkSplit, is_published
-from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated
+from mudg.diffusion.model_files import is_published
+from mudg.diffusion.published import PublishedMDM, WorkSplit
+from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated, half_format
 from mudg.diffusion.settings import SynthesizeConfig
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.rendering import render_planes
+from mudg.gaussians.storage import load_model
 from mudg.networks.codec import Modality
+from mudg.scene.clouds import read_fused
 from mudg.scene.labels import read_label, read_trusted_classes
-from mudg.scene.read import read_image
+from mudg.scene.observations import ObservationWriter
+from mudg.scene.read import read_image, read_scene
 
-# the diffusion model that a synthesize configuration names, of whichever kind, ready to sample ----
+# with only some of its parts ----------------------------------------------------------------------
+
+
+ConditionParts = Literal["full", "reference", "points", "concat", "repair"]
+"""full: the whole condition. reference: the nearest recorded image alone, put up far away. points: colour and depth of
+the points alone, without recorded images and renders. concat: points and that image, without anything warped by depth,
+and without renders. repair: renders of a fit and that image, without anything measured. Of published-type models
+reference and points leave out the other; concat shows the image in frame 0, beside the points, and not in the image
+tokens."""
+COVERED = 0.5
+"""Opacity above which a render covers a pixel."""
+
+
+@dataclass(frozen=True, slots=True)
+class ConditionSources:
+    """What conditions of a scene are made of: its clouds and tracks, recorded images, rules, and renders of a fit, if
+    there is one; of an edited drive also where something stood that is not there any more, and, for published-type
+    models, its weather."""
+
+    cloud: FusedCloud
+    tracks: Sequence[Track]
+    recorded: Sequence[Photo]
+    rules: ConditionRules
+    render_at: RenderAt | None = None
+    vacated_at: VacatedAt | None = None
+    weather: InWeather | None = None
+
+
+def conditions_of(
+    sources: ConditionSources, parts: ConditionParts, views: Sequence[View], kept: dict[int, WarpSource]
+) -> tuple[Condition, Condition]:
+    """The model's condition for ``views`` with only some of its parts, and the same on the fine grid. kept: recorded
+    images that are prepared already (see ``build_conditions``)."""
+    rules = sources.rules
+    cloud, tracks, recorded = sources.cloud, sources.tracks, sources.recorded
+    if parts == "full":
+        how, render_at, recolor = sources.weather, sources.render_at, None
+        if rules.published and how is not None and render_at is not None:
+            recolor = WeatheredPoints(how, render_at)
+        return build_conditions(
+            cloud, tracks, views, recorded, rules, kept, render_at, sources.vacated_at, recolor=recolor
+        )
+    if parts == "repair":
+        return _of_renders(sources, views, kept)
+    if rules.published:
+        whole = build_conditions(cloud, tracks, views, recorded, rules, kept)[0]
+        if parts == "reference":
+            whole = replace(whole, valid=torch.zeros_like(whole.valid), measured=None)
+        else:
+            whole = replace(whole, reference_in="frame" if parts == "concat" else "nowhere")
+        return whole, whole
+    bare = replace(rules, warp=False) if parts == "points" else replace(rules, images_per_view=0)
+    built = build_conditions(cloud, tracks, views, recorded, bare, kept)
+    if parts != "reference":
+        return built
+    small, fine = (
+        replace(
+            c,
+            color=c.backdrop,
+            semantics=c.backdrop_semantics,
+            valid=torch.zeros_like(c.valid),
+            depth=torch.full_like(c.depth, FAR_M),
+        )
+        for c in built
+    )
+    return small, fine
+
+
+def _of_renders(
+    sources: ConditionSources, views: Sequence[View], kept: dict[int, WarpSource]
+) -> tuple[Condition, Condition]:
+    """Renders in the place of points, none of them measured, and the nearest recorded image. Where a render covers a
+    pixel it counts as a recorded image that was warped there: it is the picture that is repaired."""
+    if sources.render_at is None:
+        raise UsageError("this condition needs renders of a fitted scene", got="repair")
+    rules, static = replace(sources.rules, images_per_view=1), sources.cloud.static
+    labels = None if static.semantics is None else static.semantics[:0]
+    empty = FusedCloud(
+        replace(static, xyz=static.xyz[:0], rgb=static.rgb[:0], semantics=labels), {}, sources.cloud.colors
+    )
+    built = build_conditions(empty, (), views, sources.recorded, rules, kept, sources.render_at)
+    renders = [cast("RenderPlanes", c.renders) for c in built]
+    small, fine = (
+        replace(
+            c,
+            color=r.color,
+            depth=r.depth,
+            semantics=r.semantics,
+            valid=torch.zeros_like(c.valid),
+            warped=r.alpha > COVERED,
+        )
+        for c, r in zip(built, renders, strict=True)
+    )
+    return small, fine
+
+
+# the model that a configuration names, of whichever kind, ready to sample -------------------------
 
 
 FEW_STEPS = 20
@@ -41,16 +162,9 @@ DiffusionModel = MDM | PublishedMDM
 
 def check_config(config: SynthesizeConfig, fitted: bool, *, weather: bool = False) -> SynthesizeConfig:
     """The configuration with its device chosen, and the number of processes that its model wants; without reading
-    weights of a published-type model.
-
-    Args:
-        fitted: whether a fitted scene is given too. weather: and tells the distances by which views are brought into
-            other weather.
-
-    Raises:
-        UsageError: a setting that does not apply to this kind of model, or to the device. InputError: no such model.
-        ResourceError: no such device.
-    """
+    weights of a published-type model. fitted: whether a fitted scene is given too. weather: and tells the distances by
+    which views are brought into other weather. UsageError: a setting that does not apply to this kind of model, or to
+    the device. InputError: no such model. ResourceError: no such device."""
     device = choose_device(config.device, "diffusion model", NETWORK_KINDS)
     if device.type != "cpu" and config.processes > 1:
         raise UsageError(
@@ -62,44 +176,41 @@ def check_config(config: SynthesizeConfig, fitted: bool, *, weather: bool = Fals
         )
     config = replace(config, device=str(device))
     half_of(config)
-    full_size = is_published(config.model)
+    full_size, repairs = is_published(config.model), config.condition == "repair"
     if not full_size:
         MDM.check_request(request_of(config))
-    if full_size and fitted and not weather:
-        raise UsageError(
+    for wrong, what, where, expected, got, remedy in (
+        (
+            full_size and fitted and not weather,
             "a published-type model uses a fitted scene for weather and light of --edits only",
-            where="--fitted",
-            remedy="leave it out",
-        )
-    repairs = config.condition == "repair"
-    if repairs and not (fitted or full_size):
-        raise UsageError(
+            *("--fitted", "", "", "leave it out"),
+        ),
+        (
+            repairs and not (fitted or full_size),
             "this condition is made of renders of a fitted scene",
-            where="--condition",
-            got="repair",
-            remedy="give the folder of a finished fit as --fitted",
-        )
-    if full_size and repairs:
-        raise UsageError(
+            *("--condition", "", "repair", "give the folder of a finished fit as --fitted"),
+        ),
+        (
+            full_size and repairs,
             "a published-type model does not know this condition",
-            where="--condition",
-            expected="full, reference, points, concat",
-            got="repair",
-            remedy="leave it out, or choose another --model",
-        )
-    if config.condition != "full" and fitted and not repairs:
-        raise UsageError(
+            *("--condition", "full, reference, points, concat", "repair", "leave it out, or choose another --model"),
+        ),
+        (
+            config.condition != "full" and fitted and not repairs,
             "parts of the condition cannot be switched off here",
-            where="--condition",
-            expected="full",
-            got="--fitted: renders are left out of such a condition",
-            remedy="leave out --condition or --fitted",
-        )
+            *("--condition", "full", "--fitted: renders are left out of such a condition"),
+            "leave out --condition or --fitted",
+        ),
+        (
+            bool(config.memory_budget_gb) and not full_size,
+            "this setting applies to published-type models only",
+            *("--memory-budget-gb", "", "", "leave it out"),
+        ),
+    ):
+        if wrong:
+            raise UsageError(what, where=where, expected=expected, got=got, remedy=remedy)
     if full_size:
         return replace(config, processes=config.processes or 1)  # one copy of a large model in memory
-    if config.memory_budget_gb:
-        what = "this setting applies to published-type models only"
-        raise UsageError(what, where="--memory-budget-gb", remedy="leave it out")
     model = model_files.load(config.model)  # fails now rather than in every process
     if fitted and not model.config.renders:
         raise UsageError(
@@ -138,9 +249,7 @@ def load_any(config: SynthesizeConfig) -> DiffusionModel:
     On another device than the CPU a published-type model has its weights in the number format that `precision` says.
     Its work is cut to fit `memory_budget_gb`, or, without one, what is free on a CUDA device.
 
-    Raises:
-        ResourceError: it does not fit however it is cut, or no such device.
-    """
+    ResourceError: it does not fit however it is cut, or no such device."""
     device = choose_device(config.device, "diffusion model", NETWORK_KINDS)
     if not is_published(config.model):
         return model_files.load(config.model).to(device)
@@ -151,26 +260,19 @@ def load_any(config: SynthesizeConfig) -> DiffusionModel:
         )
     half = half_of(config)
     dtype = None if device.type == "cpu" else half or torch.float32
-    model = published.load(Path(config.model), dtype=dtype)
+    model = model_files.load_published(config.model, dtype=dtype)
     model.split = WorkSplit(frames_at_once=1)
     free_gb = torch.cuda.mem_get_info(device)[0] / 1e9 if device.type == "cuda" else 0.0
     budget_gb = config.memory_budget_gb or free_gb  # 0: unknown
     if budget_gb:
         model.split = _choose_split(model, config, budget_gb, 4 if half is None else 2)
-    tower = model.image
-    if model.split.offload:
-        model.image = torch.nn.Identity()
-    model.to(device).image = tower
-    return model
+    return model.to(device)
 
 
 def _choose_split(model: PublishedMDM, config: SynthesizeConfig, budget_gb: float, bytes_per_value: int) -> WorkSplit:
     """How the model's work is cut to fit a memory budget in GB."""
-    split, peak_bytes = memory_plan.choose(
-        memory_plan.needs_of(model.config, bytes_per_value),
-        int(budget_gb * 1e9),
-        guidance=config.guidance != 1,
-        offload=(False,) if config.device == "cpu" else (False, True),
+    split, peak_bytes = published.choose(
+        published.needs_of(model.config, bytes_per_value), int(budget_gb * 1e9), guidance=config.guidance != 1
     )
     if peak_bytes > budget_gb * 1e9:
         raise ResourceError(
@@ -183,7 +285,6 @@ def _choose_split(model: PublishedMDM, config: SynthesizeConfig, budget_gb: floa
     log.info(
         f"synthesize: modalities {'together' if split.modalities_together else 'one by one'}, guidance "
         f"{'together' if split.guidance_together else 'in two passes'}, {split.frames_at_once} frames per decoding, "
-        f"image tower {'on the CPU' if split.offload else 'kept'}, "
         f"about {peak_bytes / 1e9:.1f} GB at most"
     )
     return split
@@ -192,7 +293,6 @@ def _choose_split(model: PublishedMDM, config: SynthesizeConfig, budget_gb: floa
 # views --------------------------------------------------------------------------------------------
 
 
-SKY = palette.ID["sky"]
 EDITED_IMAGES_PER_VIEW = 24
 """Recorded images tried per view of an edited drive: what an object hid at one moment others show."""
 
@@ -204,11 +304,8 @@ def source_of(condition: ConditionParts) -> str:
 
 def windows(frames: int, window: int, overlap: int) -> list[range]:
     """Frame ranges of the windows: all `frames` covered, each sharing at least `overlap` with the one before, the last
-    one ending at the last frame. Fewer frames than a window give one short window.
-
-    Raises:
-        UsageError: the overlap leaves no new frame per window.
-    """
+    one ending at the last frame. Fewer frames than a window give one short window. UsageError: the overlap leaves no
+    new frame per window."""
     if overlap >= window:
         raise UsageError("the overlap is as long as a window", expected=f"overlap < {window}", got=str(overlap))
     if frames <= window:
@@ -221,70 +318,28 @@ def recorded_images(scene: Scene, config: SynthesizeConfig) -> list[Photo]:
     """Recorded images that may be warped in, of all cameras, with the classes that may be given."""
     frames = scene.frames_in("train")
     classes = lambda frame: read_trusted_classes(scene, frame) if config.given_classes else None
-    return [
-        Photo(frame.view, read_image(scene, frame), classes(frame), recorded_pixels(scene, frame)) for frame in frames
-    ]
-
-
-def recorded_pixels(scene: Scene, frame: Frame) -> NDArray[np.bool_] | None:
-    """Which pixels bool[H, W] of a frame a camera recorded; None = all. Frames of an edited drive say which are
-    rendered."""
-    return ~read_label(scene, frame, "rendered") if "rendered" in frame.labels else None
+    # frames of an edited drive say which pixels are rendered
+    recorded = lambda frame: ~read_label(scene, frame, "rendered") if "rendered" in frame.labels else None
+    return [Photo(frame.view, read_image(scene, frame), classes(frame), recorded(frame)) for frame in frames]
 
 
 class ViewMaker:
-    """Conditions, samples and observations of one scene at one size.
-
-    Args:
-        images: recorded images that were prepared before, for views of this size; None: none.
-    """
+    """Conditions, samples and observations of one scene at one size. images: recorded images that were prepared before,
+    for views of this size."""
 
     def __init__(
-        self,
-        model: DiffusionModel,
-        sources: ConditionSources,
-        config: SynthesizeConfig,
-        images: PreparedImages | None = None,
+        self, model: DiffusionModel, sources: ConditionSources, config: SynthesizeConfig, images: PreparedImages
     ) -> None:
         if not sources.recorded:
             log.warn("synthesize: no recorded image is available; holes are filled with the nearest point's colour")
         self._model, self._given, self._full_size = model, sources, config.full_size
         self._parts: ConditionParts = config.condition
-        self._images = PreparedImages() if images is None else images
+        self._images = images
         self._request = request_of(config, half_of(config) == torch.bfloat16)
 
     def sized(self, view: View) -> View:
         """The view at the size that is written."""
-        return view if self._full_size else view.resized(self._given.rules.width, self._given.rules.height)
-
-    def spans(self, frames: int, overlap: int) -> list[range]:
-        """The windows of a path of so many frames (see `windows`)."""
-        window = self._model.config.window
-        return windows(frames, window, min(overlap, window - 1))
-
-    def along(
-        self,
-        views: Sequence[View],
-        spans: Sequence[range],
-        first: int = 0,
-        tail: Mapping[Modality, Tensor] | None = None,
-    ) -> Iterator[tuple[int, range, tuple[GeneratedClip, Condition, list[Observation]]]]:
-        """The windows of a path one after another; each continues the one before.
-
-        Args:
-            first, tail: number of the window to begin with, and the latents of the one before, of an interrupted run.
-
-        Returns, of each: its number, its frames that are in none before, and what `make` gives.
-        """
-        done = spans[first - 1].stop if first else 0
-        for number in range(first, len(spans)):
-            span = spans[number]
-            shared = done - span.start
-            known = {m: z[-shared:] for m, z in tail.items()} if shared and tail else None
-            made = self.make([views[i] for i in span], number, known)
-            yield number, range(done, span.stop), made
-            done, tail = span.stop, made[0].latents
-            del made  # before the next window is made
+        return view if self._full_size else view.resized(*self._given.rules.size)
 
     def make(
         self, views: Sequence[View], number: int, known: dict[Modality, Tensor] | None
@@ -323,7 +378,7 @@ class ViewMaker:
 
 def without_sky_depth(clip: GeneratedClip, condition: Condition) -> GeneratedClip:
     """The clip with NaN for the depth of what is classed as sky and was not measured."""
-    sky = (clip.semantics == SKY).unsqueeze(1) & ~condition.measurement.valid
+    sky = (clip.semantics == palette.ID["sky"]).unsqueeze(1) & ~condition.measurement.valid
     return replace(clip, depth=torch.where(sky, torch.nan, clip.depth))
 
 
@@ -392,3 +447,188 @@ def add_detail(rgb: Tensor, small: Condition, full: Condition) -> Tensor:
     weight = (1 - functional.max_pool2d(apart, 3, stride=1, padding=1) / 0.12).clamp(0, 1) * seen
     weight = functional.interpolate(weight, size=size, mode="bilinear", align_corners=False)
     return (larger(rgb) + weight * detail).clamp(0, 1)
+
+
+# the verb -----------------------------------------------------------------------------------------
+
+
+FITS = "depth_fits.json"
+"""Frame -> [scale, shift in metres, median relative residual before, after] of the alignment of its depth."""
+PROCESS_BYTES = int(1.2 * memory.GIB)
+PIXEL_BYTES, FRAME_PIXEL_BYTES = 240, 80
+"""What a process takes: with the small models; for each pixel of the written size; and for each pixel of a window's
+frames. Measured: 2.0 GiB at 1242x375 with windows of eight frames, 3.85 GiB at 3840x2160 with three, where conditions
+lie in files (4.5 GiB before)."""
+WINDOW_FRAMES = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveInputs:
+    """What all trajectories are made from, read; ``images``: the recorded ones, as they have been prepared for views of
+    a size."""
+
+    scene: Scene
+    cloud: FusedCloud
+    recorded: list[Photo]
+    fit: SceneModel | None = None
+    vacated: VacatedAt | None = None
+    weather: InWeather | None = None
+    images: dict[tuple[int, int], PreparedImages] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class JobInputs:
+    """What every trajectory is made from: folders of the scene, its fused clouds and its fit. edited: reads an edited
+    drive in place of the recorded one; processes are sent it."""
+
+    scene: Path
+    fused: Path
+    fitted: Path | None = None
+    edited: Callable[[SynthesizeConfig, JobInputs], DriveInputs] | None = None
+
+
+@functools.lru_cache(maxsize=1)
+def recorded_drive(config: SynthesizeConfig, inputs: JobInputs) -> DriveInputs:
+    """The drive as it was recorded; the same for the next trajectory of a run, which forgets it at its end."""
+    scene = read_scene(inputs.scene)
+    fit = None if inputs.fitted is None else load_model(inputs.fitted)
+    return DriveInputs(scene, read_fused(inputs.fused), recorded_images(scene, config), fit)
+
+
+def write_views(config: SynthesizeConfig, inputs: JobInputs, loaded: Scene, work: RunDir) -> dict[str, Any]:
+    """Generate all trajectories of the configuration, one folder of observations each; returns a summary. UsageError:
+    unknown camera, nothing to make."""
+    cameras = config.cameras or tuple(loaded.cameras)[:1]
+    if not cameras or not (config.shifts_m or config.paths):
+        raise UsageError("nothing to synthesize", where=str(inputs.scene), expected="at least one camera and one shift")
+    paths = [
+        *(trajectory.at_shift(loaded, camera, shift_m) for camera in cameras for shift_m in config.shifts_m),
+        *(trajectory.named(loaded, camera, name) for camera in cameras for name in config.paths),
+    ]
+    names = [path.name for path in paths]
+    if len(set(names)) < len(names):
+        raise UsageError("two shifts give the same trajectory", got=", ".join(names))
+    half_of(config)  # said before other processes begin
+    started, frames = time.monotonic(), 0
+    processes = config.processes or usual_processes(config, paths)
+    model = load_any(config) if processes == 1 else None  # several processes load one each
+    jobs = [(config, inputs, work.path, path, model) for path in paths]
+    processes = min(processes, len(jobs))
+    if processes > 1:
+        release_memory()
+        log.info_once(f"synthesize: {processes} processes with one thread each")
+    try:
+        with log.task("synthesize", len(jobs)) as bar:
+            for index, views in run_in_processes(make_trajectory, jobs, processes):
+                frames += views
+                bar.update(names[index])
+                bar.advance()
+    finally:
+        recorded_drive.cache_clear()
+    seconds = time.monotonic() - started
+    log.info(f"synthesize: {frames} views in {seconds:.1f} s, {seconds / max(frames, 1):.2f} s each")
+    return {"trajectories": names, "views": frames}
+
+
+def usual_processes(config: SynthesizeConfig, paths: Sequence[Trajectory]) -> int:
+    """Trajectories made at the same time where the configuration names no number: as many as there are cores and as
+    memory lasts for; one where they would share a GPU. Says so where memory decides."""
+    cores = native.default_threads() if config.device == "cpu" else 1
+    wanted, free = min(cores, len(paths)), memory.free_bytes()
+    if wanted == 1 or not free:
+        return max(1, wanted)
+    camera = max((path.views[0].camera for path in paths), key=lambda c: c.width * c.height)
+    pixels = camera.width * camera.height if config.full_size else 0
+    frames = min(WINDOW_FRAMES, max(map(len, paths)))
+    need = PROCESS_BYTES + pixels * (PIXEL_BYTES + frames * FRAME_PIXEL_BYTES)
+    possible = max(1, min(wanted, free // need))
+    if possible < wanted:
+        log.info(
+            f"synthesize: {possible} of {wanted} processes: at {camera.width}x{camera.height} each takes about "
+            f"{memory.in_words(need)}, and {memory.in_words(free)} are free"
+        )
+    return possible
+
+
+# one trajectory -----------------------------------------------------------------------------------
+
+
+def without_classes(cloud: FusedCloud) -> FusedCloud:
+    """The cloud without its points' classes."""
+    objects = {name: replace(points, semantics=None) for name, points in cloud.objects.items()}
+    return FusedCloud(replace(cloud.static, semantics=None), objects, cloud.colors)
+
+
+def make_trajectory(
+    config: SynthesizeConfig, inputs: JobInputs, out: Path, path: Trajectory, model: DiffusionModel | None = None
+) -> int:
+    """Generate one trajectory and write its folder; returns the number of views. Continues an interrupted one. `model`:
+    that of the configuration, if it is in memory already."""
+    folder = out / path.name
+    if (folder / "observations.json").is_file():
+        return len(path)
+    model = model or load_any(config)
+    maker = view_maker(config, inputs, path.views, model, out)
+    window = model.config.window
+    spans = windows(len(path), window, min(config.overlap, window - 1))
+    state = folder / "state"
+    finished = sorted(state.glob("[0-9]*.safetensors"))  # the last one's latents, by the number of windows
+    first, tail = (int(finished[-1].stem), store.read_tensors(finished[-1])) if finished else (0, None)
+    with understood("depth fits of an interrupted synthesis", str(state / FITS)):
+        fits: dict[str, list[float | None]] = dict(store.read_json(state / FITS)) if (state / FITS).is_file() else {}
+    every = max(1, len(path) // 5)
+    with ObservationWriter(folder, path.name, source_of(config.condition)) as writer:
+        done = spans[first - 1].stop if first else 0
+        for view in path.views[:done]:
+            writer.skip(maker.sized(view))
+        for number, span in list(enumerate(spans))[first:]:
+            shared = done - span.start  # frames of the window before
+            known = {m: z[-shared:] for m, z in tail.items()} if shared and tail else None
+            sample, condition, observations = maker.make([path.views[i] for i in span], number, known)
+            for index in range(done, span.stop):
+                place = index - span.start
+                writer.add(observations[place])
+                if sample.depth_fits:
+                    fit = sample.depth_fits[place]
+                    numbers = (fit.scale, fit.shift_m, fit.residual_before, fit.residual)
+                    fits[f"{index:06d}"] = [round(x, 5) if math.isfinite(x) else None for x in numbers]
+                if index % every == 0:
+                    cells = [
+                        *(to_bytes(rgb[place]) for rgb in (condition.color, sample.rgb)),
+                        depth_colors(sample.depth[place, 0].numpy()),
+                        class_colors(sample.semantics[place].numpy()),
+                        gray(sample.confidence[place, 0].numpy()),
+                    ]
+                    row = {"row": np.concatenate(cells, 1)}
+                    store.write_safetensors(state / f"row{index:06d}.safetensors", row)
+            store.write_json(state / FITS, fits)
+            store.write_safetensors(state / f"{number + 1:04d}.safetensors", dict(sample.latents))
+            (state / f"{number:04d}.safetensors").unlink(missing_ok=True)
+            done, tail = span.stop, sample.latents
+            del sample, condition, observations  # before the next window is made
+        rows = [store.read_safetensors(file)["row"] for file in sorted(state.glob("row*.safetensors"))]
+        if rows:
+            store.write_image(folder / "overview.png", np.concatenate(rows))
+        if fits:
+            store.write_json(folder / FITS, fits)
+        shutil.rmtree(state, ignore_errors=True)
+    return len(path)
+
+
+def view_maker(
+    config: SynthesizeConfig, inputs: JobInputs, views: Sequence[View], model: DiffusionModel, scratch: Path | None
+) -> ViewMaker:
+    """What makes the views of one path; ``scratch``: a folder for what is large (None: it stays in memory)."""
+    drive = recorded_drive(config, inputs) if inputs.edited is None else inputs.edited(config, inputs)
+    cloud = drive.cloud if config.given_classes else without_classes(drive.cloud)
+    camera = views[0].camera
+    width, height = model.image_size(camera.width, camera.height, config.width_px)
+    model.check_clip(min(len(views), model.config.window), height, width)
+    fine = (camera.width, camera.height) if config.full_size or model.points_alone else (2 * width, 2 * height)
+    rules = ConditionRules(width, height, *fine, published=model.points_alone)
+    rules = rules if inputs.edited is None else replace(rules, images_per_view=EDITED_IMAGES_PER_VIEW)
+    render_at = None if drive.fit is None else functools.partial(render_planes, drive.fit)
+    sources = ConditionSources(
+        cloud, drive.scene.tracks, drive.recorded, rules, render_at, drive.vacated, drive.weather
+    )
+    return ViewMaker(model, sources, config, drive.images.setdefault(fine, PreparedImages(scratch)))

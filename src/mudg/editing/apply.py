@@ -35,7 +35,7 @@ from mudg.base.weather_settings import Conditions
 from mudg.core import trajectory
 from mudg.core.edit import HeightMap, Motion
 from mudg.core.weather import ShownView, drive_facts, edited_view
-from mudg.diffusion.inputs import InWeather
+from mudg.diffusion.condition import InWeather
 from mudg.editing import model as edited
 from mudg.editing import plan as plans
 from mudg.editing.model import GROUND_CLASSES, Asset, linear_of

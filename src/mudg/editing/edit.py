@@ -28,10 +28,9 @@ from mudg.core.edit import Motion
 from mudg.core.pictures import to_bytes
 from mudg.core.raster.rasterize import RasterConfig, drawing_device
 from mudg.diffusion.condition import Vacated, VacatedAt, ray_directions
-from mudg.diffusion.published import is_published
+from mudg.diffusion.model_files import is_published
 from mudg.diffusion.settings import SynthesizeConfig
-from mudg.diffusion.synthesize import DriveInputs, JobInputs
-from mudg.diffusion.views import recorded_images
+from mudg.diffusion.views import DriveInputs, JobInputs, recorded_images
 from mudg.editing.apply import EditedDrive, carry_out, drawer, some_points, weather_of
 from mudg.editing.model import FLOOR_M, GROUND_CLASSES, STRAY_M
 from mudg.editing.plan import Actor, EditPlan

@@ -33,10 +33,9 @@ from mudg.core.pictures import panels_of, side_by_side
 from mudg.core.raster.rasterize import drawing_device
 from mudg.core.trajectory import readout_of
 from mudg.diffusion import views as loading
-from mudg.diffusion.published import is_published
+from mudg.diffusion.model_files import is_published
 from mudg.diffusion.settings import SynthesizeConfig
-from mudg.diffusion.synthesize import JobInputs, view_maker
-from mudg.diffusion.views import ViewMaker
+from mudg.diffusion.views import JobInputs, ViewMaker, view_maker
 from mudg.editing.apply import FACT, Drawer, carry_out, in_weather, scene_seen_by, weather_of
 from mudg.editing.script import EditScript, conditions_of
 from mudg.editing.settings import RenderConfig

@@ -19,7 +19,7 @@ from mudg.base.palette import UNLABELLED
 from mudg.base.types import Camera, Gaussians, Observation, Scene, Shutter, View
 from mudg.core.pictures import to_bytes
 from mudg.core.raster.rasterize import MAX_EXTRA_CHANNELS, drawing_device, rasterize
-from mudg.diffusion.synthesize import JobInputs
+from mudg.diffusion.views import JobInputs
 from mudg.editing.apply import carry_out
 from mudg.editing.render import RenderMixer, check_as_recorded
 from mudg.editing.runs import find_run, scene_at

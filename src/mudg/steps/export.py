@@ -181,13 +181,14 @@ class Convert(Step):
     def _conversion(self, to: Path) -> tuple[Callable[[], None], int]:
         """What converts this checkpoint to a folder, and the address space that it may take."""
         from mudg.diffusion import convert
+        from mudg.diffusion.model_files import SHARD_BYTES
         from mudg.labels import depthlab
         from mudg.scoring.sets import convert_weights
 
         config, source = self.settings, self.checkpoint
         if config.network != "diffusion":
-            if config.resolution != "auto" or config.towers or config.dtype != "keep":
-                what = "--resolution, --towers and --dtype apply to diffusion models only"
+            if config.resolution != "auto" or config.dtype != "keep":
+                what = "--resolution and --dtype apply to diffusion models only"
                 raise UsageError(what, where=f"--network {config.network}")
             if not source.is_file():
                 raise InputError("no such checkpoint", where=str(source))
@@ -196,9 +197,9 @@ class Convert(Step):
             return partial(convert_weights, config.network, source, to), limit
         if not source.is_dir():
             return convert.of_diffusion(config, source, to)
-        if config.resolution != "auto" or config.towers:
-            what, remedy = "--resolution and --towers do not apply to a DepthLab folder", "give a checkpoint file"
-            raise UsageError(what, where=str(source), remedy=f"leave them out, or {remedy}")
+        if config.resolution != "auto":
+            what, remedy = "--resolution does not apply to a DepthLab folder", "leave it out, or give a checkpoint file"
+            raise UsageError(what, where=str(source), remedy=remedy)
         files = depthlab.source_files(source)
-        work = partial(depthlab.convert_folder, source, to, convert.DTYPES[config.dtype], convert.SHARD_BYTES)
+        work = partial(depthlab.convert_folder, source, to, convert.DTYPES[config.dtype], SHARD_BYTES)
         return work, convert.memory_limit(config, *files)

@@ -111,7 +111,6 @@ def convert(
     network: Literal['diffusion', 'inception', 'i3d', 'lpips', 'lpips-vgg'] = 'diffusion',
     resolution: Literal['auto', '320x512', '576x1024'] = 'auto',
     dtype: Literal['keep', 'float32', 'float16', 'bfloat16'] = 'keep',
-    towers: str = '',
     memory_gb: float = 0.0,
 ) -> Any:
     """Convert a published checkpoint to a folder for synthesize, annotate or score.
@@ -124,7 +123,6 @@ def convert(
         network: What the checkpoint holds: a diffusion model, or a network of the scores (docs/scores.md). The other settings apply to diffusion models only.
         resolution: Image height x width that the checkpoint was trained at. auto: from 512 or 1024 in the file's name.
         dtype: Number format of the written weights. keep: as in the checkpoint. bfloat16 halves the size of float32 weights.
-        towers: OpenCLIP ViT-H/14 weights, for a checkpoint that lacks them (empty = the checkpoint has its own).
         memory_gb: Limit, in GB, of the address space of the process that reads the checkpoint, beyond the program's own (0 = derived from the file's size). Raise it if the conversion runs out of memory.
     """
     ...

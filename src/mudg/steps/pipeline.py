@@ -131,8 +131,7 @@ def refuse_missing(generator: SynthesizeConfig, fit: FitConfig, flag: str = "--s
     """UsageError where weights that are not shipped are asked for and not given; InputError where there is no diffusion
     model. Before anything is written: the first of these is needed only after a fit. ``flag``: what names the diffusion
     model on this command line."""
-    from mudg.diffusion.model_files import read_description
-    from mudg.diffusion.published import is_published
+    from mudg.diffusion.model_files import is_published, read_description
 
     if generator.model == NO_MODEL:
         what = "the preset paper needs a published-type diffusion model, which mudg does not ship"

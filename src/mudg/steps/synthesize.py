@@ -22,7 +22,7 @@ class Learn(Watched):
         "mudg learn --out runs/mdm",
         "mudg learn --config recipe.yaml --out runs/mdm",
         "mudg learn --data.scenes runs/kitti --start embedded --optimizer.lr 1e-4 --steps 500 --out runs/tuned",
-        "torchrun --nproc-per-node 8 -m mudg learn --compute.parallel fsdp --config recipe.yaml --out runs/mdm",
+        "torchrun --nproc-per-node 8 -m mudg learn --config recipe.yaml --out runs/mdm",
     )
     smaller = "smaller clips (--data.width, --data.height), a smaller batch, fewer --compute.workers"
     result = "model"
@@ -103,7 +103,7 @@ class Synthesize(Output):
         return first | model | self.digests({"edits": self.edits, "fitted": self.fitted})
 
     def prepare(self, inputs: dict[str, str]) -> Make:
-        from mudg.diffusion.synthesize import JobInputs, write_views
+        from mudg.diffusion.views import JobInputs, write_views
         from mudg.editing.edit import edited_drive, edited_scene
         from mudg.gaussians.storage import model_of_scene
         from mudg.scene.read import read_scene

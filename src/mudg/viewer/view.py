@@ -29,8 +29,8 @@ from mudg.core.edit import HeightMap
 from mudg.core.pictures import class_colors, depth_colors, to_bytes
 from mudg.core.raster.rasterize import drawing_device
 from mudg.core.table import Table
-from mudg.diffusion.inputs import InWeather
-from mudg.diffusion.synthesize import JobInputs
+from mudg.diffusion.condition import InWeather
+from mudg.diffusion.views import JobInputs
 from mudg.editing.apply import (
     FACT,
     Drawer,
