@@ -76,12 +76,24 @@ def test_only_cities_with_renders_add_renders_and_a_finisher(tmp_path):
     assert grown.config == from_cities.config and fresh == {"finisher"}
 
 
+def test_steps_of_fits_are_drawn_from_their_range(tmp_path):
+    rules = replace(RULES, fit_steps=(400, 1000))
+    steps = [city_clips.steps_of(rules, city) for city in range(60)]
+    assert 400 <= min(steps) < 450 and 950 < max(steps) < 1000
+    assert city_clips.steps_of(rules, city_clips.HELD_OUT) == 700
+    assert city_clips.steps_of(replace(rules, fit_steps=(50, 50)), 3) == 50
+    assert [city_clips.steps_of(RULES, city) for city in range(3)] == [117, 116, 113]  # as before there was a setting
+    config = with_settings(tiny(tmp_path), fit_steps=(400, 1000), log_frames=24, side_cameras=0.7)
+    made = learn.city_rules(config)
+    assert (made.fit_steps, made.log_frames, made.side_cameras) == ((400, 1000), 24, 0.7)
+
+
 @pytest.mark.slow
-def test_a_city_is_fitted_and_learnt_from(tmp_path, monkeypatch):
+def test_a_city_is_fitted_and_learnt_from(tmp_path):
     """From the generator over a short fit to a trained model with finisher; the renders resemble what they show."""
-    monkeypatch.setattr(city_clips, "FIT_STEPS", (60, 100))
+    rules = replace(RULES, fit_steps=(60, 100))
     for city in (0, city_clips.HELD_OUT):
-        assert city_clips.write_city(RULES, city, tmp_path / "clips") == (
+        assert city_clips.write_city(rules, city, tmp_path / "clips") == (
             2 if city == 0 else len(city_clips.shifts_of(RULES, city))
         )
     shifted = clips.ShardFolder(tmp_path / "clips").clip(0, 0, [0, 1])

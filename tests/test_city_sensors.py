@@ -252,11 +252,26 @@ def test_sizes_have_one_area_and_go_round() -> None:
     assert city_clips.size_of(rules, city_clips.HELD_OUT + 4) == (192, 128)
 
 
-def test_logs_are_as_long_as_their_clips_need() -> None:
-    for window, starts in ((8, {2}), (16, {2}), (4, set(range(2, 7)))):
-        rules = city_clips.CityClipRules(window=window)
-        assert {city_clips.start_of(rules, city, number) for city in range(20) for number in range(6)} == starts
-        assert rules.frames == max(12, 2 + window)
+def test_mixed_cities_are_varied_and_plain_by_turns_and_have_all_sizes_of_both() -> None:
+    mixed, rules = city_clips.CityClipRules(realism="mixed"), city_clips.CityClipRules(realism="varied")
+    kinds = [city_clips.is_varied(mixed, city) for city in range(20)]
+    assert kinds == [True] * 5 + [False] * 5 + [True] * 5 + [False] * 5
+    assert not city_clips.is_varied(mixed, city_clips.HELD_OUT)
+    for city in range(10):
+        assert city_clips.size_of(mixed, city) == city_clips.size_of(rules, city)
+        config, fine = city_clips.city_config(mixed, city), city_clips.fine_of(mixed, city)
+        assert (config.width, config.height) == tuple(fine * side for side in city_clips.size_of(mixed, city))
+    assert city_clips.city_config(mixed, 3) == city_clips.city_config(rules, 3)
+    assert city_clips.city_config(mixed, 8).skies == "plain" and city_clips.sensors_of(mixed, 8) == SensorFaults()
+
+
+def test_clips_of_longer_logs_begin_anywhere_but_at_the_ends() -> None:
+    rules = city_clips.CityClipRules(log_frames=24)
+    starts = {city_clips.start_of(rules, city, number) for city in range(20) for number in range(6)}
+    assert starts == set(range(2, 24 - 2 - 8 + 1))
+    for short in (city_clips.CityClipRules(), city_clips.CityClipRules(window=16)):
+        assert {city_clips.start_of(short, city, number) for city in range(9) for number in range(6)} == {2}
+        assert short.frames == max(12, 2 + short.window)
 
 
 @needs_native

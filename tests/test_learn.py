@@ -104,14 +104,23 @@ def test_learning_on_the_same_few_clips_lowers_the_loss(clips, tmp_path):
     assert totals[-1] < 0.95 * totals[0]  # measured: 0.90
 
 
+def test_cities_that_are_skipped_are_never_drawn(clips):
+    config = with_settings(tiny(clips, cities=2, first_cities=2), skip_cities=1, augment=False)
+    source = learn.clips_of_cities(config, clips)
+    allowed = [ShardFolder(clips).clip(city, k, range(4)).rgb for city in (1, 2) for k in range(2)]
+    drawn = [clip.rgb for step in range(8) for clip in source.draw(step, 2, 4, "batch")]
+    assert all(any(torch.equal(one, rgb) for rgb in allowed) for one in drawn)
+    assert all(any(torch.equal(one, rgb) for one in drawn) for rgb in allowed)
+
+
 def test_schedules(clips):
     config = tiny(clips, steps=1000, warmup_steps=100, decay_share=0.5, lr=1e-3, cities=3, first_cities=1)
     assert learn.learning_rate(config, 0) == pytest.approx(1e-5)
     assert learn.learning_rate(config, 300) == pytest.approx(1e-3)
     assert learn.learning_rate(config, 750) == pytest.approx(5e-4)
     assert learn.learning_rate(config, 999) == pytest.approx(2e-5)
-    source = learn.clips_of_cities(config, clips)
-    assert [source.in_use(step) for step in (0, 300, 600)] == [range(1), range(2), range(3)]
+    source, later = (learn.clips_of_cities(with_settings(config, skip_cities=n), clips) for n in (0, 2))
+    assert [source.in_use(0), source.in_use(600), later.in_use(600)] == [range(1), range(3), range(2, 5)]
     assert [learn.frames_at(config, s) for s in (0, 499, 500)] == [2, 2, 4]
     constant = tiny(clips, steps=100, warmup_steps=0, last_lr_share=1.0, lr=1e-5)
     assert {learn.learning_rate(constant, step) for step in range(100)} == {1e-5}

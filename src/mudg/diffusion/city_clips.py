@@ -90,12 +90,20 @@ def sized(width: int, height: int, city: int, multiple: int = 16) -> tuple[int, 
     return columns * multiple, rows * multiple
 
 
-def draw_city(seed: int, city: int, plain: CityConfig, textures: str = "") -> CityConfig:
-    """Configuration of a training city. seed, city: fix everything. plain: seed, length and image size; the rest is
-    drawn here. textures: folder of photographs for `CityConfig.textures`; four fifths of the cities use it."""
+def draw_city(
+    seed: int, city: int, plain: CityConfig, textures: str = "", side_cameras: float = SIDE_CAMERAS
+) -> CityConfig:
+    """Configuration of a training city.
+
+    Args:
+        seed, city: fix everything.
+        plain: seed, length and image size; the rest is drawn here.
+        textures: folder of photographs for `CityConfig.textures`; four fifths of the cities use it.
+        side_cameras: share of the cities with two cameras beside the front one.
+    """
     rng = seeds.numpy_rng(seed, city, "varied city")
     beams, lower, upper = LIDARS[int(rng.choice(len(LIDARS), p=LIDAR_SHARES))]
-    beside = rng.random() < SIDE_CAMERAS
+    beside = rng.random() < side_cameras
     return replace(
         plain,
         rate_hz=float(rng.choice([10.0, 10.0, 10.0, 6.0, 12.0])),
@@ -280,7 +288,7 @@ REPORTED = tuple(range(HELD_OUT + 100, HELD_OUT + 106))
 """Cities whose scores are reported and on which nothing is chosen."""
 LISTS: dict[str, tuple[int, ...]] = {"development": DEVELOPMENT, "reported": REPORTED}
 
-Realism = Literal["plain", "varied"]
+Realism = Literal["plain", "varied", "mixed"]
 
 FRAMES = 12
 SIZES = len(ASPECTS)
@@ -307,7 +315,14 @@ class CityClipRules:
     the time of the first view, from where it was recorded."""
     realism: Realism = "plain"
     """varied: training cities and their sensors are drawn from `draw_city`; clips then have the size of
-    `size_of`."""
+    `size_of`. mixed: so are half of them; the others are plain, of these sizes."""
+    log_frames: int = FRAMES
+    """Length of the logs at least. In longer ones than `FRAMES` each clip begins at a frame of its own."""
+    side_cameras: float | None = None
+    """Share of the training cities with two cameras beside the front one (None: 0.4 of plain cities, 0.35 of varied
+    ones)."""
+    fit_steps: tuple[int, int] = (100, 300)
+    """Fewest and most steps of the fit to a training city; cities for scoring have the middle of them."""
     fitted: bool = False
     """Clips have renders of a scene fitted to the recorded images (which the maker of the clips supplies), and a patch
     at a higher resolution; recorded images are 2 to 4 times larger than the clips."""
@@ -317,19 +332,21 @@ class CityClipRules:
     @property
     def frames(self) -> int:
         """Length of the log."""
-        return max(FRAMES, FIRST + self.window)
+        return max(FRAMES, self.log_frames, FIRST + self.window)
 
 
 def is_varied(rules: CityClipRules, city: int) -> bool:
-    """Whether a city is drawn from the varied distribution; cities for scoring never are."""
-    return city < HELD_OUT and rules.realism == "varied"
+    """Whether a city is drawn from the varied distribution; cities for scoring never are. Of mixed ones, `SIZES`
+    neighbours are (one of each size) and the next are not."""
+    return city < HELD_OUT and (rules.realism == "varied" or (rules.realism == "mixed" and city // SIZES % 2 == 0))
 
 
 def size_of(rules: CityClipRules, city: int) -> tuple[int, int]:
-    """Width and height of a city's clips. Varied cities differ in aspect, except for the published system's fixed
-    size."""
-    varied = is_varied(rules, city) and not rules.published
-    return sized(rules.width, rules.height, city) if varied else (rules.width, rules.height)
+    """Width and height of a city's clips. Varied and mixed cities differ in aspect, except for the published system's
+    fixed size."""
+    if rules.realism != "plain" and city < HELD_OUT and not rules.published:
+        return sized(rules.width, rules.height, city)
+    return rules.width, rules.height
 
 
 def fine_of(rules: CityClipRules, city: int) -> int:
@@ -352,9 +369,10 @@ def city_config(rules: CityClipRules, city: int) -> CityConfig:
     if city >= HELD_OUT:
         return plain
     if is_varied(rules, city):
-        return draw_city(rules.seed, city, plain, rules.textures)
+        share = SIDE_CAMERAS if rules.side_cameras is None else rules.side_cameras
+        return draw_city(rules.seed, city, plain, rules.textures, share)
     rng = seeds.numpy_rng(rules.seed, city, "city configuration")
-    side_cameras = rng.random() < 0.4
+    side_cameras = rng.random() < (0.4 if rules.side_cameras is None else rules.side_cameras)
     return replace(
         plain,
         rate_hz=float(rng.choice([10.0, 10.0, 6.0])),
@@ -535,16 +553,9 @@ def write_missing(rules: CityClipRules, cities: Sequence[int], folder: Path) -> 
 # fits to cities -----------------------------------------------------------------------------------
 
 
-FIT_STEPS = 100, 300
-"""Fewest and most steps of the fit to a training city, because renders of logs are of different quality, too; cities
-for scoring have the middle of them."""
-
-
 def fit_city(rules: CityClipRules, city: int, log: CityLog) -> RenderAt:
     """Fit a scene to the images that the clips of a city may know; returns what it shows at a view."""
-    fewest, most = FIT_STEPS
-    drawn = seeds.numpy_rng(rules.seed, city, "fit")
-    steps = (fewest + most) // 2 if city >= HELD_OUT else int(drawn.integers(fewest, most))
+    steps = steps_of(rules, city)
     width = size_of(rules, city)[0]
     images = given_images(rules, city, log)
     config = short_fit(steps, width, images[0].view.camera.width, seed=city)
@@ -558,6 +569,14 @@ def fit_city(rules: CityClipRules, city: int, log: CityLog) -> RenderAt:
         model = fit.load_model(work.path)
 
     return partial(render_planes, model)
+
+
+def steps_of(rules: CityClipRules, city: int) -> int:
+    """Steps of a city's fit, drawn from `rules.fit_steps`, because renders of logs are of different quality, too."""
+    fewest, most = rules.fit_steps
+    if city >= HELD_OUT or fewest == most:
+        return (fewest + most) // 2
+    return int(seeds.numpy_rng(rules.seed, city, "fit").integers(fewest, most))
 
 
 def placed_sweeps(log: CityLog) -> Iterator[PlacedSweep]:

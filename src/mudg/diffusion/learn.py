@@ -188,7 +188,8 @@ def clips_of_cities(config: LearnConfig, folder: Path, points_alone: bool = Fals
     if data.realism != "plain" and not points_alone:
         sizes = [city_clips.size_of(city_rules(config), city) for city in range(city_clips.SIZES)]
     held_out = [city_clips.HELD_OUT + n for n in range(data.held_out)]
-    return TrainingClips(config, ShardFolder(folder), size, sizes, range(data.cities), data.first_cities, held_out)
+    numbers = range(data.skip_cities, data.skip_cities + data.cities)
+    return TrainingClips(config, ShardFolder(folder), size, sizes, numbers, data.first_cities, held_out)
 
 
 def city_rules(config: LearnConfig, points_alone: bool = False, fitted: bool = False) -> CityClipRules:
@@ -204,6 +205,9 @@ def city_rules(config: LearnConfig, points_alone: bool = False, fitted: bool = F
         realism=data.realism,
         textures=data.textures,
         fitted=fitted,
+        log_frames=data.log_frames,
+        side_cameras=data.side_cameras,
+        fit_steps=data.fit_steps,
     )
 
 

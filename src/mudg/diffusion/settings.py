@@ -111,16 +111,26 @@ class LearnData:
     0.2, released code: 0.1)."""
     cities: int = setting(default=240, ge=1)
     """Number of generated cities to train on."""
+    skip_cities: int = setting(default=0, ge=0)
+    """Generated cities to leave out before the first one, for example those of an earlier run whose `clips` this run
+    uses and adds to."""
     first_cities: int = setting(default=40, ge=1)
     """Number of cities in use from the first step. The others are generated and join while training runs."""
     all_cities_at: float = setting(default=0.6, ge=0, le=1)
     """Share of the steps after which all cities are in use, 0 to 1."""
     clips_per_city: int = setting(default=4, ge=1)
     """Clips taken from each generated city."""
-    realism: Literal["plain", "varied"] = "plain"
-    """Generated cities: varied = cities, cameras, LiDARs and their faults as in recorded logs (docs/training.md). The
-    small model then also learns five aspect ratios, all of about the area width x height. Cities for scoring stay
-    plain."""
+    realism: Literal["plain", "varied", "mixed"] = "plain"
+    """Generated cities: varied = cities, cameras, LiDARs and their faults as in recorded logs (docs/training.md). mixed
+    = half of them are. The small model then also learns five aspect ratios, all of about the area width x height.
+    Cities for scoring stay plain."""
+    log_frames: int = setting(default=12, ge=12)
+    """Generated cities: frames of each log. Longer logs, with fits of more steps, give better renders."""
+    side_cameras: float | None = setting(default=None, ge=0, le=1)
+    """Generated cities: share with two cameras beside the front one (not given: 0.4 of plain cities, 0.35 of varied
+    ones)."""
+    fit_steps: tuple[Annotated[int, Limits(ge=1)], Annotated[int, Limits(ge=1)]] = (100, 300)
+    """Generated cities: fewest and most steps of the fit to each city; cities for scoring have the middle of them."""
     renders: bool = True
     """Generated cities: fit a scene to each city's images for a few hundred steps and give its renders in the
     condition, with patches at the camera's resolution. Takes about half a minute per city. Not done for models that use
