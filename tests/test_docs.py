@@ -56,7 +56,8 @@ FOLDERS = (
 GROUPS = "virtual loss densify poses objects appearance start optimizer compute network codec city".split()
 FILE_ENDINGS = tuple(".py .json .jsonl .yaml .csv .txt .md .png .jpg .mp4 .html .pt .ckpt .safetensors".split())
 FOREIGN_NAMES = (
-    "PromptDepthAnything DepthLab DynamiCrafter DeepSpeed SegFormer MergedPointCloud RayCluster RayJob"
+    "PromptDepthAnything DepthLab DistributedDataParallel DynamiCrafter DeepSpeed SegFormer MergedPointCloud RayCluster"
+    " RayJob"
 ).split()
 LONG = "bench_shift paper_tables results simulate/closed_loop start/demo training"
 SLOW = tuple(f"docs/{page}.md" for page in LONG.split())

@@ -7,7 +7,6 @@ OUT/report.html  OUT/viewer.html  OUT/run.yaml (settings)  OUT/run.json (state, 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any
 from mudg.base import config as configuration
 from mudg.base import log, store
 from mudg.base.errors import InputError, IntegrityError, MudgError, UsageError, similar_path
-from mudg.base.memory import Usage, folder_bytes, in_words
+from mudg.base.memory import Meter, Usage, folder_bytes, in_words
 from mudg.base.records import ForeignRecord, Number, parse_record
 from mudg.base.run_folder import is_temporary, locked, refuse_overlap
 from mudg.base.versions import environment
@@ -330,12 +329,12 @@ class _Ledger:
         return f"{standing}, about {left_min:.0f} min left" if share >= FORECAST_FROM and left_min >= 1 else standing
 
     def timed(self, name: str, result: Path, run: Callable[[], Any]) -> Any:
-        """Do one step, which makes a folder or file, and note what it took: of a folder, what its own record says. The
+        """Do one step, which makes a folder or file, and note what it took; of a folder, what its own record says. The
         next step begins with the memory that this one took given back."""
         from mudg.core.raster.cpu import release_memory
 
         log.info(f"== {self._standing(name)}")
-        began_s, self.steps[name] = time.monotonic(), {"state": "interrupted"}
+        meter, self.steps[name] = Meter(), {"state": "interrupted"}
         try:
             made = run()
             release_memory()
@@ -344,7 +343,7 @@ class _Ledger:
         finally:
             done = self.steps[name]["state"] == "complete"
             taken = store.json_object(result / store.RUN_STATE) if done else {}
-            spent = Usage.of_record({"seconds": time.monotonic() - began_s, **taken})
+            spent = Usage.of_record({**meter.stop().record(), **taken})
             self.steps[name] |= {**spent.record(), "written_bytes": folder_bytes(result)}
             self.save("running")
 
