@@ -158,7 +158,11 @@ def test_a_call_beside_that_fails_is_told_and_the_rest_are_dropped(tmp_path: Pat
 
 def test_an_error_in_the_block_stops_the_calls_beside_it(tmp_path: Path) -> None:
     (folder,) = folders(tmp_path, "a")
-    with pytest.raises(ValueError, match="in the block"), calls_beside(sleep_long, [(folder,)], 1):
-        wait_for(folder / "started")
-        raise ValueError("in the block")
+
+    def fail() -> None:
+        with calls_beside(sleep_long, [(folder,)], 1):
+            wait_for(folder / "started")
+            raise ValueError("in the block")
+
+    refused("in the block", fail, raises=ValueError)
     assert ends(worker_in(folder))

@@ -62,8 +62,8 @@ def one_torch_thread() -> Iterator[None]:
 @contextlib.contextmanager
 def child_environment() -> Iterator[None]:
     """Environment of processes started in this block: one thread each, and waiting without spinning."""
-    wanted = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MUDG_THREADS"), "1")
-    wanted["OMP_WAIT_POLICY"] = "PASSIVE"
+    counts = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MUDG_THREADS")
+    wanted = {"OMP_WAIT_POLICY": "PASSIVE", **dict.fromkeys(counts, "1")}
     before = {name: os.environ[name] for name in wanted if name in os.environ}
     os.environ.update(wanted)
     try:
@@ -304,7 +304,6 @@ def _stoppable(function: Callable[..., Result], items: tuple[Any, ...]) -> Resul
     finally:
         for number in heard:
             signal.signal(number, lambda *_: _stop_asked.set())
-
 
 
 class _Spawning(SpawnContext):
