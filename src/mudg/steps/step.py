@@ -344,10 +344,11 @@ def _texts_of_module(source: str) -> dict[str, dict[str, str]]:
     texts: dict[str, dict[str, str]] = {}
     with contextlib.suppress(OSError):
         for node in ast.parse(Path(source).read_bytes()).body:
-            for pair in zip(node.body, node.body[1:], strict=False) if isinstance(node, ast.ClassDef) else ():
-                match pair:
-                    case ast.AnnAssign(target=ast.Name(name)), ast.Expr(value=ast.Constant(str(text))):
-                        texts.setdefault(node.name, {})[name] = " ".join(text.split())
+            if isinstance(node, ast.ClassDef):
+                for pair in zip(node.body, node.body[1:], strict=False):
+                    match pair:
+                        case ast.AnnAssign(target=ast.Name(name)), ast.Expr(value=ast.Constant(str(text))):
+                            texts.setdefault(node.name, {})[name] = " ".join(text.split())
     return texts
 
 
