@@ -7,6 +7,7 @@ imports no torch, so that facts can be read without it.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -17,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import geometry
-from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import InputError, UsageError, short
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 Matrix = NDArray[np.float64]
+Triple = tuple[float, float, float]
 TrajectoryOrigin = Literal["recorded", "shifted"]
 ObservationKind = Literal["recorded", "virtual"]
 Shutter = Literal["global", "top_to_bottom", "left_to_right", "bottom_to_top", "right_to_left"]
@@ -126,9 +127,14 @@ class _Brief:
     __slots__ = ()
 
     def __repr__(self) -> str:
-        given = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
-        texts = [f"{name}={_in_brief(value)}" for name, value in given.items() if value is not None]
+        texts = [f"{name}={_in_brief(value)}" for name, value in _given(self).items()]
         return f"{type(self).__name__}({', '.join(texts)})"
+
+
+def _given(record: Any) -> dict[str, Any]:
+    """Fields of a record by name, without those that are None."""
+    values = ((field.name, getattr(record, field.name)) for field in fields(record))
+    return {name: value for name, value in values if value is not None}
 
 
 class _Tensors(_Brief):
@@ -138,7 +144,7 @@ class _Tensors(_Brief):
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Self:
         """The same with ``change`` applied to each tensor, for example a crop or a mirror image."""
-        given = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+        given = _given(self)
         inner = {name: value.map(change) for name, value in given.items() if isinstance(value, _Tensors)}
         tensors = {name: change(value) for name, value in given.items() if hasattr(value, "device")}
         return replace(self, **inner, **tensors)  # type: ignore[type-var]
@@ -158,15 +164,10 @@ def _in_brief(value: Any) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class RenderPlanes(_Tensors):
-    """What a fitted scene shows at T views (or at one view, without the leading dimension).
-
-    Args:
-        color: f32[T, 3, H, W] in [0, 1], sky included.
-        depth: f32[T, 1, H, W] metres; meaningless where ``alpha`` is small.
-        alpha: f32[T, 1, H, W] in [0, 1]: coverage by Gaussians.
-        certainty: f32[T, 1, H, W] in [0, 1]: how far the photographs determined what is shown; never above ``alpha``.
-        semantics: u8[T, 1, H, W] class ids; 255 = unknown.
-    """
+    """What a fitted scene shows at T views (or at one view, without the leading dimension): ``color`` f32[T, 3, H, W]
+    in [0, 1], sky included; ``depth`` f32[T, 1, H, W] metres, meaningless where ``alpha``, coverage by Gaussians,
+    f32[T, 1, H, W] in [0, 1], is small; ``certainty`` f32[T, 1, H, W] in [0, 1]: how far the photographs determined
+    what is shown, never above ``alpha``; ``semantics`` u8[T, 1, H, W] class ids (255 = unknown)."""
 
     color: Tensor
     depth: Tensor
@@ -184,21 +185,108 @@ def _freeze(mapping: Mapping[str, Any]) -> Mapping[str, Any]:
     return MappingProxyType(dict(mapping))
 
 
+# colours of cameras: each has an exposure and a white balance of its own, the world has not ---------------------------
+# Fused points and fitted scenes have *common* colours, those of one camera of the log; images on disk, recorded and
+# generated, have those of their camera. The maps between them are found by `core/calibration.py`, and travel with the
+# fused cloud.
+
+
+@dataclass(frozen=True, slots=True)
+class ColorMap:
+    """wanted = gain * given + offset for each channel of colours in [0, 1]; ``pairs``: of colours it was fitted to."""
+
+    gain: Triple = (1.0, 1.0, 1.0)
+    offset: Triple = (0.0, 0.0, 0.0)
+    pairs: int = 0
+
+    def inverse(self) -> ColorMap:
+        """The map back."""
+        back = tuple(1 / g for g in self.gain), tuple(-o / g for g, o in zip(self.gain, self.offset))
+        return ColorMap(*back, self.pairs)  # type: ignore[arg-type]
+
+    def then(self, other: ColorMap) -> ColorMap:
+        """This map, and after it another one."""
+        gain = tuple(a * b for a, b in zip(other.gain, self.gain))
+        offset = tuple(a * o + p for a, o, p in zip(other.gain, self.offset, other.offset))
+        return ColorMap(gain, offset, min(self.pairs, other.pairs))  # type: ignore[arg-type]
+
+    def of_image(self, rgb: Tensor) -> Tensor:
+        """An image [3, H, W] mapped, differentiable, not clamped."""
+        gain, offset = (_per_channel(values, rgb.dtype, rgb.device) for values in (self.gain, self.offset))
+        return rgb * gain + offset
+
+    def of_bytes(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Colours u8[..., 3] mapped, rounded and clamped."""
+        levels = np.arange(256) / 255.0
+        values = [np.rint((g * levels + o) * 255) for g, o in zip(self.gain, self.offset)]
+        tables = np.clip(values, 0, 255).astype(np.uint8)
+        return np.stack([table[rgb[..., channel]] for channel, table in enumerate(tables)], -1)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraColors:
+    """Which camera's colours are the common ones ("" = all cameras have the same), and for the others the maps to them.
+    A camera that is not named has common colours."""
+
+    reference: str = ""
+    to_common: Mapping[str, ColorMap] = field(default_factory=dict)
+
+    def image_to_common(self, camera: str, rgb: Tensor) -> Tensor:
+        """An image [3, H, W] of a camera in common colours, not clamped."""
+        found = self.to_common.get(camera)
+        return rgb if found is None else found.of_image(rgb)
+
+    def image_of(self, camera: str, rgb: Tensor) -> Tensor:
+        """An image [3, H, W] in common colours as a camera shows it, not clamped."""
+        found = self.to_common.get(camera)
+        return rgb if found is None else found.inverse().of_image(rgb)
+
+    def bytes_to_common(self, camera: str, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Colours u8[..., 3] of a camera as common ones."""
+        found = self.to_common.get(camera)
+        return rgb if found is None else found.of_bytes(rgb)
+
+    def record(self) -> dict[str, Any]:
+        """As JSON values; inverse of ``of_record``."""
+        values = lambda m: {"gain": list(m.gain), "offset": list(m.offset), "pairs": m.pairs}
+        return {"reference": self.reference, "to_common": {name: values(m) for name, m in self.to_common.items()}}
+
+    @classmethod
+    def of_record(cls, values: Mapping[str, Any]) -> CameraColors:
+        """From JSON values. KeyError, TypeError or ValueError if they are malformed."""
+        map_of = lambda m: ColorMap(_triple(m["gain"]), _triple(m["offset"]), int(m["pairs"]))
+        maps = {str(name): map_of(m) for name, m in values["to_common"].items()}
+        if any(min(m.gain) <= 0 for m in maps.values()):
+            raise ValueError("a gain is not positive")
+        return cls(str(values["reference"]), maps)
+
+
+SAME_COLORS = CameraColors()
+"""All cameras have the same colours."""
+
+
+@functools.lru_cache(maxsize=256)
+def _per_channel(values: Triple, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Three numbers as [3, 1, 1], sent to a device once."""
+    import torch
+
+    return torch.tensor(values, dtype=dtype).to(device).view(3, 1, 1)
+
+
+def _triple(values: Any) -> Triple:
+    red, green, blue = (float(value) for value in values)
+    return red, green, blue
+
+
 # facts --------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A pinhole camera.
-
-    Args:
-        name: sensor name, unique in a scene.
-        width, height: image size in pixels.
-        fx, fy, cx, cy: intrinsics in pixels; the centre of the top-left pixel is (0.5, 0.5).
-        distortion: coefficients of the original lens, kept for the record; images in a scene are rectified.
-        readout_s: duration of the rolling shutter, 0 for a global shutter.
-        shutter: the direction in which a rolling shutter reads the image; "global" also where it is not known.
-    """
+    """A pinhole camera. name: of the sensor, unique in a scene. width, height: image size in pixels. fx, fy, cx, cy:
+    intrinsics in pixels; the centre of the top-left pixel is (0.5, 0.5). distortion: coefficients of the original lens,
+    kept for the record; images in a scene are rectified. readout_s: duration of the rolling shutter, 0 for a global
+    shutter. shutter: the direction in which a rolling shutter reads the image; "global" also where it is not known."""
 
     name: str
     width: int
@@ -509,24 +597,17 @@ class SparseDepth(_Tensors):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Condition(_Tensors):
-    """What the diffusion model is given for T views.
+    """What the diffusion model is given for T views, all of one size H x W.
 
-    Args:
-        views: T views, all of one size H x W.
-        color: f32[T, 3, H, W] in [0, 1]; meaningless where not valid.
-        depth: f32[T, 1, H, W] metres; meaningless where not valid.
-        valid: bool[T, 1, H, W]: a fused point was seen here.
-        reference: f32[3, H, W], the dense recorded image near views[0].
-        reference_in: where a published-type model is shown it: in the image tokens and in frame 0 of the colour (as
-            released), in that frame alone, or nowhere.
-        warped: bool[T, 1, H, W] or None: the colour here was warped from a recorded image near in time.
-        backdrop: f32[T, 3, H, W] in [0, 1] or None: a recorded image carried over as if all of it were far away.
-        semantics: u8[T, 1, H, W] or None: class ids that came with `color` from labelled points and images; 255 =
-            unknown.
-        backdrop_semantics: u8[T, 1, H, W] or None: the same for `backdrop`.
-        renders: what a fitted scene shows at the views, or None.
-        measured: what the points measured, where ``depth`` is something else: the published system's network is given
-            depth that was resized with its gaps, as 0 m, mixed in. None: ``depth`` where ``valid``.
+    ``color`` f32[T, 3, H, W] in [0, 1] and ``depth`` f32[T, 1, H, W] metres are meaningless but where ``valid``
+    bool[T, 1, H, W]: a fused point was seen here. ``reference`` f32[3, H, W] is the dense recorded image near views[0];
+    reference_in: where a published-type model is shown it: in the image tokens and in frame 0 of the colour (as
+    released), in that frame alone, or nowhere. The others may be None. ``warped`` bool[T, 1, H, W]: the colour here was
+    warped from a recorded image near in time. ``backdrop`` f32[T, 3, H, W] in [0, 1]: a recorded image carried over as
+    if all of it were far away. ``semantics`` u8[T, 1, H, W]: class ids that came with ``color`` from labelled points
+    and images (255 = unknown); ``backdrop_semantics`` the same for ``backdrop``. renders: what a fitted scene shows at
+    the views. measured: what the points measured, where ``depth`` is something else: the published system's network is
+    given depth that was resized with its gaps, as 0 m, mixed in. None: ``depth`` where ``valid``.
     """
 
     views: tuple[View, ...]
@@ -578,17 +659,11 @@ class FinePatch(_Tensors):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Clip(_Tensors):
-    """A training example: a condition and the truth for its T views.
-
-    Args:
-        rgb: f32[T, 3, H, W] in [0, 1].
-        depth: f32[T, 1, H, W] metres where ``depth_valid`` bool[T, 1, H, W]; elsewhere it only fills a gap.
-        semantics: i64[T, H, W] train ids, 255 = unlabelled.
-        shift_m: lateral shift from the recorded path, metres, positive to the left.
-        fine: a rectangle at a higher resolution, or None.
-        depth_confidence: f32[T, 1, H, W] in [0, 1] or None: how far valid depth is to be believed (1 = measured); None:
-            wholly.
-    """
+    """A training example: a condition and the truth for its T views: ``rgb`` f32[T, 3, H, W] in [0, 1]; ``depth``
+    f32[T, 1, H, W] metres where ``depth_valid`` bool[T, 1, H, W], elsewhere it only fills a gap; ``semantics``
+    i64[T, H, W] train ids (255 = unlabelled). shift_m: lateral shift from the recorded path, metres, positive to the
+    left. fine: a rectangle at a higher resolution, or None. depth_confidence: f32[T, 1, H, W] in [0, 1]: how far valid
+    depth is to be believed (1 = measured); None: wholly."""
 
     condition: Condition
     rgb: Tensor
@@ -614,18 +689,11 @@ class Clip(_Tensors):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Observation(_Brief):
-    """What is known, or believed, about one view. Recorded and generated frames are this same type.
-
-    Args:
-        view: camera, pose and time; H x W is the camera's size.
-        rgb: f32[3, H, W] in [0, 1].
-        depth: f32[1, H, W] metres, or None if not produced; not finite or <= 0 = no depth (sky).
-        semantics: i64[H, W] train ids (255 = unlabelled), or None if not produced.
-        confidence: f32[1, H, W] in [0, 1].
-        mask: bool[1, H, W]: pixels that may be used at all.
-        kind: recorded by a sensor, or virtual (generated or rendered).
-        source: who made it, e.g. ``camera`` or ``mudg_r``.
-    """
+    """What is known, or believed, about one view. Recorded and generated frames are this same type: ``rgb``
+    f32[3, H, W] in [0, 1], H x W being the size of the view's camera; ``depth`` f32[1, H, W] metres, not finite or <= 0
+    where there is none (sky); ``semantics`` i64[H, W] train ids (255 = unlabelled); both None if not produced;
+    ``confidence`` f32[1, H, W] in [0, 1]; ``mask`` bool[1, H, W]: pixels that may be used at all. kind: recorded by a
+    sensor, or virtual (generated or rendered). source: who made it, e.g. ``camera`` or ``mudg_r``."""
 
     view: View
     rgb: Tensor
@@ -644,19 +712,12 @@ class Observation(_Brief):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Gaussians(_Brief):
-    """Gaussians in the world, activated (scales in metres, never their logarithm; opacity in [0, 1]).
-
-    Args:
-        means: f32[N, 3] metres.
-        quats: f32[N, 4] (w, x, y, z), need not be normalised.
-        scales: f32[N, 3] metres.
-        opacity: f32[N] in [0, 1].
-        sh: f32[N, K, 3] spherical harmonics, K = (degree + 1)^2.
-        sh_rest: harmonics from degree 1 on, f32[N, K - 1, 3], where they are kept in a tensor of their own (``sh`` is
-            then f32[N, 1, 3]); None: ``sh`` holds all. The CPU rasteriser draws both forms without a copy.
-        extra: f32[N, C] feature channels rendered like colours, or None.
-        node: i32[N] index of the scene node.
-    """
+    """Gaussians in the world, activated: ``means`` f32[N, 3] metres, ``quats`` f32[N, 4] (w, x, y, z), which need not
+    be normalised, ``scales`` f32[N, 3] metres, never their logarithm, ``opacity`` f32[N] in [0, 1], ``sh`` f32[N, K, 3]
+    spherical harmonics, K = (degree + 1)^2, ``node`` i32[N] index of the scene node. extra: f32[N, C] feature channels
+    rendered like colours, or None. sh_rest: harmonics from degree 1 on, f32[N, K - 1, 3], where they are kept in a
+    tensor of their own (``sh`` is then f32[N, 1, 3]); None: ``sh`` holds all. The CPU rasteriser draws both forms
+    without a copy."""
 
     means: Tensor
     quats: Tensor
