@@ -21,7 +21,7 @@ from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.fleet import engines, work
 from mudg.fleet import records as status
 from mudg.fleet.engines import LocalRun
-from mudg.fleet.plan import Entry, command_of, parse_shard, plan_of, read_list, shard_of
+from mudg.fleet.plan import Entry, parse_shard, plan_of, read_list, shard_of
 from mudg.fleet.records import BatchFolder, Ended, this_host
 from mudg.fleet.settings import BatchConfig
 from mudg.fleet.work import Job, Stop, last_words, run_step
@@ -131,7 +131,7 @@ def test_settings_of_a_line_are_those_of_ingest_also_in_the_chain() -> None:
     ingest, fuse = plan_of(("ingest", "fuse"), LINES, values).units(entry)
     (chain,) = plan_of(("run",), LINES, values).units(entry)
     places = {"source": "city", "ingest": "i"}
-    flags = {unit.stage.name: command_of(unit, places, "o", "") for unit in (ingest, fuse, chain)}
+    flags = {unit.stage.name: unit.command(places, "o", "") for unit in (ingest, fuse, chain)}
     assert flags["ingest"][-5:] == ["--frames=0:5", "--cameras", "front", "left", "--city.seed=7"]
     assert flags["run"][-5:] == ["--ingest.frames=0:5", "--ingest.cameras", "front", "left", "--ingest.city.seed=7"]
     assert flags["fuse"][-1] == "--quiet"

@@ -9,8 +9,7 @@ import torch
 from fit_settings import fit_config
 
 from mudg.base import config as configuration
-from mudg.base.camera_colors import SAME_COLORS, CameraColors, ColorMap
-from mudg.base.types import Photo
+from mudg.base.types import SAME_COLORS, CameraColors, ColorMap, Photo
 from mudg.core.calibration import match_cameras
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.diffusion.condition import ConditionRules, DriveInputs, build_conditions

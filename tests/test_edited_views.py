@@ -22,7 +22,6 @@ from mudg.base.types import FusedCloud, Observation, Photo, PointCloud, RenderPl
 from mudg.base.weather_settings import Conditions
 from mudg.core.edit import Motion
 from mudg.core.pictures import to_bytes
-from mudg.core.weather import DriveFacts
 from mudg.core.weather.gbuffer import Surroundings
 from mudg.core.weather.light import srgb_decode, srgb_encode
 from mudg.diffusion import condition as clip_parts
@@ -358,7 +357,7 @@ def test_points_and_reference_of_the_published_condition_are_in_fog_at_their_own
 
     light = Surroundings(*(np.full(3, 0.5) for _ in range(3)), np.zeros(3), np.array([0.0, 0.0, 1.0]), np.full(3, 0.5))
     fog = Conditions.model_validate({"weather": {"fog": {"visibility_m": 30}}})
-    how = InWeather(fog, DriveFacts(light), 0, lambda _: (0.0, 0.0, 0.0))
+    how = InWeather(fog, light, 0, lambda _: (0.0, 0.0, 0.0))
     rules = ConditionRules(12, 8, 48, 32, published=True)
     drive = DriveInputs(cloud, [], [photo], render, weather=how)
     clear = build_conditions(replace(drive, weather=None), views, rules)[0]

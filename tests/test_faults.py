@@ -97,7 +97,7 @@ def test_a_replacement_killed_at_every_point_is_never_lost(tmp_path: Path, step:
     for number in range(1, total + 1, step):
         place = replaced(tmp_path / f"kill{number}")
         assert in_child(lambda place=place: small_run(place / "out", 2, overwrite=True), killed(number), place) == -9
-        places = (place / "out", Replacement.at(place / "out").retired)
+        places = (place / "out", Replacement(place / "out").retired)
         standing = [folder for folder in places if (folder / "manifest.json").is_file()]
         assert standing, f"nothing whole after a kill at point {number}"
         store.verify_manifest(standing[0])

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from mudg import native
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.core import losses, native_ops
-from mudg.core.table import AdamColumn, torch_adam_columns
+from mudg.core import native_ops
+from mudg.core.native_ops import AdamColumn
 
 needs_native = pytest.mark.skipif(native.library() is None, reason=native.status())
 
@@ -155,7 +155,7 @@ def test_photometric_equals_its_float64_twin(
     of = lambda dtype: (weight.to(dtype),) if weighted else ()
     mine, exact = prediction.clone().requires_grad_(), prediction.double().requires_grad_()
     got = native_ops.photometric(mine, target, ssim, *of(torch.float32))
-    want = losses.photometric(exact, target.double(), ssim, *of(torch.float64))
+    want = native_ops.photometric(exact, target.double(), ssim, *of(torch.float64))
     assert got.item() == pytest.approx(want.item(), rel=1e-6, abs=1e-7)
     (found,), (true,) = _gradients(3 * got, mine), _gradients(3 * want, exact)
     assert (found - true).norm() <= 2e-6 * true.norm() + 1e-12
@@ -170,7 +170,7 @@ def test_box_mean_equals_its_float64_twin(isa: str, shape: tuple[int, ...], size
     generator = torch.Generator().manual_seed(4)
     values, upstream = (torch.randn(shape, generator=generator) for _ in range(2))
     mine, exact = values.clone().requires_grad_(), values.double().requires_grad_()
-    got, want = native_ops.box_mean(mine, size), native_ops.torch_box_mean(exact, size)
+    got, want = native_ops.box_mean(mine, size), native_ops.box_mean(exact, size)
     assert got.shape == values.shape and (got.double() - want).abs().max() < 1e-6
     got.backward(upstream)
     want.backward(upstream.double())
@@ -182,26 +182,23 @@ def adam(*tensors: Any) -> None:
     native_ops.adam_columns([AdamColumn(*tensors[:5])], *tensors[5:])
 
 
-def twin(*tensors: Any) -> None:
-    """The same in plain torch."""
-    torch_adam_columns([AdamColumn(*tensors[:5])], *tensors[5:])
+def test_without_the_library_plain_torch_does_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    (prediction, target), cover = _images((3, 20, 20)), _images((1, 20, 20))[0]
+    labels = torch.arange(400).view(20, 20) % 4
 
+    def all_of_them() -> list[Tensor]:
+        moved = torch.ones(4, 3)
+        adam(moved, torch.full((4, 3), 0.5), torch.zeros(4, 3), torch.zeros(4, 3), 0.1, 1)
+        boxes, sky = native_ops.box_mean(prediction, 3), native_ops.over(prediction, cover, target[:, ::2])
+        named = native_ops.class_loss(prediction, labels, cover[0], 2.0)
+        return [native_ops.photometric(prediction, target), boxes, sky, named, moved]
 
-def test_without_the_library_the_plain_twins_do_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    prediction, target = _images((3, 20, 20))
-    parameter, gradient = torch.ones(4, 3), torch.full((4, 3), 0.5)
-    with_library = native_ops.photometric(prediction, target).item()
+    with_library = all_of_them()
     monkeypatch.setattr(native, "_loaded", None)
     monkeypatch.setattr(native, "_problem", "not built: test")
-    assert native_ops.photometric(prediction, target).item() == pytest.approx(with_library, rel=1e-5)
-    adam(parameter, gradient, torch.zeros(4, 3), torch.zeros(4, 3), 0.1, 1)
-    torch.testing.assert_close(parameter, torch.full((4, 3), 0.9))
-    torch.testing.assert_close(native_ops.box_mean(prediction, 3), native_ops.torch_box_mean(prediction, 3))
-    cover, labels = torch.rand(1, 20, 20), torch.ones(20, 20, dtype=torch.int64)
-    planes = (prediction, cover, target)
-    torch.testing.assert_close(native_ops.over(*planes), native_ops.torch_over(*planes))
-    got = native_ops.class_loss(prediction, labels, cover[0], 2.0)
-    torch.testing.assert_close(got, losses.class_loss(prediction, labels, cover[0], 2.0))
+    for mine, expected in zip(all_of_them(), with_library, strict=True):
+        torch.testing.assert_close(mine, expected, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(mine, torch.full((4, 3), 0.9))
 
 
 # ---- cross entropy of classes, pictures over the sky ---------------------------------------------
@@ -218,7 +215,7 @@ def test_class_loss_equals_its_float64_twin(isa: str, shape: tuple[int, int, int
     mine, exact = values.clone().requires_grad_(), values.double().requires_grad_()
     channel = shape[0] - 1
     got = native_ops.class_loss(mine, target, weight, 7.0, (channel, lift) if lifted else None)
-    want = losses.class_loss(exact, target, weight.double(), 7.0, (channel, lift.double()) if lifted else None)
+    want = native_ops.class_loss(exact, target, weight.double(), 7.0, (channel, lift.double()) if lifted else None)
     assert got.item() == pytest.approx(want.item(), rel=2e-6, abs=1e-6)
     (found,), (true,) = _gradients(3 * got, mine), _gradients(3 * want, exact)
     assert (found - true).norm() <= 3e-6 * true.norm() + 1e-9 and found[:, target == 255].abs().sum() == 0
@@ -247,7 +244,7 @@ def test_picture_over_the_sky_equals_its_float64_twin(
     inputs = [torch.rand(shape, generator=generator) for shape in shapes]
     upstream = torch.randn(channels, height, width, generator=generator)
     mine, exact = [t.clone().requires_grad_() for t in inputs], [t.double().requires_grad_() for t in inputs]
-    got, want = native_ops.over(*mine), native_ops.torch_over(*exact)
+    got, want = native_ops.over(*mine), native_ops.over(*exact)
     torch.testing.assert_close(got.double(), want, rtol=1e-6, atol=2e-6)
     for found, true in zip(
         _gradients((got * upstream).sum(), *mine), _gradients((want * upstream).sum(), *exact), strict=True
@@ -285,7 +282,7 @@ def test_adam_equals_its_float64_twin(isa: str, shape: tuple[int, ...], sparse: 
     for step in range(1, 6):
         gradient = torch.randn(shape, generator=generator)
         adam(mine[0], gradient, mine[1], mine[2], 1e-2, step, visible)
-        twin(exact[0], gradient.double(), exact[1], exact[2], 1e-2, step, visible)
+        adam(exact[0], gradient.double(), exact[1], exact[2], 1e-2, step, visible)
     for got, want in zip(mine, exact):
         torch.testing.assert_close(got.double(), want, rtol=2e-6, atol=2e-6)
     if visible is not None:

@@ -133,16 +133,6 @@ def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
     return luminance * (2 * covariance + SSIM_C2) / (variance_p + variance_t + SSIM_C2)
 
 
-def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, weight: Tensor | None = None) -> Tensor:
-    """Scalar ``(1 - w) mean|p - t| + w (1 - mean SSIM)`` of images ``[3, H, W]`` in [0, 1]: the plain-torch form.
-
-    With a weight ``[H, W]`` per pixel: the ``confident_mean`` of both maps. ``core.native_ops.photometric`` computes
-    the same value and gradient in one native pass.
-    """
-    both = (1 - ssim_weight) * (prediction - target).abs() + ssim_weight * (1 - ssim_map(prediction, target))
-    return both.mean() if weight is None else confident_mean(both, weight)
-
-
 def outside_mask_copied(prediction: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
     """The prediction with the target copied in where ``mask`` (bool ``[1, H, W]``) is False.
 
@@ -248,36 +238,6 @@ def empty_sky(alpha: Tensor, sky: Tensor, floor: float = 1e-3) -> Tensor:
 def opacity_entropy(alpha: Tensor, floor: float = 1e-3) -> Tensor:
     """Mean of ``-alpha log alpha``: a pixel is covered, or it is not."""
     return -(alpha * torch.log(alpha.clamp_min(floor))).mean()
-
-
-def semantic_map(logits: Tensor, target: Tensor) -> Tensor:
-    """Cross-entropy at every pixel; unlabelled pixels (255) give 0.
-
-    Args:
-        logits: ``[C, H, W]``.
-        target: i64[H, W] in 0..C-1 or 255.
-
-    Returns:
-        ``[H, W]``.
-    """
-    check_shape(target, "semantic loss: target", tuple(logits.shape[1:]))
-    return F.cross_entropy(logits[None], target[None], ignore_index=UNLABELLED, reduction="none")[0]
-
-
-def class_loss(
-    logits: Tensor, target: Tensor, weight: Tensor, total: float | Tensor, lift: tuple[int, Tensor] | None = None
-) -> Tensor:
-    """Scalar: cross entropy of every pixel, times its weight, summed and divided by ``total``: the plain-torch form.
-
-    ``core.native_ops.class_loss`` computes the same value and gradient in one native pass, and names the arguments.
-    """
-    if lift is not None:
-        # filled there: a list would be copied, and waited for
-        channel = torch.full((1,), lift[0], device=logits.device)
-        logits = logits.index_add(0, channel, lift[1].detach()[None].to(logits.dtype))
-    labelled = torch.where((target >= 0) & (target < len(logits)), target, UNLABELLED)
-    total = total.to(weight.dtype) if isinstance(total, Tensor) else total
-    return (semantic_map(logits, labelled) * weight).sum() / total
 
 
 def object_map(object_alpha: Tensor, inside_boxes: Tensor, floor: float = 1e-3) -> Tensor:

@@ -218,7 +218,6 @@ def object_record(box: ObjectBox) -> dict[str, Any]:
 
 
 # --- mudg render --layers -------------------------------------------------------------------------
-#
 # OUT/layers/<trajectory>/layers.json            objects by number; per view its file, time, pose, trust and boxes
 # OUT/layers/<trajectory>/000000.safetensors     arrays as in ``CameraReply.layers``
 # OUT/layers/<trajectory>/000000_instances.png   u16; 000000_normals.png: u8, (n + 1) / 2, black without a surface

@@ -39,7 +39,7 @@ from mudg.base.weather_settings import Conditions
 from mudg.core import weather
 from mudg.core.pictures import resize_area, to_bytes
 from mudg.core.project import ProjectConfig, ProjectedPoints, project_sparse
-from mudg.core.weather import DriveFacts, ShownView
+from mudg.core.weather import ShownView, Surroundings
 
 # vacated ------------------------------------------------------------------------------------------
 #
@@ -626,7 +626,7 @@ class InWeather:
     velocity of the cameras at a time."""
 
     settings: Conditions
-    drive: DriveFacts
+    drive: Surroundings
     seed: int
     velocity_at: Callable[[float], tuple[float, float, float]]
 

@@ -48,7 +48,7 @@ def run(config: ConvertConfig, checkpoint: Path, to: Path, conversion: Conversio
     InputError: not such a checkpoint; nothing is written. ResourceError: memory limit or disk."""
     checkpoint, to = Path(checkpoint), Path(to)
     refuse_overlap(to, {"checkpoint": checkpoint})
-    replacement = Replacement.at(to)
+    replacement = Replacement(to)
     replacement.recover(lambda folder: bool(own_names(folder)), own_names)
     replaces = to.exists()
     if replaces and not overwrite:

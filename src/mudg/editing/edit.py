@@ -440,8 +440,7 @@ def edited_scene(script: EditScript, config: SynthesizeConfig, inputs: JobInputs
 
 
 def edited_drive(script: EditScript, config: SynthesizeConfig, inputs: JobInputs) -> DriveInputs:
-    """The drive as the script leaves it: its scene, clouds and fit, recorded images without what they show wrongly, and
-    its weather."""
+    """The drive as the script leaves it: clouds, fit, recorded images without what they show wrongly, and weather."""
     scene, cloud = read_scene(inputs.scene), read_fused(inputs.fused)
     fit = None if inputs.fitted is None else load_model(inputs.fitted)
     drive = carry_out(script, fit, scene, cloud)
@@ -449,9 +448,9 @@ def edited_drive(script: EditScript, config: SynthesizeConfig, inputs: JobInputs
     conditions, weather = conditions_of(script.canonical()), None
     if conditions is not None and fit is not None and shows_weather(config, script, True):
         weather = weather_of(drawer(fit), conditions, edited)
-    recorded = photos_of_edited(recorded_images(scene, config), drive.plan)
-    render_at, cloud = fit and functools.partial(render_planes, fit), cleared_cloud(drive.cloud or cloud, drive.plan)
-    return DriveInputs(cloud, edited.tracks, recorded, render_at, vacated_at(drive.plan), weather)
+    recorded, cloud = photos_of_edited(recorded_images(scene, config), drive.plan), drive.cloud or cloud
+    shown, cloud = None if fit is None else functools.partial(render_planes, fit), cleared_cloud(cloud, drive.plan)
+    return DriveInputs(cloud, edited.tracks, recorded, shown, vacated_at(drive.plan), weather)
 
 
 def shows_weather(config: SynthesizeConfig, script: EditScript, fitted: bool) -> bool:

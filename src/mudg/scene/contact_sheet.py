@@ -25,7 +25,6 @@ Floats = NDArray[np.float64]
 
 # a scene from above: points, the recorded path, boxes and their courses ---------------------------
 
-
 GROUND_COLOR: Final = (18, 18, 18)
 TEXT_COLOR: Final = (235, 235, 235)
 VEHICLE_COLOR: Final = (80, 255, 120)
@@ -124,7 +123,6 @@ def pairs(points: Floats) -> list[tuple[float, float]]:
 
 
 # contact sheet ------------------------------------------------------------------------------------
-
 
 NAME: Final = "contact_sheet.jpg"
 TILE_WIDTH_PX: Final = 480

@@ -196,7 +196,6 @@ def jumps(times_s: Times, poses: Matrix, least_m: float) -> list[tuple[int, floa
 
 # the recorded path as a road -----------------------------------------------------------------------
 
-
 Matrix = NDArray[np.float64]
 LEAST_STEP_M: Final = 0.2
 """Recorded poses nearer to the last one than this add nothing to a road."""

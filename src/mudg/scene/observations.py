@@ -223,7 +223,6 @@ def list_observation_sets(path: Path) -> dict[str, Path]:
 
 
 # simulated sweeps: what ``mudg render --lidar`` writes and ``mudg score`` reads -------------------------
-#
 # sweeps.json          schema, trajectory, sensor, shift in metres; one record per sweep: id of the recorded sweep, if
 #                      its own beams are fired, times and world-from-sensor poses of start and end, file
 # 000000.safetensors   xyz f32[N, 3], intensity f32[N], dt_s f32[N], classes u8[N] as a scene stores sweeps, in the

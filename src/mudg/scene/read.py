@@ -107,7 +107,6 @@ _open_cached = functools.lru_cache(maxsize=16)(lambda path, *_state: SceneFiles(
 
 # read ---------------------------------------------------------------------------------------------
 
-
 _EXIF_ORIENTATION: Final = 0x0112
 _PNG: Final = b"\x89PNG"
 

@@ -243,7 +243,7 @@ def _wanted(trajectory: ScoredTrajectory, reference: Reference, counted: Sequenc
     every_frame = {"temporal_flickering"} | ({"flicker", "warp_error"} if reference.truth.exact else set())
     needs_weights = reference.distances.keys()  # "flicker" and "temporal_flickering" want all views, in order
     usual = {name for name, row in metrics.METRICS.items() if row.build is not None}
-    usual = (usual | {*metrics.FACTS}) - {*needs_weights, *metrics.EVERY_VIEW}
+    usual -= {*needs_weights, *metrics.EVERY_VIEW}
     return [
         every_frame | (usual if n in counted else set()) | (needs_weights if n in sampled else set())
         for n in range(len(trajectory.views))

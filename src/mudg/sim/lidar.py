@@ -303,7 +303,6 @@ def _carried(points: NDArray[np.float32], share: Floats, start: Instant, end: In
 
 
 # -- sweeps of a whole log: ``mudg render --lidar`` ---
-#
 # OUT/lidar/<sensor>_recorded/, OUT/lidar/<sensor>_shift+3.0/   see ``scene/observations.py``
 Place = tuple[BeamTable, Instant, Instant]
 

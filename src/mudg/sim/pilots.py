@@ -184,7 +184,6 @@ class PlanPilot:
 
 
 # -- a driving policy behind AlpaSim's EgodriverService (``pip install 'mudg[sim]'``) ---
-#
 #     with Policy("localhost:50051", "front", camera, mount) as policy:
 #         controls = PlanPilot(policy).drive(sight)
 #
