@@ -26,7 +26,6 @@ from mudg.base.types import View
 from mudg.core import metrics
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.gaussians import fit
-from mudg.gaussians import start as fit_start
 from mudg.gaussians import trust as fit_trust
 from mudg.gaussians import views as fit_views
 from mudg.gaussians.corrections import Appearance
@@ -34,6 +33,7 @@ from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.schedule import FiniteCheck
 from mudg.gaussians.settings import METHODS, FitConfig
+from mudg.gaussians.start import FitStart
 from mudg.scene.clouds import read_fused, write_fused
 from mudg.scene.observations import ObservationWriter
 from mudg.scene.read import read_scene
@@ -214,7 +214,7 @@ def test_a_non_finite_gradient_is_named_and_never_reaches_the_parameters(world):
     frames = fit_views.training_frames(scene, ())
     classes = fit_views.classes_of(scene, frames, {})
     stored = [stored for _, stored in fit_views.load_recorded(scene, frames, classes, 0, with_lidar=False)]
-    model = fit_start.start_model(scene, fused_cloud(FRAMES), stored, classes, settings(start__gaussians=300))
+    model = FitStart(settings(start__gaussians=300), scene, fused_cloud(FRAMES), stored, classes).model()
     model.table["log_scales"].grad = torch.zeros_like(model.table["log_scales"])
     model.table["log_scales"].grad[3, 1] = float("inf")
 

@@ -483,7 +483,7 @@ class Canvas:
         self.rgb[:, *where] = seen.rgb.numpy()
         self.distance[where] = seen.depth.numpy() / rays[..., 2]
         self.classes[where] = seen.semantics.numpy()
-        self.certainty[where] = _certainty(seen)
+        self.certainty[where] = seen.sure().numpy()
         if planes.instances is not None:
             self.instances[where] = planes.instances
 
@@ -495,7 +495,7 @@ class Canvas:
         x, y = geometry.pinhole_ray(face.camera.intrinsics, *face.uv.T)
         self.distance[place] = surface(seen.depth.numpy(), face.uv, face.camera)[0] * np.sqrt(x * x + y * y + 1)
         self.classes[place] = nearest(seen.semantics.numpy(), face.uv)
-        self.certainty[place] = nearest(_certainty(seen), face.uv)
+        self.certainty[place] = nearest(seen.sure().numpy(), face.uv)
         if planes.instances is not None:
             self.instances[place] = nearest(planes.instances, face.uv)
 
@@ -514,12 +514,6 @@ def _repaired(mixer: RenderMixer, view: View, rendered: RenderedCondition) -> Re
 def _background(model: SceneModel) -> Matrix:
     """Places f64[N, 3] of the Gaussians that stand still."""
     return model.table["means"].detach()[: model.counts()[0]].cpu().numpy().astype(np.float64)
-
-
-def _certainty(seen: RenderedCondition) -> NDArray[np.float32]:
-    """Certainty f32[H, W]; half the coverage for scenes that measured none."""
-    certainty = 0.5 * seen.alpha if seen.certainty is None else seen.certainty
-    return np.where(np.isfinite(seen.depth.numpy()), certainty.numpy(), 0.0).astype(np.float32)
 
 
 def _pose(value: ArrayLike, where: str) -> Matrix:
