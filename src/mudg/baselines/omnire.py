@@ -64,9 +64,9 @@ class FlatNetwork:
         return found
 
 
-def waves(values: Tensor, octaves: int) -> Tensor:
-    """Values ``[n, c]`` with sine and cosine of their 1, 2, 4, ... pi fold: ``[n, c (1 + 2 octaves)]``."""
-    scaled = torch.cat([values * (math.pi * 2**octave) for octave in range(octaves)], 1)
+def waves(values: Tensor, octaves: int, first: float = math.pi) -> Tensor:
+    """Values ``[n, c]`` with sine and cosine of them times 1, 2, 4, ... ``first``: ``[n, c (1 + 2 octaves)]``."""
+    scaled = torch.cat([values * (first * 2**octave) for octave in range(octaves)], 1)
     return torch.cat([values, torch.sin(scaled), torch.cos(scaled)], 1)
 
 
