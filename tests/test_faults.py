@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from faults import Act, contents, counted, every, failing, in_child, killed, sweep, terminated
-from test_nothing_is_lost import VERBS, call, world  # noqa: F401
+from test_nothing_is_lost import STEPS, call, world  # noqa: F401
 from toy_clips import tiny, write_clips
 
 from mudg import app
@@ -23,7 +23,7 @@ from mudg.base.run_folder import Replacement, RunDir, VerbOutput
 from mudg.steps.synthesize import Learn
 
 OUTPUT = VerbOutput("small", 1, ("*.txt", "rows/*.txt"))
-SWEPT = [name for name in VERBS if name not in ("learn", "bench", "film")]
+SWEPT = [name for name in STEPS if name not in ("learn", "film")]
 """Verbs that do their work in this process; ``learn`` has its own sweep below, the others write through the same
 store."""
 POINTS = int(os.environ.get("MUDG_TEST_POINTS", "24"))
@@ -108,7 +108,7 @@ def test_a_verb_stopped_at_any_point_is_repeated_to_the_same_bytes(
 
     def work(place: Path) -> None:
         with app._sigterm_interrupts():
-            call(name, world, place / "out", 1, False)
+            call(name, world, place / "out")
 
     def some(operations: list[str]) -> list[int]:
         count = min(len(operations), POINTS if stop is not failing else 8)
