@@ -23,7 +23,7 @@ from torch import Tensor
 from mudg.base import geometry, log, seeds
 from mudg.base.errors import InputError
 from mudg.base.palette import DYNAMIC_IDS, ID, UNLABELLED
-from mudg.base.types import CameraColors, FusedCloud, PointCloud, Scene
+from mudg.base.types import FusedCloud, PointCloud, Scene
 from mudg.core.fusion import largest_beam_gap
 from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import visible_depth
