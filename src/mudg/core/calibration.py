@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import geometry
-from mudg.base.camera_colors import SAME_COLORS, CameraColors, ColorMap
 from mudg.base.geometry import transform_points
-from mudg.base.types import View
+from mudg.base.types import SAME_COLORS, CameraColors, ColorMap, View
 
 # colours ------------------------------------------------------------------------------------------
 # Cameras of a rig overlap little at one moment, but the front camera sees what the side cameras pass a little later. So

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import palette
-from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import InputError
 from mudg.base.geometry import invert, pinhole, yaw_of
-from mudg.base.types import FusedCloud, Photo, PointCloud, SweepPoints, Track, View
+from mudg.base.types import SAME_COLORS, CameraColors, FusedCloud, Photo, PointCloud, SweepPoints, Track, View
 from mudg.core.project import RULES, DrawLimits, PointLayer, draw_points, nearer_depth
 
 Matrix = NDArray[np.float64]

@@ -173,7 +173,7 @@ def _score(
     motion, exact_motion = metrics.ExactMotion(), metrics.ExactMotion(reference.vehicles)
     build = lambda: metrics.build_all(reference.distances, motion, metrics.build_facts(exact_motion))
     sums = {name: build() for name in names} | {TRUTH: metrics.build_facts(exact_motion)}
-    counted = trajectory.counted(reference.held_out)
+    counted = reference.counted(trajectory)
     wanted = _wanted(trajectory, reference, counted)
     truth_has: set[str] = set()
     scored = 0
@@ -209,9 +209,7 @@ def _score(
                     scored += 1
                     truth_has |= _contents(made.truth, exact)
                 if reference.error_pictures and number == every // 2:
-                    picture = _error_picture(made.seen, made.truth.seen)
-                    path = out / "errors" / f"{trajectory.name}.png"
-                    store.write_image(path, picture, optimize=False, compress_level=1)
+                    write_errors(out / "errors" / f"{trajectory.name}.png", made.seen, made.truth.seen)
             for name, values in made.measured.items():
                 for metric, value in values.items():
                     sums[name][metric].add(value)
@@ -321,9 +319,10 @@ def pair_of(
     return metrics.Pair(*made, *truths, mask=true.mask, moving=truth.moving, view=true.view, facts=facts)
 
 
-def _error_picture(seen: Mapping[str, Observation], true: Observation) -> NDArray[np.uint8]:
-    """Truth and the methods beside each other, their colour errors below."""
+def write_errors(path: Path, seen: Mapping[str, Observation], true: Observation) -> None:
+    """A picture: truth and the methods beside each other, their colour errors below."""
     height, width = true.view.camera.height, true.view.camera.width
     images = [true.rgb, *(resize_rgb(observation.rgb, height, width) for observation in seen.values())]
     errors = [np.zeros((height, width, 3), np.uint8), *(error_image(rgb, true.rgb) for rgb in images[1:])]
-    return np.vstack([np.hstack([to_bytes(rgb) for rgb in images]), np.hstack(errors)])
+    picture = np.vstack([np.hstack([to_bytes(rgb) for rgb in images]), np.hstack(errors)])
+    store.write_image(path, picture, optimize=False, compress_level=1)

@@ -69,20 +69,28 @@ def rasterize(
     world_from_cam: Tensor | None = None,
     absgrad: bool = False,
 ) -> Render:
-    """Draw Gaussians (activated parameters) into a view, over black; everything returned is differentiable, in the
-    parameters and in ``world_from_cam`` [4, 4], a rigid pose used instead of the view's.
+    """Draw Gaussians into a view, over black; everything returned is differentiable.
 
     Cameras are pinhole cameras with a global shutter: ``Camera.distortion`` describes the lens before rectification,
     and ``core/trajectory.py`` moves Gaussians to where a rolling shutter sees them.
 
-    Returns rgb [3, H, W], depth [1, H, W] (expected z; times alpha = the accumulated z; 0 where alpha is 0), alpha
-    [1, H, W], extra [C, H, W] accumulated, and the trace, whose leaf ``means2d`` gets its gradient (pixels) in
-    backward; rows of Gaussians that were not drawn are 0. ``absgrad`` also fills ``trace.abs_grad2d`` (sum over pixels
-    of |d loss / d mean2d|).
+    Args:
+        gaussians: activated parameters; gradients flow to means, quats, scales, opacity, sh (sh_rest), extra.
+        view: the camera, and the pose unless ``world_from_cam`` is given.
+        config: see ``RasterConfig``.
+        world_from_cam: [4, 4], a rigid, differentiable pose used instead of the view's.
+        absgrad: also fill ``trace.abs_grad2d`` in backward (sum over pixels of |d loss / d mean2d|, pixels).
 
-    InputError: shapes, devices or types that do not fit. ResourceError: the backend asked for is not available here, or
-    memory ran out. NumericsError: a parameter of any Gaussian is not finite, or the colour or a feature of a drawn one;
-    finite but absurd values (zero quaternion, scale of 1e38) are drawn or culled, never spread NaN.
+    Returns:
+        Render with rgb [3, H, W], depth [1, H, W] (expected z; times alpha = the accumulated z; 0 where alpha is 0),
+        alpha [1, H, W], extra [C, H, W] accumulated, and the trace. ``trace.means2d`` is a leaf whose ``.grad``
+        backward fills (pixels); rows of Gaussians that were not drawn are 0.
+
+    Raises:
+        InputError: shapes, devices or types that do not fit.
+        ResourceError: the backend asked for is not available here, or memory ran out.
+        NumericsError: a parameter is NaN or infinite (in any Gaussian), or the colour or a feature of a drawn one.
+            Finite but absurd values (zero quaternion, scale of 1e38) are drawn or culled, never spread NaN.
     """
     config, camera = config or RasterConfig(), view.camera
     _check(gaussians)
