@@ -205,7 +205,7 @@ def _count(word: str, where: str, largest: int = MAX_POINTS) -> int:
 
 def read_ply(content: bytes, where: str) -> dict[str, NDArray]:
     """Vertices of a polygon file, text or binary; what follows (faces) is passed over."""
-    table = ply.read_elements(content, where, ("vertex",)).tables.get("vertex")
+    table = ply.PlyFile(content, where, ("vertex",)).tables.get("vertex")
     if table is None:
         raise InputError("the PLY file has no vertices", where=where)
     return {name: table[name].astype(table.dtype[name].newbyteorder("=")) for name in table.dtype.names or ()}
