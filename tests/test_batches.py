@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import socket
@@ -42,10 +43,10 @@ LINES = stage_lines()
 class Scenes:
     """A list of scenes, a step, and what is to happen to single ones."""
 
-    def __init__(self, folder: Path, count: int = 3) -> None:
+    def __init__(self, folder: Path, count: int = 3, step: str = STEP) -> None:
         self.folder, self.tally = folder, folder / "tally"
         self.tally.mkdir(parents=True, exist_ok=True)
-        (folder / "step.sh").write_text(STEP)
+        (folder / "step.sh").write_text(step)
         self.entries = [Entry(f"s{number}", f"/logs/{number}") for number in range(count)]
         self.command = ("sh", str(folder / "step.sh"), "{name}", "{out}", str(self.tally))
         self.plan = plan_of((), {}, {}, self.command)
@@ -74,6 +75,10 @@ class Scenes:
     def words(self, *more: str) -> list[str]:
         first = f"batch run --list {self.folder}/list.txt --out {self.batch.out} --quiet".split()
         return [*first, *more, "--command", *self.command]
+
+    def start(self, *more: str, **environment: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "mudg", *self.words(*more)]
+        return subprocess.Popen(command, env={**os.environ, **environment})
 
 
 @pytest.fixture(autouse=True)
@@ -381,7 +386,7 @@ open(os.path.join(out, "whole"), "w").write("whole")
 def start(made: Scenes) -> subprocess.Popen[bytes]:
     made.command = (sys.executable, str(made.folder / "step.py"), "{out}", str(made.folder / "up"))
     (made.folder / "step.py").write_text(CHECKPOINTS)
-    process = subprocess.Popen([sys.executable, "-m", "mudg", *made.words("--jobs", "1")])
+    process = made.start("--jobs", "1")
     wait_for((made.folder / "up").exists)
     return process
 

@@ -130,10 +130,10 @@ def stripes(phase: float, width_px: float = 6.0) -> Tensor:
 
 
 def test_filter_bank_zero_for_equal_images_and_gradient():
-    x = image(3, (3, 16, 20))
-    assert distance(x, x) == 0.0
-    bank, weight = FilterBank(scales=2), image(1, (1, 16, 20))
-    target = bank(image(4, (3, 16, 20)))
+    x = image(3, (3, 10, 12))
+    assert distance(image(3, (3, 16, 20)), image(3, (3, 16, 20))) == 0.0
+    bank, weight = FilterBank(scales=2), image(1, (1, 10, 12))
+    target = bank(image(4, (3, 10, 12)))
     check_gradient(lambda p: losses.feature_distance(bank(p), target, weight), x)
 
 

@@ -23,27 +23,6 @@ from mudg.core.native_ops import AdamColumn
 needs_native = pytest.mark.skipif(native.library() is None, reason=native.status())
 
 
-@pytest.fixture
-def pool() -> Any:
-    """(sum function, restores the thread setting)."""
-    library = native.require("the test")
-    before = native.threads()
-    library.mudg_parallel_sum.argtypes = [ctypes.c_int64, ctypes.c_int64]
-    library.mudg_parallel_sum.restype = ctypes.c_int64
-    yield library.mudg_parallel_sum
-    native.set_threads(before)
-
-
-@pytest.fixture(params=["avx512", "avx2", "portable"])
-def isa(request: pytest.FixtureRequest) -> Any:
-    try:
-        native.set_isa(request.param)
-    except (UsageError, ResourceError) as error:
-        pytest.skip(str(error))
-    yield request.param
-    native.set_isa("")
-
-
 # ---- loading -------------------------------------------------------------------------------------
 
 
@@ -100,12 +79,13 @@ def test_the_thread_count_comes_from_the_environment(monkeypatch: pytest.MonkeyP
 # ---- the pool ------------------------------------------------------------------------------------
 
 
-@needs_native
 @pytest.mark.parametrize("threads", [1, 2, 7])
-def test_every_index_is_visited_exactly_once(pool: Any, threads: int) -> None:
-    native.set_threads(threads)
+def test_every_index_is_visited_exactly_once(set_threads: Callable[[int], None], threads: int) -> None:
+    set_threads(threads)
+    summed = native.require("the test").mudg_parallel_sum
+    summed.argtypes, summed.restype = [ctypes.c_int64, ctypes.c_int64], ctypes.c_int64
     for count, grain in ((0, 1), (1, 1), (5, 100), (1000, 1), (100_003, 64), (64, 0)):
-        assert pool(count, grain) == count * (count - 1) // 2
+        assert summed(count, grain) == count * (count - 1) // 2
 
 
 @needs_native
@@ -252,14 +232,13 @@ def test_picture_over_the_sky_equals_its_float64_twin(
         torch.testing.assert_close(found, true, rtol=2e-5, atol=2e-5)
 
 
-@needs_native
-def test_losses_and_sky_do_not_depend_on_the_number_of_threads(pool: Any) -> None:
+def test_losses_and_sky_do_not_depend_on_the_number_of_threads(set_threads: Callable[[int], None]) -> None:
     generator = torch.Generator().manual_seed(3)
     logits, coarse, rgb = (torch.randn(shape, generator=generator) for shape in ((9, 90, 70), (3, 20, 15), (3, 90, 70)))
     target, weight = torch.randint(0, 9, (90, 70), generator=generator), torch.rand(90, 70, generator=generator)
     results = []
     for threads in (1, 3):
-        native.set_threads(threads)
+        set_threads(threads)
         leaves = [t.clone().requires_grad_() for t in (logits, coarse, rgb, weight)]
         sky = native_ops.over(leaves[2], leaves[3][None], leaves[1])
         value = native_ops.class_loss(leaves[0], target, weight, 10.0) + sky.square().sum()

@@ -38,7 +38,7 @@ from mudg.base.types import Condition, FusedCloud, Photo, RenderPlanes, SparseDe
 from mudg.base.weather_settings import Conditions
 from mudg.core import weather
 from mudg.core.pictures import resize_area, to_bytes
-from mudg.core.project import ProjectConfig, ProjectedPoints, project_sparse
+from mudg.core.project import ProjectConfig, ProjectedPoints, project_cloud
 from mudg.core.weather import ShownView, Surroundings
 
 # vacated ------------------------------------------------------------------------------------------
@@ -169,7 +169,8 @@ class ConditionRules:
     def project(self, cloud: FusedCloud, tracks: Sequence[Track], view: View) -> ProjectedPoints:
         """The cloud's points in a view of the condition's resolution."""
         drawn = ProjectConfig(near_m=1.0, far_m=FAR_M, occluder_m=0.0 if self.published else self.occluder_m)
-        return project_sparse(cloud, tracks, view, drawn, hide=not self.published)
+        poses = {track.id: track.pose_at(view.time_s) for track in tracks}
+        return project_cloud(cloud, poses, view, drawn, hide=not self.published)
 
 
 OVERLAP_GRID = 24, 16

@@ -23,7 +23,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Clip, Condition, Frame, FusedCloud, Photo, PointCloud, Scene, Sweep, View
 from mudg.core.pictures import resize_area, resize_nearest
 from mudg.core.project import RULES as HIDING_RULES
-from mudg.core.project import project_points, seen_pixels
+from mudg.core.project import DrawLimits, PointLayer, draw_points, seen_pixels
 from mudg.diffusion.clips import FAR_M, shard_path, write_shard
 from mudg.diffusion.condition import (
     SAME_TIME_S,
@@ -232,9 +232,9 @@ def measured_depth(scene: Scene, view: View) -> tuple[NDArray[np.float32], NDArr
         if other is None or abs(sweep.time_s - view.time_s) < abs(other.time_s - view.time_s):
             nearest[sweep.sensor] = sweep
     places = [geometry.transform_points(s.world_from_lidar, read_points(scene, s).xyz) for s in nearest.values()]
-    seen = project_points(np.concatenate(places).astype(np.float32), None, view, near_m=1.0, far_m=100.0)
-    depth = seen.depth[0].numpy()
-    return depth, seen_pixels(depth, seen.valid[0].numpy(), HIDING_RULES["condition"])
+    layer = PointLayer(np.concatenate(places).astype(np.float32), np.eye(4))
+    depth, index = draw_points([layer], view, DrawLimits(1.0, 100.0))
+    return depth, seen_pixels(depth, index >= 0, HIDING_RULES["condition"])
 
 
 # files --------------------------------------------------------------------------------------------
