@@ -245,9 +245,8 @@ def record_with_faults(config: CityConfig, sensors: SensorFaults, used: Sequence
     if sensors.second_lidar is not None:
         second, pose = sensors.second_lidar, np.eye(4)
         pose[:3, 3] = second.place
-        scans.append(
-            LidarScan(pose, beam_elevations(second.beams, second.lower_deg, second.upper_deg), delay_s, " second")
-        )
+        elevations = beam_elevations(second.beams, second.lower_deg, second.upper_deg)
+        scans.append(LidarScan(pose, elevations, delay_s, " second"))
     sweeps = []
     for index in used:
         shots = [photos[name][index] for name in config.cameras]
