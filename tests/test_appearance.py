@@ -17,8 +17,7 @@ from mudg.base import geometry
 from mudg.base.config import to_dict
 from mudg.base.errors import NumericsError
 from mudg.base.run_folder import RunDir
-from mudg.core.native_ops import adam_columns
-from mudg.core.table import Table, torch_adam_columns
+from mudg.core.table import Table
 from mudg.gaussians import fit
 from mudg.gaussians.corrections import Appearance, rigid_motion
 from mudg.gaussians.model import SceneModel, compose
@@ -103,16 +102,14 @@ def test_gradients_by_finite_differences(scale):
     assert torch.autograd.gradcheck(applied, inputs)
 
 
-@pytest.mark.parametrize("kernel", [torch_adam_columns, adam_columns])
-def test_only_the_image_of_a_step_moves(kernel):
+def test_only_the_image_of_a_step_moves():
     made = everything()
     view = view_at(0.3, camera())
     made.world_from_cam(view, RECORDED[1])[:3, 3].sum().backward()
-    made.adam_step(1, {"shift": 0.1, "turn": 0.1, "affine": 0.1}, kernel)
+    made.adam_step(1, {"shift": 0.1, "turn": 0.1, "affine": 0.1})
     assert made.tables["cameras"]["shift"].detach().any(1).tolist() == [False, True, False]
-    assert not any(
-        made.tables[group][name].detach().any() for group, name in (("cameras", "turn"), ("exposure", "affine"))
-    )
+    for group, name in (("cameras", "turn"), ("exposure", "affine")):
+        assert not made.tables[group][name].detach().any()
 
 
 # ---- fits ----------------------------------------------------------------------------------------

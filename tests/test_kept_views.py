@@ -100,15 +100,6 @@ def test_every_combination_of_fields_and_number_types_comes_back_to_the_bit(tmp_
         assert_same(found, wanted)
 
 
-def test_a_mapped_array_keeps_its_values_and_has_no_name(tmp_path):
-    array = memory.mapped_array(tmp_path, (3, 5000), np.float32)
-    assert not array.any()
-    array[:] = np.arange(15000).reshape(3, 5000)
-    memory.rest_mapped()
-    assert np.array_equal(array, np.arange(15000).reshape(3, 5000))
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_mapped_array_that_the_disk_has_no_room_for_is_an_error_in_words(tmp_path, monkeypatch):
     def full(*_: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -19,7 +19,7 @@ from mudg.base.types import Gaussians, View
 from mudg.core import losses
 from mudg.core.harmonics import left_product_matrix
 from mudg.core.raster.rasterize import RasterConfig, rasterize
-from mudg.core.table import AdamKernel, Table
+from mudg.core.table import Table
 from mudg.gaussians import nodes
 from mudg.gaussians.model import SceneModel, compose_as_read, composite_sky
 from mudg.gaussians.nodes import RigidNode
@@ -105,12 +105,12 @@ class Appearance:
         affine = self.tables[COLOR]["affine"]
         return affine[row] - affine.mean(0)
 
-    def adam_step(self, step: int, rates: Mapping[str, float], kernel: AdamKernel) -> None:
+    def adam_step(self, step: int, rates: Mapping[str, float]) -> None:
         """One Adam step on the rows that have a gradient (the others rest), then gradients are dropped."""
         for table in self.tables.values():
             gradients = [gradient.flatten(1).abs().sum(1) for gradient in table.gradients().values()]
             if gradients:
-                table.adam_step(step, rates, kernel, torch.stack(gradients).sum(0) > 0)
+                table.adam_step(step, rates, torch.stack(gradients).sum(0) > 0)
             table.clear_gradients()
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:

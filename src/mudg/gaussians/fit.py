@@ -248,7 +248,7 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
         check.refuse()
         adam_step(state.model, step, config.iterations, state.begun_at)
         rates = appearance_rates(step, config.iterations)
-        state.appearance.adam_step(step - state.begun_at, rates, native_ops.adam_columns)
+        state.appearance.adam_step(step - state.begun_at, rates)
         if step % SHAPE_EVERY == 0:
             shorten_needles(state.model.table, config.densify.longest_to_middle)
             now, first = (learning_rates(at, config.iterations)["deform"] for at in (step, 1))
@@ -424,7 +424,7 @@ def adam_step(model: SceneModel, step: int, iterations: int, begun_at: int = 0) 
     ``begun_at``."""
     rates = learning_rates(step, iterations)
     for table in (model.table, *model.node_tables().values()):
-        table.adam_step(step - begun_at, rates, native_ops.adam_columns)
+        table.adam_step(step - begun_at, rates)
         table.clear_gradients()
 
 

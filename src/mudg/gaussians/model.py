@@ -33,10 +33,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mudg.base import geometry
-from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import CLASSES, ID
-from mudg.base.types import Gaussians, View
+from mudg.base.types import SAME_COLORS, CameraColors, Gaussians, View
 from mudg.core import native_ops
 from mudg.core.table import Table
 from mudg.core.trajectory import Readout, as_read, moved_by

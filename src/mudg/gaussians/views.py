@@ -27,7 +27,7 @@ from mudg.base.types import Frame, FusedCloud, ObservationKind, Scene, Sweep, Tr
 from mudg.core.fusion import largest_beam_gap
 from mudg.core.pictures import resize_area, resize_nearest
 from mudg.core.project import RULES as HIDING_RULES
-from mudg.core.project import ProjectConfig, project_sparse, visible_depth
+from mudg.core.project import ProjectConfig, project_cloud, visible_depth
 from mudg.core.trajectory import Readout, points_as_read, readout_of
 from mudg.networks.featnets import WHOLE_PIXELS
 from mudg.scene.labels import read_label
@@ -267,7 +267,7 @@ def fused_lidar(cloud: FusedCloud, tracks: Sequence[Track]) -> Callable[[View], 
     drawn = ProjectConfig(near_m=1.0, far_m=MAX_LIDAR_M, occluder_m=0.2)
 
     def measured(view: View) -> LidarPixels:
-        seen = project_sparse(cloud, tracks, view, drawn, hide=True)
+        seen = project_cloud(cloud, {t.id: t.pose_at(view.time_s) for t in tracks}, view, drawn, hide=True)
         pixel = seen.valid.reshape(-1).nonzero()[:, 0]
         return LidarPixels(pixel, seen.depth.reshape(-1)[pixel].contiguous())
 

@@ -25,7 +25,7 @@ from mudg.core import feature_distances
 from mudg.core.feature_distances import frechet_distance
 from mudg.core.pictures import resize_rgb, to_bytes
 from mudg.editing.settings import ScoreConfig
-from mudg.networks import i3d, inception
+from mudg.networks import folders, i3d, inception
 from mudg.networks.featnets import LpipsFeatures, LpipsTrunk, lpips_shapes
 from mudg.scene.observations import ObservationSet, read_observations
 from mudg.scene.read import read_image
@@ -385,7 +385,7 @@ def videos(scene: Scene, files: ClipFiles) -> SetComparison:
     made = {
         "network": "I3D, Kinetics-400, scores before the softmax, 400 values",
         "weights_sha256": files.sha256,
-        "norm_epsilon": i3d.NORM_EPSILON,
+        "norm_epsilon": folders.NORM_EPSILON,
         "resize": files.rule,
         "clip_frames": CLIP_FRAMES,
         "hop_frames": HOP_FRAMES,
