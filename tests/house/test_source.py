@@ -290,9 +290,19 @@ def methods(tree: ast.Module, *, of_protocols: bool) -> set[str]:
     return {one.name for one in inner if ast.get_docstring(one)}
 
 
+def of_bases(node: ast.ClassDef, classes: dict[str, ast.ClassDef]) -> set[str]:
+    """Names of the methods that the bases of a class in the package document."""
+    bases = [classes[name] for base in node.bases if (name := dotted(base).rpartition(".")[2]) in classes]
+    own = {
+        one.name for base in bases for one in base.body if isinstance(one, ast.FunctionDef) and ast.get_docstring(one)
+    }
+    return own.union(*(of_bases(base, classes) for base in bases))
+
+
 def test_public_functions_are_annotated_and_documented(package_dir: Path) -> None:
-    """But for torch's forward, and what a base of all verbs, or a protocol in the same module, explains."""
+    """But for torch's forward, and what a base of the class or of all verbs, or a protocol in the module, explains."""
     modules = dict(parsed(package_dir))
+    classes = {node.name: node for tree in modules.values() for node in tree.body if isinstance(node, ast.ClassDef)}
     of_steps = {"steps/step.py", "steps/engine.py"} & modules.keys()
     explained_steps = {name for module in of_steps for name in methods(modules[module], of_protocols=False)}
     explained_steps |= {"run_parts", "settings_in_list"}
@@ -300,6 +310,7 @@ def test_public_functions_are_annotated_and_documented(package_dir: Path) -> Non
     for name, tree in modules.items():
         explained = {"forward"} | methods(tree, of_protocols=True)
         explained |= explained_steps if name.startswith(("steps/", "benchmarks/")) else set()
+        explained.update(*(of_bases(node, classes) for node in tree.body if isinstance(node, ast.ClassDef)))
         if not ast.get_docstring(tree):
             problems.append(f"{name}: no module docstring")
         top = [node for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)]
