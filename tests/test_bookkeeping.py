@@ -9,16 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from test_run_folder import run
 
 from mudg.base import store
 from mudg.base.errors import InputError, IntegrityError, MudgError, UsageError
-from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
-
-OUTPUT = VerbOutput("fit", 1, ("out.txt",))
-
-
-def run(path: Path, **named: bool) -> RunDir:
-    return RunDir.open(path, OUTPUT, {"value": 1}, {"scene": "abc"}, **named)
+from mudg.base.run_folder import refuse_overlap
 
 
 @pytest.fixture

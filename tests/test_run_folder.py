@@ -64,6 +64,24 @@ def test_lock_of_a_live_process_is_respected_and_of_a_dead_one_taken_over(tmp_pa
     assert not run(tmp_path / "r").complete
 
 
+def test_a_folder_that_another_process_filled_meanwhile_is_not_taken_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between a look into the folder and its lock another command can have finished there."""
+    begin = RunDir._begin
+
+    def later(made: RunDir, *given: Any) -> None:
+        monkeypatch.setattr(RunDir, "_begin", begin)
+        finished(tmp_path / "r")
+        begin(made, *given)
+
+    monkeypatch.setattr(RunDir, "_begin", later)
+    with pytest.raises((ResourceError, UsageError)):
+        finished(tmp_path / "r", 2)
+    assert contents(tmp_path / "r")["out.txt"] == "result 1"
+    store.verify_manifest(tmp_path / "r")
+
+
 # somebody else's files ----------------------------------------------------------------------------
 
 
