@@ -164,10 +164,15 @@ def _in_brief(value: Any) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class RenderPlanes(_Tensors):
-    """What a fitted scene shows at T views (or at one view, without the leading dimension): ``color`` f32[T, 3, H, W]
-    in [0, 1], sky included; ``depth`` f32[T, 1, H, W] metres, meaningless where ``alpha``, coverage by Gaussians,
-    f32[T, 1, H, W] in [0, 1], is small; ``certainty`` f32[T, 1, H, W] in [0, 1]: how far the photographs determined
-    what is shown, never above ``alpha``; ``semantics`` u8[T, 1, H, W] class ids (255 = unknown)."""
+    """What a fitted scene shows at T views (or at one view, without the leading dimension).
+
+    Args:
+        color: f32[T, 3, H, W] in [0, 1], sky included.
+        depth: f32[T, 1, H, W] metres; meaningless where ``alpha`` is small.
+        alpha: f32[T, 1, H, W] in [0, 1]: coverage by Gaussians.
+        certainty: f32[T, 1, H, W] in [0, 1]: how far the photographs determined what is shown; never above ``alpha``.
+        semantics: u8[T, 1, H, W] class ids; 255 = unknown.
+    """
 
     color: Tensor
     depth: Tensor
@@ -283,10 +288,16 @@ def _triple(values: Any) -> Triple:
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A pinhole camera. name: of the sensor, unique in a scene. width, height: image size in pixels. fx, fy, cx, cy:
-    intrinsics in pixels; the centre of the top-left pixel is (0.5, 0.5). distortion: coefficients of the original lens,
-    kept for the record; images in a scene are rectified. readout_s: duration of the rolling shutter, 0 for a global
-    shutter. shutter: the direction in which a rolling shutter reads the image; "global" also where it is not known."""
+    """A pinhole camera.
+
+    Args:
+        name: sensor name, unique in a scene.
+        width, height: image size in pixels.
+        fx, fy, cx, cy: intrinsics in pixels; the centre of the top-left pixel is (0.5, 0.5).
+        distortion: coefficients of the original lens, kept for the record; images in a scene are rectified.
+        readout_s: duration of the rolling shutter, 0 for a global shutter.
+        shutter: the direction in which a rolling shutter reads the image; "global" also where it is not known.
+    """
 
     name: str
     width: int
@@ -597,17 +608,24 @@ class SparseDepth(_Tensors):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Condition(_Tensors):
-    """What the diffusion model is given for T views, all of one size H x W.
+    """What the diffusion model is given for T views.
 
-    ``color`` f32[T, 3, H, W] in [0, 1] and ``depth`` f32[T, 1, H, W] metres are meaningless but where ``valid``
-    bool[T, 1, H, W]: a fused point was seen here. ``reference`` f32[3, H, W] is the dense recorded image near views[0];
-    reference_in: where a published-type model is shown it: in the image tokens and in frame 0 of the colour (as
-    released), in that frame alone, or nowhere. The others may be None. ``warped`` bool[T, 1, H, W]: the colour here was
-    warped from a recorded image near in time. ``backdrop`` f32[T, 3, H, W] in [0, 1]: a recorded image carried over as
-    if all of it were far away. ``semantics`` u8[T, 1, H, W]: class ids that came with ``color`` from labelled points
-    and images (255 = unknown); ``backdrop_semantics`` the same for ``backdrop``. renders: what a fitted scene shows at
-    the views. measured: what the points measured, where ``depth`` is something else: the published system's network is
-    given depth that was resized with its gaps, as 0 m, mixed in. None: ``depth`` where ``valid``.
+    Args:
+        views: T views, all of one size H x W.
+        color: f32[T, 3, H, W] in [0, 1]; meaningless where not valid.
+        depth: f32[T, 1, H, W] metres; meaningless where not valid.
+        valid: bool[T, 1, H, W]: a fused point was seen here.
+        reference: f32[3, H, W], the dense recorded image near views[0].
+        reference_in: where a published-type model is shown it: in the image tokens and in frame 0 of the colour (as
+            released), in that frame alone, or nowhere.
+        warped: bool[T, 1, H, W] or None: the colour here was warped from a recorded image near in time.
+        backdrop: f32[T, 3, H, W] in [0, 1] or None: a recorded image carried over as if all of it were far away.
+        semantics: u8[T, 1, H, W] or None: class ids that came with `color` from labelled points and images; 255 =
+            unknown.
+        backdrop_semantics: u8[T, 1, H, W] or None: the same for `backdrop`.
+        renders: what a fitted scene shows at the views, or None.
+        measured: what the points measured, where ``depth`` is something else: the published system's network is given
+            depth that was resized with its gaps, as 0 m, mixed in. None: ``depth`` where ``valid``.
     """
 
     views: tuple[View, ...]
@@ -659,11 +677,17 @@ class FinePatch(_Tensors):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Clip(_Tensors):
-    """A training example: a condition and the truth for its T views: ``rgb`` f32[T, 3, H, W] in [0, 1]; ``depth``
-    f32[T, 1, H, W] metres where ``depth_valid`` bool[T, 1, H, W], elsewhere it only fills a gap; ``semantics``
-    i64[T, H, W] train ids (255 = unlabelled). shift_m: lateral shift from the recorded path, metres, positive to the
-    left. fine: a rectangle at a higher resolution, or None. depth_confidence: f32[T, 1, H, W] in [0, 1]: how far valid
-    depth is to be believed (1 = measured); None: wholly."""
+    """A training example: a condition and the truth for its T views.
+
+    Args:
+        rgb: f32[T, 3, H, W] in [0, 1].
+        depth: f32[T, 1, H, W] metres where ``depth_valid`` bool[T, 1, H, W]; elsewhere it only fills a gap.
+        semantics: i64[T, H, W] train ids, 255 = unlabelled.
+        shift_m: lateral shift from the recorded path, metres, positive to the left.
+        fine: a rectangle at a higher resolution, or None.
+        depth_confidence: f32[T, 1, H, W] in [0, 1] or None: how far valid depth is to be believed (1 = measured); None:
+            wholly.
+    """
 
     condition: Condition
     rgb: Tensor
@@ -689,11 +713,18 @@ class Clip(_Tensors):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Observation(_Brief):
-    """What is known, or believed, about one view. Recorded and generated frames are this same type: ``rgb``
-    f32[3, H, W] in [0, 1], H x W being the size of the view's camera; ``depth`` f32[1, H, W] metres, not finite or <= 0
-    where there is none (sky); ``semantics`` i64[H, W] train ids (255 = unlabelled); both None if not produced;
-    ``confidence`` f32[1, H, W] in [0, 1]; ``mask`` bool[1, H, W]: pixels that may be used at all. kind: recorded by a
-    sensor, or virtual (generated or rendered). source: who made it, e.g. ``camera`` or ``mudg_r``."""
+    """What is known, or believed, about one view. Recorded and generated frames are this same type.
+
+    Args:
+        view: camera, pose and time; H x W is the camera's size.
+        rgb: f32[3, H, W] in [0, 1].
+        depth: f32[1, H, W] metres, or None if not produced; not finite or <= 0 = no depth (sky).
+        semantics: i64[H, W] train ids (255 = unlabelled), or None if not produced.
+        confidence: f32[1, H, W] in [0, 1].
+        mask: bool[1, H, W]: pixels that may be used at all.
+        kind: recorded by a sensor, or virtual (generated or rendered).
+        source: who made it, e.g. ``camera`` or ``mudg_r``.
+    """
 
     view: View
     rgb: Tensor
@@ -712,12 +743,19 @@ class Observation(_Brief):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Gaussians(_Brief):
-    """Gaussians in the world, activated: ``means`` f32[N, 3] metres, ``quats`` f32[N, 4] (w, x, y, z), which need not
-    be normalised, ``scales`` f32[N, 3] metres, never their logarithm, ``opacity`` f32[N] in [0, 1], ``sh`` f32[N, K, 3]
-    spherical harmonics, K = (degree + 1)^2, ``node`` i32[N] index of the scene node. extra: f32[N, C] feature channels
-    rendered like colours, or None. sh_rest: harmonics from degree 1 on, f32[N, K - 1, 3], where they are kept in a
-    tensor of their own (``sh`` is then f32[N, 1, 3]); None: ``sh`` holds all. The CPU rasteriser draws both forms
-    without a copy."""
+    """Gaussians in the world, activated (scales in metres, never their logarithm; opacity in [0, 1]).
+
+    Args:
+        means: f32[N, 3] metres.
+        quats: f32[N, 4] (w, x, y, z), need not be normalised.
+        scales: f32[N, 3] metres.
+        opacity: f32[N] in [0, 1].
+        sh: f32[N, K, 3] spherical harmonics, K = (degree + 1)^2.
+        sh_rest: harmonics from degree 1 on, f32[N, K - 1, 3], where they are kept in a tensor of their own (``sh`` is
+            then f32[N, 1, 3]); None: ``sh`` holds all. The CPU rasteriser draws both forms without a copy.
+        extra: f32[N, C] feature channels rendered like colours, or None.
+        node: i32[N] index of the scene node.
+    """
 
     means: Tensor
     quats: Tensor

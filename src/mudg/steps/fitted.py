@@ -22,9 +22,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """One rendered view as numpy arrays: ``rgb`` u8[H, W, 3]; ``depth_m`` f32[H, W], camera z in metres, NaN in the sky
-    and where the scene is empty; ``classes`` u8[H, W] Cityscapes train ids (255 = none), or None if the scene was
-    fitted without classes; ``coverage`` f32[H, W] in 0..1, how much of the pixel Gaussians cover."""
+    """One rendered view as numpy arrays.
+
+    Args:
+        rgb: u8[H, W, 3].
+        depth_m: f32[H, W], camera z in metres, NaN in the sky and where the scene is empty.
+        classes: u8[H, W] Cityscapes train ids (255 = none), or None if the scene was fitted without classes.
+        coverage: f32[H, W] in 0..1, how much of the pixel Gaussians cover.
+    """
 
     rgb: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
@@ -44,11 +49,16 @@ def read_scene(folder: str | Path) -> Scene:
 def camera_path(
     scene: Scene, camera: str | Camera = "", *, shift_m: float = 0.0, name: str = "", file: str | Path | None = None
 ) -> Trajectory:
-    """A path of views through a log: the recorded one, one beside it, or that of a file. camera: of the log (empty: its
-    first), or a camera of your own, which then takes the place of its first one. shift_m: to the left of the direction
-    of travel, metres. name: of a named path, as ``up+1.0`` or ``lane+0.1``. file: TUM or KITTI poses (.txt) or
-    nerfstudio's transforms.json, as of ``mudg render --path``. UsageError: no such camera or path. InputError: the file
-    holds no path."""
+    """A path of views through a log: the recorded one, one beside it, or that of a file.
+
+    Args:
+        camera: of the log (empty: its first), or a camera of your own, which then takes the place of its first one.
+        shift_m: to the left of the direction of travel, metres. name: of a named path, as ``up+1.0`` or ``lane+0.1``.
+        file: TUM or KITTI poses (.txt) or nerfstudio's transforms.json, as of ``mudg render --path``.
+
+    Raises:
+        UsageError: no such camera or path. InputError: the file holds no path.
+    """
     from mudg.core import trajectory
     from mudg.formats.paths import read_path
 
@@ -186,10 +196,18 @@ class FittedScene:
         return write_mp4(Path(out), (picture.rgb for picture in self.render_path(path)), fps)
 
     def render(self, camera: Camera, world_from_cam: ArrayLike, time_s: float, *, backend: str = "auto") -> Picture:
-        """Render a camera at a pose (rigid 4x4, camera axes x right, y down, z forward) and time (seconds on the
-        scene's clock). Objects stand where they were then; outside their tracks they are absent. backend: ``auto``,
-        ``cpu``, ``torch`` or ``gsplat``. UsageError: not a camera. InputError: the pose is not rigid. ResourceError:
-        the backend is not available."""
+        """Render a camera at a pose and time.
+
+        Args:
+            camera: size and intrinsics in pixels.
+            world_from_cam: rigid 4x4 pose; camera axes x right, y down, z forward.
+            time_s: seconds on the scene's clock. Objects stand where they were then; outside their tracks they are
+                absent.
+            backend: ``auto``, ``cpu``, ``torch`` or ``gsplat``.
+
+        Raises:
+            UsageError: not a camera. InputError: the pose is not rigid. ResourceError: the backend is not available.
+        """
         import torch
 
         from mudg.core.pictures import to_bytes
