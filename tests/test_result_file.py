@@ -125,6 +125,8 @@ def test_files_of_others_and_altered_ones_are_replaced_on_demand_only(
     about = out.with_name(f"{out.name}.json")
     assert command(name, toy)(tmp_path) == 0
     whole, stamp = folder_of(tmp_path), out.stat().st_mtime_ns
+    if name in ("ply", "asset"):
+        assert store.read_json(about)["inputs"] == {"fit": store.digest(toy / "fit")}
     assert command(name, toy)(tmp_path) == 0 and out.stat().st_mtime_ns == stamp
     if (other := COMMANDS[name][2]) != "--overwrite":
         assert command(name, toy, other)(tmp_path) == 2 and "the file exists" in capsys.readouterr().err

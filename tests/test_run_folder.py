@@ -182,10 +182,14 @@ def test_the_old_result_stands_until_the_new_one_is_finished(tmp_path: Path) -> 
     assert ".part" not in "".join(contents(folder).values())
 
 
-def test_a_finished_result_of_the_same_settings_is_reused_with_overwrite_too(tmp_path: Path) -> None:
+@pytest.mark.parametrize("altered", ["out.txt", "run.json"])
+def test_a_finished_result_is_reused_with_overwrite_too_and_an_altered_one_made_again(
+    tmp_path: Path, altered: str
+) -> None:
     folder = finished(tmp_path / "r").path
     assert run(folder, overwrite=True).complete
-    (folder / "out.txt").write_text("altered")
+    text = (folder / altered).read_text()
+    (folder / altered).write_text(text.replace('"value": 1', '"value": 2').replace("result 1", "altered"))
     refused("--overwrite", run, folder, raises=IntegrityError)
     assert finished(folder, overwrite=True).path == folder and (folder / "out.txt").read_text() == "result 1"
 
