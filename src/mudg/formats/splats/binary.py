@@ -140,11 +140,11 @@ def morton_order(means: NDArray[np.floating]) -> NDArray[np.intp]:
     cells = ((means.astype(np.float64) - low) / span * ((1 << 21) - 1)).astype(np.uint64)
     key = np.zeros(len(means), np.uint64)
     for axis in range(3):
-        key |= _spread(cells[:, axis]) << np.uint64(axis)
+        key |= with_gaps(cells[:, axis]) << np.uint64(axis)
     return np.argsort(key, kind="stable")
 
 
-def _spread(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
+def with_gaps(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """Two zero bits after every bit of 21."""
     v = bits
     for shift, mask in (
