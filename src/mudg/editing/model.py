@@ -614,45 +614,6 @@ def continued(xy: Array, places: Array, colors: Array, weights: Array) -> tuple[
     return found, np.asarray(KDTree(places).query(xy)[1], np.int64)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Cells:
-    """A grid of square cells of `SHADOW_CELL_M` on the ground: the place f64[2] of its first corner, and how many cells
-    it has."""
-
-    low: Array
-    shape: tuple[int, int]
-
-    def index(self, xy: Array) -> NDArray[np.int64]:
-        """Cells i64[N, 2] in which places f64[N, 2] lie, or would lie beyond the grid."""
-        return np.floor((xy - self.low) / SHADOW_CELL_M).astype(np.int64)
-
-    def below(self, size_m: Sequence[float], poses: Array) -> Rows:
-        """Cells bool[X, Y] below boxes."""
-        cells = np.stack(np.meshgrid(*map(np.arange, self.shape), indexing="ij"), -1).reshape(-1, 2)
-        centres, half = self.low + (cells + 0.5) * SHADOW_CELL_M, np.array(size_m[:2]) / 2
-        found = np.zeros(len(centres), bool)
-        for pose in poses:
-            yaw = geometry.yaw_of(pose)
-            turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-            found |= (np.abs((centres - pose[:2, 3]) @ turn) <= half).all(1)
-        return found.reshape(self.shape)
-
-    def at(self, xy: Array, cells: Rows) -> Rows:
-        """Which places f64[N, 2] lie in chosen cells."""
-        index = self.index(xy)
-        inside = ((index >= 0) & (index < self.shape)).all(1)
-        found = np.zeros(len(xy), bool)
-        found[inside] = cells[tuple(index[inside].T)]
-        return found
-
-    def light(self, xy: Array, luminance: Array, weights: Array) -> Array:
-        """Weighted mean luminance f64[X, Y] of the places near each cell; NaN where there are none."""
-        flat, count = np.ravel_multi_index(tuple(self.index(xy).T), self.shape), int(np.prod(self.shape))
-        sums = [np.bincount(flat, values, count).reshape(self.shape) for values in (weights, weights * luminance)]
-        total, shown = (ndimage.gaussian_filter(values, 0.7, truncate=2.0) for values in sums)
-        return np.where(total > LEAST_PX, shown / np.maximum(total, 1e-12), np.nan)
-
-
 def shaded_cells(light: Array, below: Rows, reach_m: float) -> Rows:
     """Cells bool[X, Y] of the shadow of what stood on some: those darker than lit ground about them that lie behind it,
     and behind each other, in one direction: the one in which there are most. ``light``: luminance f64[X, Y] in linear
@@ -689,28 +650,44 @@ def _brightened(model: SceneModel, one: Hidden) -> SceneModel:
     reach = REACH * size_m[2]
     around = reach + AROUND_M + float(np.linalg.norm(size_m[:2])) / 2
     low = np.floor((poses[:, :2, 3].min(0) - around) / SHADOW_CELL_M) * SHADOW_CELL_M
-    count = np.ceil((poses[:, :2, 3].max(0) + around - low) / SHADOW_CELL_M).astype(int)
-    cells = _Cells(low, (int(count[0]), int(count[1])))
-    below, here = cells.below(size_m, poses), cells.at(means, np.ones(cells.shape, bool))
+    shape = tuple(np.ceil((poses[:, :2, 3].max(0) + around - low) / SHADOW_CELL_M).astype(int))
+    below = _below(size_m, poses, low, shape)
+    index = np.floor((means - low) / SHADOW_CELL_M).astype(np.int64)
+    here = still_rows(model) & ((index >= 0) & (index < shape)).all(1)
+    cell = np.ravel_multi_index(tuple(index.T), shape, mode="clip")
     colors = model.table["sh_dc"].detach().clone()
     for number in GROUND_CLASSES:
-        rows = still_rows(model) & (ids == number)
-        near = rows & here & (weights > 0)
+        rows = here & (ids == number)
+        near = rows & (weights > 0)
         if near.sum() < LEAST_ROWS:
             continue
-        light = cells.light(means[near], luminance[near], weights[near])
+        sums = [np.bincount(cell[near], values[near], below.size) for values in (weights, weights * luminance)]
+        total, seen = (ndimage.gaussian_filter(values.reshape(shape), 0.7, truncate=2.0) for values in sums)
+        light = np.where(total > LEAST_PX, seen / np.maximum(total, 1e-12), np.nan)
         wide = np.asarray(ndimage.binary_dilation(shaded_cells(light, below, reach), iterations=EDGE_CELLS), np.bool_)
-        shaded, lit = np.flatnonzero(rows & cells.at(means, wide)), near & ~cells.at(means, wide | below)
+        shaded, lit = np.flatnonzero(rows & wide.ravel()[cell]), near & ~(wide | below).ravel()[cell]
         if not len(shaded) or lit.sum() < LEAST_ROWS:
             continue
         target = linear_of(continued(means[shaded], means[lit], shown[lit], weights[lit])[0])
-        usual = light[tuple(cells.index(means[shaded]).T)]
+        usual = light.ravel()[cell[shaded]]
         usual = np.where(np.isfinite(usual), usual, luminance[shaded])  # what no view shows has no texture
         texture = (luminance[shaded] / np.maximum(usual, 1e-4)).clip(1 / TEXTURE, TEXTURE)
         darker = luminance[shaded] < target @ LUMINANCE / TEXTURE
         values = ((display_of(target * texture[:, None]) - 0.5) / SH_C0)[darker]
         colors[torch.from_numpy(shaded[darker]).to(model.device), 0] = torch.from_numpy(values).to(colors)
     return changed(model, {"sh_dc": colors})
+
+
+def _below(size_m: Sequence[float], poses: Array, low: Array, shape: tuple[int, ...]) -> Rows:
+    """Cells bool[X, Y] of `SHADOW_CELL_M` below boxes; ``low``: the place f64[2] of their first corner."""
+    cells = np.stack(np.indices(shape), -1).reshape(-1, 2)
+    centres, half = low + (cells + 0.5) * SHADOW_CELL_M, np.array(size_m[:2]) / 2
+    found = np.zeros(len(centres), bool)
+    for pose in poses:
+        yaw = geometry.yaw_of(pose)
+        turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+        found |= (np.abs((centres - pose[:2, 3]) @ turn) <= half).all(1)
+    return found.reshape(shape)
 
 
 # -- sides -----------------------------------------------------------------------------------------

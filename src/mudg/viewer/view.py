@@ -43,7 +43,6 @@ from mudg.editing.apply import (
     weather_of,
 )
 from mudg.editing.model import motion_of
-from mudg.editing.plan import EditPlan
 from mudg.editing.render import RenderMixer, check_as_recorded
 from mudg.editing.runs import RunParts, find_run
 from mudg.editing.script import EditScript, conditions_of, parse_edits, read_edits
@@ -290,16 +289,15 @@ class EditDesk:
         drive = self._carried(text)
         with self._making:
             if text not in self._made:
-                made = [drive.model(model, street=self._street(model, drive.plan)) for model in self.models]
+                made = list[SceneModel]()
+                for model in self.models:  # closing a street takes seconds, and an object is moved many times
+                    key = (id(model), *left_behind(model, drive.plan))
+                    if key not in self._streets:
+                        kept = _last(self._streets, STREETS * len(self.models) - 1)
+                        self._streets = {**kept, key: street_left(model, drive.plan)}
+                    made.append(drive.model(model, street=self._streets[key]))
                 self._made = {**_last(self._made, KEPT - 1), text: made}
             return self._made[text]
-
-    def _street(self, model: SceneModel, plan: EditPlan) -> SceneModel:
-        """What ``street_left`` makes, kept: closing a street takes seconds, and an object is moved many times."""
-        key = (id(model), *left_behind(model, plan))
-        if key not in self._streets:
-            self._streets = {**_last(self._streets, STREETS * len(self.models) - 1), key: street_left(model, plan)}
-        return self._streets[key]
 
     def _carried(self, text: str) -> EditedDrive:
         """A script carried out on all but the fits; quick."""
