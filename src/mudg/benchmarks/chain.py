@@ -42,7 +42,7 @@ from mudg.steps.pipeline import WITHOUT_DIFFUSION, fits_of
 from mudg.steps.render import RenderViews
 from mudg.steps.settings import PresetName
 from mudg.steps.synthesize import Synthesize
-from mudg.viewer.report import FPS, panel_grid, panel_size
+from mudg.viewer.report import FPS, PANEL_WIDTH, panel_grid, panel_size
 
 PAGES: Final = ("bench.json", "bench.md")
 
@@ -264,7 +264,6 @@ class FillViews(Output):
         return self.key_settings()
 
 
-PANEL_WIDTH: Final = 320
 QUALITY: Final = (29, 41)
 VIDEO_BYTES: Final = 900 * 1024
 """A video larger than this is made anew in lower quality: eight logs of seven trajectories stay under 60 MB."""
@@ -308,7 +307,7 @@ def _frames(
     sets: Mapping[str, ObservationSet], order: Sequence[str], frames: Sequence[int]
 ) -> Iterator[NDArray[np.uint8]]:
     camera = next(iter(sets.values())).views[0].camera
-    size = panel_size(camera.width, camera.height, PANEL_WIDTH)
+    size = panel_size(camera.width, camera.height)
     rows = [row for row in ROWS if row != "error" or "truth" in sets]
     for frame in frames:
         seen = {column: sets[column][frame] if column in sets else None for column in order}

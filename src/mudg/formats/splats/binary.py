@@ -138,11 +138,16 @@ def morton_order(means: NDArray[np.floating]) -> NDArray[np.intp]:
     low = means.min(0).astype(np.float64)
     span = np.maximum(means.max(0).astype(np.float64) - low, 1e-9)
     cells = ((means.astype(np.float64) - low) / span * ((1 << 21) - 1)).astype(np.uint64)
+    key = with_gaps(cells) << np.arange(3, dtype=np.uint64)
+    return np.argsort(np.bitwise_or.reduce(key, axis=1), kind="stable")
+
+
+def with_gaps(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Two zero bits after every bit of 21."""
     masks = (0x1F00000000FFFF, 0x1F0000FF0000FF, 0x100F00F00F00F00F, 0x10C30C30C30C30C3, 0x1249249249249249)
-    for shift, mask in zip((32, 16, 8, 4, 2), masks):  # two zero bits after every bit of 21
-        cells = (cells | cells << np.uint64(shift)) & np.uint64(mask)
-    key = cells[:, 0] | cells[:, 1] << np.uint64(1) | cells[:, 2] << np.uint64(2)
-    return np.argsort(key, kind="stable")
+    for shift, mask in zip((32, 16, 8, 4, 2), masks):
+        bits = (bits | bits << np.uint64(shift)) & np.uint64(mask)
+    return bits
 
 
 def smallest_three(quats: Floats) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
