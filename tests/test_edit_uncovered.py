@@ -14,7 +14,6 @@ from mudg.base import geometry
 from mudg.base.palette import ID
 from mudg.base.types import Camera, View
 from mudg.core.edit import Motion
-from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
 from mudg.editing.apply import complete_asset, hidden_by
 from mudg.editing.model import SHOWN, Hidden, continued, noted, shaded_cells, with_closed_sides, without_traces
@@ -27,7 +26,6 @@ from mudg.gaussians.start import SH_C0
 SIZE = (4.0, 2.0, 1.5)
 CAMERA = Camera("front", 120, 80, 90.0, 90.0, 60.0, 40.0)
 FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-RASTER = RasterConfig(near_m=0.2)
 LIT, SHADED, CAR = 0.55, 0.3, 0.1
 CLASSES = (ID["road"], ID["building"], ID["car"])
 
@@ -88,8 +86,8 @@ def street(actor: Actor, grey: np.ndarray | float = LIT, buildings=NONE, spots=N
 
 def cleared(model: SceneModel, actor: Actor, views: list[View]) -> SceneModel:
     """The street after the car was removed."""
-    known = noted(model, views, RASTER)
-    return without_traces(known.without_nodes(["car"]), {"car": hidden_by(actor, views)}, views, RASTER)
+    known = noted(model, views)
+    return without_traces(known.without_nodes(["car"]), {"car": hidden_by(actor, views)}, views)
 
 
 def grey_of(model: SceneModel) -> np.ndarray:
@@ -231,8 +229,8 @@ def test_a_scene_without_ground_or_views_stays() -> None:
     actor, views = lead()
     for road, seen in ((np.zeros((4, 3)), views), (ROAD, [])):
         hidden = {"car": hidden_by(actor, seen)}
-        model = noted(street(actor, road=road), seen, RASTER)
-        made = without_traces(model, hidden, seen, RASTER)
+        model = noted(street(actor, road=road), seen)
+        made = without_traces(model, hidden, seen)
         assert len(made.table) == len(model.table) and torch.equal(made.table["sh_dc"], model.table["sh_dc"])
     assert isinstance(hidden_by(actor, []), Hidden)
 
@@ -268,7 +266,7 @@ def made_sides(before: SceneModel, after: SceneModel) -> tuple[np.ndarray, np.nd
 
 def test_flanks_continue_the_colours_of_the_rear() -> None:
     model = behind()
-    places, colors = made_sides(model, with_closed_sides(model, ["car"], VIEWS, RASTER))
+    places, colors = made_sides(model, with_closed_sides(model, ["car"], VIEWS))
     assert set(np.sign(places[:, 1])) == {-1.0, 1.0} and np.abs(places[:, 1]).max() <= NARROW[1] / 2
     assert places[:, 0].min() < -1.6 and places[:, 0].max() > 1.8
     low, high = places[:, 2] < -0.2, places[:, 2] > 0.2
@@ -280,10 +278,10 @@ def test_flanks_continue_the_colours_of_the_rear() -> None:
 
 def test_only_gaps_of_vehicles_are_closed() -> None:
     model = behind(flank=0.84)
-    places, _ = made_sides(model, with_closed_sides(model, ["car"], VIEWS, RASTER))
+    places, _ = made_sides(model, with_closed_sides(model, ["car"], VIEWS))
     assert len(places) and (places[:, 1] < 0).all()  # the left flank is there
     person = behind("pedestrian")
-    assert with_closed_sides(person, ["car"], VIEWS, RASTER) is person
+    assert with_closed_sides(person, ["car"], VIEWS) is person
 
 
 def test_what_views_show_is_not_made_up() -> None:
@@ -292,7 +290,7 @@ def test_what_views_show_is_not_made_up() -> None:
     beside = [View(CAMERA, pose, float(t)) for pose, t in zip(poses, TIMES, strict=True)]
 
     def right(views: Sequence[View]) -> int:
-        return int((made_sides(model, with_closed_sides(model, ["car"], views, RASTER))[0][:, 1] < 0).sum())
+        return int((made_sides(model, with_closed_sides(model, ["car"], views))[0][:, 1] < 0).sum())
 
     assert right([*VIEWS, *beside]) < 0.2 * right(VIEWS)  # the right flank was seen to be empty; measured: 0
 
