@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from refusals import refused
 
 from mudg.base import config as configuration
 from mudg.base import geometry
@@ -162,5 +163,4 @@ def test_when_it_is_due_and_a_wrong_kind_is_refused(tmp_path):
     assert due == list(range(10, 101, 10))
     assert not any(SETTINGS.reset_due(step) for step in range(1, 130))
     (tmp_path / "fit.yaml").write_text("densify: {kind: mcm}\n")
-    with pytest.raises(UsageError, match="'gradient' or 'none'"):
-        configuration.load(FitConfig, None, tmp_path / "fit.yaml")
+    refused("'gradient' or 'none'", configuration.load, FitConfig, None, tmp_path / "fit.yaml", raises=UsageError)

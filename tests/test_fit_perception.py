@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from refusals import refused
 from test_score_metrics import lpips_state
 
 from mudg.base import store
@@ -56,8 +57,7 @@ def test_every_eye_sees_equality_differences_and_confidence(name, tmp_path):
 
 
 def test_lpips_without_or_with_other_weights_is_refused(tmp_path):
-    with pytest.raises(UsageError, match="weight file"):
-        perception_of(VirtualConfig(perception="lpips"))
+    refused("weight file", perception_of, VirtualConfig(perception="lpips"), raises=UsageError)
     store.write_safetensors(tmp_path / "other.safetensors", {"x": torch.zeros(3).numpy()})
     with pytest.raises(InputError, match="not the network it should be"):
         perception_of(VirtualConfig(perception="lpips", lpips_weights=str(tmp_path / "other.safetensors")))

@@ -347,9 +347,9 @@ def test_settling_removes_noise_and_leaves_a_clean_track_alone():
 # ---- deformable ----------------------------------------------------------------------------------
 
 
-def walker(label: str = "pedestrian") -> nodes.DeformableNode:
+def walker() -> nodes.DeformableNode:
     keys = np.stack([pose(0.1 * n, 0, 0.9, 0.0) for n in range(5)])
-    node = nodes.object_node(Track("p", label, [0.8, 0.6, 1.8], 0.1 * np.arange(5), keys), deformable=True)
+    node = nodes.object_node(Track("p", "pedestrian", [0.8, 0.6, 1.8], 0.1 * np.arange(5), keys), deformable=True)
     assert isinstance(node, nodes.DeformableNode)
     return node
 

@@ -284,7 +284,7 @@ class FactMaker:
     """Makes the facts of views; threads may call."""
 
     def __init__(self, scene: Scene) -> None:
-        self._scene, self._points, self._vehicles = scene, LogPoints(scene), vehicles_of(scene)
+        self._scene, self._points, self.vehicles = scene, LogPoints(scene), vehicles_of(scene)
         self._path = driven_path(scene.ego.world_from_ego)
 
     def of(self, view: View, truth: ViewTruth | None) -> ViewFacts:
@@ -293,7 +293,7 @@ class FactMaker:
         frame = next(near, None)  # what the view's camera recorded at its time
         points = self._points.truth_at(view, frame)
         if truth is not None and truth.instance is not None:
-            agents, seen, lanes = visible_agents(view, self._vehicles, truth.instance), truth.seen, None
+            agents, seen, lanes = visible_agents(view, self.vehicles, truth.instance), truth.seen, None
             if truth.marking is not None and seen.semantics is not None and seen.depth is not None:
                 depth = seen.depth[0].numpy()
                 road = (seen.semantics.numpy() == palette.ID["road"]) & (depth > 0) & (depth < street_scores.LANE_FAR_M)
@@ -381,21 +381,23 @@ class ScoredTrajectory:
         return {**names, **sizes, "methods": list(self.sets), "indices": indices}
 
 
-@dataclass(frozen=True)
 class Reference:
-    """What every method is compared with, and how. ``truth``, ``baseline``: of any view. ``held_out``: ids of the
-    recorded frames that count. ``distances``: what computes the rows of the table that need weights, at
-    ``distance_views`` views of a trajectory (0 = all). ``facts``: makes what is known of views beside their true image.
-    ``vehicles``: numbers in instance maps, and their tracks."""
+    """What every method is compared with, and how. ``truth``, ``baseline``: of any view. ``distances``: what computes
+    the rows of the table that need weights, at ``distance_views`` views of a trajectory (0 = all). ``held_out``: ids of
+    the recorded frames that count. ``facts``: makes what is known of views beside their true image."""
 
-    truth: Truth
-    baseline: Baseline | None
-    held_out: frozenset[str]
-    error_pictures: bool
-    distances: Mapping[str, PairDistance]
-    distance_views: int
-    facts: FactMaker
-    vehicles: tuple[tuple[int, Track], ...]
+    def __init__(
+        self,
+        config: ScoreConfig,
+        scene: Scene,
+        truth: Truth,
+        baseline: Baseline | None,
+        distances: Mapping[str, PairDistance],
+    ) -> None:
+        self.truth, self.baseline, self.distances = truth, baseline, distances
+        self.error_pictures, self.distance_views = config.error_pictures, config.perceptual_views
+        self.held_out = frozenset(frame.id for frame in scene.frames_in("test") or scene.frames)
+        self.facts = FactMaker(scene)
 
     def counted(self, trajectory: ScoredTrajectory) -> list[int]:
         """The views that count. Recorded training frames were seen by the fit and do not; views off the path never
