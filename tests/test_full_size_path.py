@@ -14,7 +14,7 @@ from test_score_metrics import lpips_state
 from toy_published import TINY, tiny_checkpoint
 
 from mudg.base import store
-from mudg.diffusion import model_files
+from mudg.diffusion import convert, model_files
 from mudg.scene.observations import list_observation_sets, read_observations
 from mudg.steps.settings import PRESETS
 
@@ -63,9 +63,14 @@ def test_from_a_published_checkpoint_to_a_table_of_the_paper(mudg, tmp_path):
     mudg(f"learn --start one/model {frozen} {training} --out two")
     one, two = (model_files.load_published(tmp_path / name / "model") for name in ("one", "two"))
     assert ((one.config.width, one.config.height), (two.config.width, two.config.height)) == ((32, 32), (36, 32))
-    before, after = (model.trained_part().state_dict() for model in (one, two))
-    unchanged = {name for name in before if torch.equal(before[name], after[name])}
-    assert unchanged == two.temporal_parameters("transformers")
+    first, before, after = (model.float().state_dict() for model in (start, one, two))
+    moved = lambda old, new: {name for name in old if not torch.equal(old[name], new[name])}
+    trained = set(two.trained_part().state_dict())
+    assert moved(first, before) == trained  # stage 1 moves all of the network, stage 2 not the temporal transformers
+    assert moved(before, after) == trained - two.temporal_parameters("transformers") < trained
+    assert not torch.equal(after["net.label.0.weight"], after["net.time.0.weight"])
+    assert torch.equal(two.schedule.scale, start.schedule.scale)
+    assert (tmp_path / "two" / "model" / "MODEL_CARD.md").read_text().rstrip().endswith(convert.LICENCE)
 
     sampling = "--model two/model --steps 50 --overlap 2 --shifts-m 2 --no-full-size"
     mudg(f"synthesize log/scene --fused log/fuse {sampling} --out virtual")

@@ -86,36 +86,29 @@ def neighbours(x: np.ndarray, reduce) -> np.ndarray:
     return np.stack([np.stack([reduce(window, axis=(1, 2)) for window in row], -1) for row in rows], -2)
 
 
-@pytest.mark.parametrize(("name", "pool"), [("Mixed_7b", np.mean), ("Mixed_7c", np.max)])
-def test_the_last_blocks_against_a_twin_in_numpy(network, state, name: str, pool) -> None:
-    width = 1280 if name == "Mixed_7b" else 2048
-    x = torch.rand(1, width, 3, 4, generator=torch.Generator().manual_seed(1))
-    of = lambda y, unit: convolved(y, state, f"{name}.{unit}")
-    one = x[0].double().numpy()
-    middle = of(one, "branch3x3_1")
-    double = of(of(one, "branch3x3dbl_1"), "branch3x3dbl_2")
-    ends = [of(middle, f"branch3x3_2{k}") for k in "ab"] + [of(double, f"branch3x3dbl_3{k}") for k in "ab"]
-    expected = np.concatenate([of(one, "branch1x1"), *ends, of(neighbours(one, pool), "branch_pool")])
-    assert np.abs(network.block(name, x)[0].numpy() - expected).max() < 1e-4 * np.abs(expected).max()
+def units(branch: str, count: int) -> list[str]:
+    return [f"{branch}_{number}" for number in range(1, count + 1)]
 
 
-@pytest.mark.parametrize(("name", "pool"), [("Mixed_5c", np.mean), ("Mixed_6d", np.mean)])
-def test_the_order_of_branches_and_the_pools_of_earlier_blocks(network, state, name: str, pool) -> None:
-    width = 256 if name == "Mixed_5c" else 768
-    one = np.random.default_rng(2).random((width, 5, 4))
+ENDS = [(["branch3x3_1"], "branch3x3_2"), (units("branch3x3dbl", 2), "branch3x3dbl_3")]
+BRANCHES = {
+    "Mixed_5c": (256, np.mean, [units("branch5x5", 2), units("branch3x3dbl", 3)]),
+    "Mixed_6d": (768, np.mean, [units("branch7x7", 3), units("branch7x7dbl", 5)]),
+    "Mixed_7b": (1280, np.mean, [[*chain, f"{last}{end}"] for chain, last in ENDS for end in "ab"]),
+    "Mixed_7c": (2048, np.max, [[*chain, f"{last}{end}"] for chain, last in ENDS for end in "ab"]),
+}
+"""Channels in, what pools, and the units of the branches between the first and the pool's."""
 
-    def chain(y: np.ndarray, *units: str) -> np.ndarray:
-        for unit in units:
-            y = convolved(y, state, f"{name}.{unit}")
-        return y
 
-    if name == "Mixed_5c":
-        lengths = {"branch5x5": 2, "branch3x3dbl": 3}
-    else:
-        lengths = {"branch7x7": 3, "branch7x7dbl": 5}
-    branches = [[f"{branch}_{n + 1}" for n in range(count)] for branch, count in lengths.items()]
-    chains = [chain(one, *branch) for branch in (["branch1x1"], *branches)]
-    expected = np.concatenate([*chains, chain(neighbours(one, pool), "branch_pool")])
+@pytest.mark.parametrize("name", BRANCHES)
+def test_blocks_against_a_twin_in_numpy(network, state, name: str) -> None:
+    width, pool, chains = BRANCHES[name]
+    one, parts = np.random.default_rng(2).random((width, 3, 4)), []
+    for chain in (["branch1x1"], *chains):
+        parts.append(one)
+        for unit in chain:
+            parts[-1] = convolved(parts[-1], state, f"{name}.{unit}")
+    expected = np.concatenate([*parts, convolved(neighbours(one, pool), state, f"{name}.branch_pool")])
     found = network.block(name, torch.from_numpy(one).float()[None])[0].numpy()
     assert np.abs(found - expected).max() < 1e-4 * np.abs(expected).max()
 

@@ -20,7 +20,7 @@ from mudg.base.errors import NumericsError, UsageError
 from mudg.diffusion import learn, model_files, models, parallel
 from mudg.diffusion.clips import ShardFolder, class_weights
 from mudg.diffusion.model import MDM, BatchPart
-from mudg.diffusion.parallel import Ranks, TrainingState
+from mudg.diffusion.parallel import Ranks
 from mudg.steps.synthesize import Learn
 
 SAME = 2e-6
@@ -33,52 +33,6 @@ ALONE = Ranks(0, 1, torch.device("cpu"))
 @pytest.fixture(scope="module")
 def clips(tmp_path_factory):
     return write_clips(tmp_path_factory.mktemp("clips"))
-
-
-def environment():
-    here = Path(__file__).parent
-    paths = os.pathsep.join([str(here), *sys.path])
-    return os.environ | {"PYTHONPATH": paths, "GLOO_SOCKET_IFNAME": "lo", "OMP_NUM_THREADS": "1"}
-
-
-@pytest.mark.slow
-def test_a_run_may_go_on_in_another_number_of_processes(clips, tmp_path):
-    common = {"batch_frames": 8, "log_every": 1, "checkpoint_every": 100, "steps": 6}
-    Learn(out=tmp_path / "whole", settings=tiny(clips, **common)).run()
-
-    stop = TrainingState.blend
-
-    def stop_after_two(state, decay):
-        stop(state, decay)
-        if state.step == 2:
-            state.save(tmp_path / "parts" / "steps", ALONE, {})
-            raise KeyboardInterrupt
-
-    TrainingState.blend = stop_after_two
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            Learn(out=tmp_path / "parts", settings=tiny(clips, **common)).run()
-    finally:
-        TrainingState.blend = stop
-    both_run("learn_together.py", tmp_path / "store", clips, tmp_path)
-    said = [json.loads((tmp_path / f"said_{rank}.json").read_text()) for rank in (0, 1)]
-    for words in said:  # one process was asked to stop, both did; one had numbers that are not finite, both say so
-        assert words["stopped"] and "divided evenly" in words["uneven"]
-        assert "step" in words["numerics"] and "of 2" in words["numerics"]
-    saved = checkpoint.latest(tmp_path / "parts" / "steps")
-    assert saved is not None and saved.step == 5 and saved.state["processes"] == 2
-    parts = Learn(out=tmp_path / "parts", settings=tiny(clips, **common)).run()
-
-    assert_same_training(tmp_path / "whole", parts.parent, (3, 4, 5, 6), model_files.load)
-
-
-def both_run(script, *arguments):
-    """Runs a script of this folder in two processes, given their ranks."""
-    words = [sys.executable, str(Path(__file__).with_name(script))]
-    how = {"env": environment(), "stderr": subprocess.PIPE, "text": True}
-    both = [subprocess.Popen([*words, str(rank), *map(str, arguments)], **how) for rank in (0, 1)]
-    errors = [process.communicate(timeout=540)[1] for process in both]
-    assert [process.returncode for process in both] == [0, 0], "\n".join(errors)
 
 
 def assert_same_losses(one, other, steps):
@@ -96,22 +50,37 @@ def assert_same_training(one, other, steps, load):
         torch.testing.assert_close(first[name], second[name], rtol=2e-3, atol=2e-5)
 
 
-def torchrun(processes, clips, out, fault="", restarts=0, **changes):
+def torchrun(processes, config, out, fault="", restarts=0):
     """Command and environment of a training by torch's launcher, with a fault (see `learn_on_nodes.py`)."""
-    usual = {"steps": STEPS, "batch_frames": 16, "checkpoint_every": 2, "log_every": 1}
     recipe = out.with_suffix(".yaml")
-    recipe.write_text(dump_yaml(tiny(clips, **usual | changes)))
+    recipe.write_text(dump_yaml(config))
     command = [sys.executable, *"-m torch.distributed.run --rdzv-backend c10d --nnodes 1".split()]
     command += ["--rdzv-endpoint", "127.0.0.1:0", "--max-restarts", str(restarts), "--nproc-per-node", str(processes)]
     command += [str(Path(__file__).with_name("learn_on_nodes.py")), "learn", "--config", str(recipe), "--out", str(out)]
-    return command, environment() | {"FAULT": fault, "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}
+    paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    own = {"PYTHONPATH": paths, "GLOO_SOCKET_IFNAME": "lo", "OMP_NUM_THREADS": "1", "FAULT": fault}
+    return command, os.environ | own | {"TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}
+
+
+def learn_in(processes, config, out, fault="", restarts=0, *, ends_well=True):
+    """Trains in several processes; what they said."""
+    command, variables = torchrun(processes, config, out, fault, restarts)
+    done = subprocess.run(command, env=variables, capture_output=True, text=True, timeout=500)
+    said = done.stdout + done.stderr
+    assert (done.returncode == 0) is ends_well, said
+    return said
+
+
+def eight_steps(clips, **changes):
+    usual = {"steps": STEPS, "batch_frames": 16, "checkpoint_every": 2, "log_every": 1}
+    return tiny(clips, **usual | changes)
 
 
 @pytest.mark.slow
 def test_ctrl_c_under_torchrun_saves_the_step(clips, tmp_path):
     """The terminal sends the signal to all processes, and the launcher sends it on once more."""
     out = tmp_path / "out"
-    command, variables = torchrun(2, clips, out, steps=5000, checkpoint_every=5000)
+    command, variables = torchrun(2, eight_steps(clips, steps=5000, checkpoint_every=5000), out)
     process = subprocess.Popen(command, env=variables, start_new_session=True, stderr=subprocess.PIPE, text=True)
     try:
         deadline = time.monotonic() + 500
@@ -133,24 +102,23 @@ def test_ctrl_c_under_torchrun_saves_the_step(clips, tmp_path):
 
 @pytest.mark.slow
 def test_two_processes_then_one_then_four(clips, tmp_path):
-    def run(processes, out, fault="", restarts=0):
-        command, variables = torchrun(processes, clips, out, fault, restarts)
-        done = subprocess.run(command, env=variables, capture_output=True, text=True, timeout=500)
-        said = done.stdout + done.stderr
-        assert (done.returncode == 0) is not fault.startswith("warn"), said
-        return said
-
     whole, killed, changed = (tmp_path / name for name in ("whole", "killed", "changed"))
-    run(1, whole)
-    assert "resuming at step 2" in run(2, killed, "kill:3:1", 1)  # killed in step 4, resumed after step 2
+    config = eight_steps(clips)
+    learn_in(1, config, whole)
+    said = learn_in(2, config, killed, "kill:3:1", 1)
+    assert "resuming at step 2" in said  # killed in step 4, resumed after step 2
     assert_same_losses(whole, killed, range(1, STEPS + 1))
-    said = [run(2, changed, "warn:2:1"), run(1, changed, "warn:4:0"), run(4, changed)]
+    warned = ((2, "warn:2:1"), (1, "warn:4:0"))  # one process is asked to stop, all do
+    said = [learn_in(count, config, changed, fault, ends_well=False) for count, fault in warned]
+    said.append(learn_in(4, config, changed))
     assert ["143" in text for text in said[:2]] == [True, True]
     assert [re.findall(r"resuming at step (\d+)", text) for text in said] == [[], ["3"], ["5"]]
     assert set(re.findall(r"checkpoint of step (\d+)", "\n".join(said))) == {"2", "3", "4", "5", "6", "8"}
-    assert_same_losses(whole, changed, range(1, STEPS + 1))
+    assert_same_training(whole, changed, range(1, STEPS + 1), model_files.load)
     assert sorted(p.name for p in (changed / "steps").iterdir()) == ["step_00000006", "step_00000008"]
     assert checkpoint.latest(changed / "steps").state["processes"] == 4
+    said = learn_in(2, eight_steps(clips, lr=1e30, steps=20), tmp_path / "numerics", ends_well=False)
+    assert re.search(r"step \d+, process [01, ]+ of 2", said)  # both say so
 
 
 def test_draws_do_not_depend_on_the_part_of_a_batch(clips):
@@ -197,9 +165,8 @@ def test_clips_are_shared_evenly_or_not_at_all_and_bad_terms_are_named():
 
 
 def test_what_repeats_is_recomputed():
-    first, second, outer = (
-        nn.Sequential(nn.Linear(2, 2), nn.ModuleList([nn.Sequential(nn.Linear(2, 2))])) for _ in range(3)
-    )
+    block = lambda: nn.Sequential(nn.Linear(2, 2), nn.ModuleList([nn.Sequential(nn.Linear(2, 2))]))
+    first, second, outer = block(), block(), block()
     part = nn.Sequential(nn.Linear(2, 2), nn.ModuleList([nn.ModuleList([first, second]), nn.Linear(2, 2), outer]))
     assert parallel.recompute(part) == 3
     assert [m for m in part.modules() if "forward" in vars(m)] == [first, second, outer]

@@ -6,15 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_learn_parallel import SAME, assert_same_training, both_run
-from toy_clips import write_clips
+from test_learn_parallel import SAME, assert_same_training, learn_in
+from toy_clips import with_settings, write_clips
 from toy_published import published_settings, write_tiny
 from toy_scene import ToyStreet
 
 from mudg.base import palette
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Condition
-from mudg.diffusion import city_clips, convert, learn, log_clips, model_files, models
+from mudg.diffusion import city_clips, learn, log_clips, model_files, models
 from mudg.diffusion import clips as clip_shards
 from mudg.diffusion.condition import ConditionRules, DriveInputs, build_conditions
 from mudg.diffusion.log_clips import LogClipRules, LogSource
@@ -64,35 +64,6 @@ def corners(settings, clips, *draw):
     return [corner(clip) for clip in learn.clips_of_cities(settings, clips, points_alone=True).draw(*draw)]
 
 
-@pytest.mark.slow
-def test_two_stages_from_a_converted_model(converted, clips, tmp_path):
-    """Stage 1 moves all of the network; stage 2, larger, all but the temporal transformers."""
-    one = Learn(out=tmp_path / "one", settings=published_settings(converted, clips, steps=1, batch_frames=4)).run()
-    large = write_clips(tmp_path / "large", 36, 32, points=True)
-    config = published_settings(
-        one, large, width=36, height=32, frozen="temporal_transformers", steps=1, batch_frames=4
-    )
-    begun, fresh = models.starting_model(config)
-    first, start = (model_files.load_published(folder).state_dict() for folder in (converted, one))
-    assert not fresh
-    assert all(torch.equal(value, start[name]) for name, value in begun.state_dict().items())  # the modality label too
-    two = Learn(out=tmp_path / "two", settings=config).run()
-    last = model_files.load_published(two)
-    end = last.state_dict()
-    trained = {name for name in first if name.startswith(("net.", "image_tokens."))}
-    temporal = begun.temporal_parameters("transformers")
-    assert {name for name in first if not torch.equal(first[name], start[name])} == trained
-    assert {name for name in first if not torch.equal(start[name], end[name])} == trained - temporal
-    assert temporal and not any(name.startswith("net.first.") or ".res" in name for name in temporal)
-    for state in (start, end):  # learnt, and never that of the noise step
-        assert not torch.equal(state["net.label.0.weight"], first["net.label.0.weight"])
-        assert not torch.equal(state["net.label.0.weight"], state["net.time.0.weight"])
-    assert (last.config.width, last.config.height) == (36, 32)
-    assert torch.equal(last.schedule.scale, model_files.load_published(converted).schedule.scale)
-    assert (two / "MODEL_CARD.md").read_text().rstrip().endswith(convert.LICENCE)
-    assert json.loads((two.parent / "metrics.json").read_text())["clips"] == 1
-
-
 def test_the_card_of_a_trained_model_says_how_it_was_trained(begun, clips, monkeypatch):
     settings, model = begun
     monkeypatch.setattr(models, "table", lambda scores: "a table")
@@ -127,10 +98,8 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(begun, clips):
 def test_unknown_truth_has_no_part_in_the_loss(begun, clips):
     settings, model = begun
     drawn = corners(settings, clips, 0, 4, 4, "batch")
-    nothing = [
-        replace(clip, depth_valid=torch.zeros_like(clip.depth_valid), semantics=torch.full_like(clip.semantics, 255))
-        for clip in drawn
-    ]
+    unknown, unlabelled = torch.zeros_like(drawn[0].depth_valid), torch.full_like(drawn[0].semantics, 255)
+    nothing = [replace(clip, depth_valid=unknown, semantics=unlabelled) for clip in drawn]
     with torch.no_grad():
         terms, without = (model(some, BatchPart(0, 0, 0, 4)).terms for some in (drawn, nothing))
     assert {"depth", "semantics"} & set(terms)
@@ -140,9 +109,9 @@ def test_unknown_truth_has_no_part_in_the_loss(begun, clips):
 @pytest.mark.slow
 def test_two_processes_give_the_losses_of_one(converted, clips, tmp_path):
     """With frozen layers, and blocks that are computed again."""
-    common = {"frozen": "temporal_transformers", "steps": 3}
-    Learn(out=tmp_path / "one", settings=published_settings(converted, clips, **common)).run()
-    both_run("learn_published_together.py", tmp_path / "store", converted, clips, tmp_path / "both")
+    config = published_settings(converted, clips, frozen="temporal_transformers", steps=3)
+    Learn(out=tmp_path / "one", settings=config).run()
+    learn_in(2, with_settings(config, recompute=True), tmp_path / "both")
     assert_same_training(tmp_path / "one", tmp_path / "both", (1, 2, 3), model_files.load_published)
 
 
@@ -225,19 +194,18 @@ def test_a_folder_of_clips_is_known_by_its_condition(street, tmp_path):
 
 
 def test_clips_of_cities_show_points_alone_and_are_as_long_as_asked():
-    rules = city_clips.CityClipRules(width=48, height=32, window=16, clips=1, published=True)
-    assert rules.frames == 18 and city_clips.CityClipRules().frames == city_clips.FRAMES
-    log = city_clips.make_log(replace(rules, width=24, height=16), 0, rules.frames)
-    (clip,) = city_clips.make_clips(replace(rules, width=24, height=16), 0, log)
+    rules = city_clips.CityClipRules(width=24, height=16, window=11, clips=1, published=True)
+    assert rules.frames == 13 and city_clips.CityClipRules().frames == city_clips.FRAMES
+    log = city_clips.make_log(rules, 0, rules.frames)
+    (clip,) = city_clips.make_clips(rules, 0, log)
     condition = clip.condition
-    assert len(clip.rgb) == 16 and condition.warped is None
+    assert len(clip.rgb) == 11 and condition.warped is None
     sky = (clip.semantics == palette.ID["sky"])[:, None]
     assert bool(sky.any()) and bool(clip.depth_valid[sky].all()) and bool((clip.depth[sky] == clip_shards.FAR_M).all())
     empty = ~condition.valid
     assert bool(empty.any()) and float((condition.depth * empty).abs().max()) == 0
     assert float((condition.color * empty).abs().max()) == 0
     found = np.stack([r.rgb for r in log.recorded if r.view.time_s == condition.views[0].time_s][:1])
-    small = torch.nn.functional.interpolate(
-        torch.from_numpy(found).permute(0, 3, 1, 2).float() / 255, size=(16, 24), mode="bilinear", align_corners=False
-    )
+    large = torch.from_numpy(found).permute(0, 3, 1, 2).float() / 255
+    small = torch.nn.functional.interpolate(large, size=(16, 24), mode="bilinear", align_corners=False)
     assert torch.allclose(condition.reference, small[0], atol=1e-6)

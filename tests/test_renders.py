@@ -301,9 +301,8 @@ def test_clips_of_a_fitted_city_show_its_full_size_in_their_patches():
     for number, clip in enumerate(made):
         fine = clip.fine
         assert (fine.scale, *fine.clip.rgb.shape[-2:]) == (3, 60, 60)
-        view = city_clips.shifted_view(
-            log.world, log.world.frame_views("front")[city_clips.start_of(rules, city, number)], clip.shift_m
-        )
+        recorded = log.world.frame_views("front")[city_clips.start_of(rules, city, number)]
+        view = city_clips.shifted_view(log.world, recorded, clip.shift_m)
         truth = torch.from_numpy(log.truth(view).rgb).permute(2, 0, 1).float()
         rows, columns = (slice(3 * start, 3 * start + 60) for start in (fine.row, fine.column))
         assert torch.equal(fine.clip.rgb[0], truth[:, rows, columns])
@@ -316,10 +315,10 @@ def test_images_of_held_out_moments_are_not_given():
     if native.library() is None:
         pytest.skip("the native library is not built")
     rules = CityClipRules(width=48, height=32, window=1, clips=1, fitted=True)
-    log = city_clips.make_log(rules, city_clips.HELD_OUT, 9)
+    log = city_clips.make_log(rules, city_clips.HELD_OUT, 5)
     times = sorted({photo.view.time_s for photo in log.recorded})
     given = {photo.view.time_s for photo in city_clips.given_images(rules, city_clips.HELD_OUT, log)}
-    assert set(times) - given == {times[4], times[8]}
+    assert set(times) - given == {times[4]}
     assert city_clips.given_images(replace(rules, fitted=False), city_clips.HELD_OUT, log) == log.recorded
 
 

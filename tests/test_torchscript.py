@@ -9,10 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 from refusals import Asks, refused
-from test_i3d import made_up, renamed
 
 from mudg.base.weights import is_torchscript, read_checkpoint, read_torchscript
-from mudg.networks import i3d
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning")
 
@@ -84,31 +82,3 @@ def test_damaged_archives_are_refused(archive: tuple[Path, Outer]) -> None:
     refused("does not fit its storage", read_torchscript, short)
     cut = rewritten(archive[0], lambda name, old: old[:50] if name.endswith("/data.pkl") else old)
     refused(".", read_torchscript, cut)
-
-
-class Tree(torch.nn.Module):
-    """Modules made from dotted names, so that an archive has the published names."""
-
-    def __init__(self) -> None:
-        super().__init__()
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return x
-
-
-def test_an_archive_of_i3d_gives_the_features_of_its_tensors(tmp_path: Path) -> None:
-    state = {renamed(name): value for name, value in made_up().items()}
-    root = Tree()
-    for name, value in state.items():
-        *path, leaf = name.split(".")
-        place: torch.nn.Module = root
-        for part in path:
-            if part not in dict(place.named_children()):
-                place.add_module(part, Tree())
-            place = place.get_submodule(part)
-        place.register_buffer(leaf, value)
-    torch.jit.save(torch.jit.script(root), tmp_path / "i3d_torchscript.pt")
-    found = read_checkpoint(tmp_path / "i3d_torchscript.pt")
-    assert set(found) == set(state)
-    network = i3d.I3DFeatures(found)
-    assert torch.equal(network.get_buffer("Mixed_3b/b1b/conv3d/weight"), made_up()["Mixed_3b.b1b.conv3d.weight"])

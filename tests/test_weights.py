@@ -69,9 +69,8 @@ def test_every_published_tensor_is_accounted_for(published_keys, wanted):
     """The full-size network wants the published names and shapes; the rest is on the list of the unused."""
     published = weights.published_names(wanted)
     assert len(published_keys) == 2524
-    assert {published[name]: shape for name, shape in wanted.items()} == {
-        name: shape for name, shape in published_keys.items() if name not in weights.UNUSED
-    }
+    used = {name: shape for name, shape in published_keys.items() if name not in weights.UNUSED}
+    assert {published[name]: shape for name, shape in wanted.items()} == used
     assert len(published) + len(set(published_keys) & weights.UNUSED) == 2524
     assert len(set(weights.published_names(wanted).values())) == len(wanted)
     refused("lacks a tensor", weights.published_names, ["net.nothing"])
@@ -86,13 +85,9 @@ def test_every_published_tensor_is_accounted_for(published_keys, wanted):
 
 def containers(state):
     deep = {"_forward_module." + name: value for name, value in state.items()}
+    more = {"epoch": 3, "global_step": 100, "hyper_parameters": {"lr": 1e-5, "names": ["a"]}}
     return {
-        "lightning": {
-            "state_dict": state,
-            "epoch": 3,
-            "global_step": 100,
-            "hyper_parameters": {"lr": 1e-5, "names": ["a"]},
-        },
+        "lightning": {"state_dict": state, **more},
         "deepspeed": {"module": deep, "dp_world_size": 8, "mp_world_size": 1, "global_steps": 5, "ds_version": "0.9"},
         "plain": dict(state),
         "compiled": {"state_dict": {"module._orig_mod." + name: value for name, value in state.items()}},
@@ -245,9 +240,8 @@ def test_impossible_values_are_refused(tmp_path, complete, name, value, message)
 
 
 def converted_by_process(config: ConvertConfig, path: Path, to: Path, *, overwrite: bool = False) -> Path:
-    return convert.run(
-        config, path, to, functools.partial(convert.of_diffusion, config, path, network=TINY), overwrite=overwrite
-    )
+    conversion = functools.partial(convert.of_diffusion, config, path, network=TINY)
+    return convert.run(config, path, to, conversion, overwrite=overwrite)
 
 
 @pytest.mark.slow

@@ -1,17 +1,18 @@
 """A tiny network of the published kind, and fake checkpoints of it as the training frameworks write them."""
 
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import torch
-from toy_clips import with_settings
+from toy_clips import tiny, with_settings
 
 from mudg.base import weights
 from mudg.core.noise import ScheduleConfig
 from mudg.diffusion import convert
 from mudg.diffusion.published import PublishedConfig, PublishedMDM
 from mudg.diffusion.published_network import AutoencoderConfig, ResamplerConfig, VideoUNetConfig
-from mudg.diffusion.settings import ConvertConfig, LearnConfig
+from mudg.diffusion.settings import ConvertConfig, LearnNetwork
 from mudg.networks.clip import TowerConfig
 
 TINY = PublishedConfig(
@@ -33,11 +34,8 @@ TINY = PublishedConfig(
 
 def value_for(name, shape):
     """Values that depend on a tensor's published name alone (see golden/published_networks.md)."""
-    draw = (
-        np.random.RandomState(zlib.crc32(name.encode()) & 0xFFFFFFFF)
-        .standard_normal(int(np.prod(shape)))
-        .reshape(shape)
-    )
+    numbers = np.random.RandomState(zlib.crc32(name.encode()) & 0xFFFFFFFF).standard_normal(int(np.prod(shape)))
+    draw = numbers.reshape(shape)
     if len(shape) >= 2:
         draw = draw / np.sqrt(np.prod(shape[1:]))
     else:
@@ -95,33 +93,11 @@ def tiny_model():
 
 def published_settings(start, clips, **changes):
     """A run of two steps of `learn` on clips of points alone that goes on from a folder of the tiny model."""
-    settings = with_settings(
-        LearnConfig(start=str(start), steps=2, precision="float32"),
-        clips=str(clips),
-        cities=3,
-        first_cities=3,
-        clips_per_city=2,
-        held_out=1,
-        score_watched=1,
-        workers=0,
-        width=32,
-        height=32,
-        window=4,
-        full_window_share=1.0,
-        batch_frames=8,
-        lr=1e-4,
-        last_lr_share=1.0,
-        warmup_steps=0,
-        betas=(0.9, 0.999),
-        clip_norm=0.5,
-        average_decay=0.0,
-        augment=False,
-        log_every=1,
-        checkpoint_every=100,
-        score_every=100,
-        score_steps=1,
-    )
-    return with_settings(settings, **changes)
+    steps = {"steps": 2, "full_window_share": 1.0, "batch_frames": 8, "checkpoint_every": 100, "log_every": 1}
+    rate = {"lr": 1e-4, "last_lr_share": 1.0, "warmup_steps": 0, "betas": (0.9, 0.999), "clip_norm": 0.5}
+    data = {"first_cities": 3, "width": 32, "height": 32, "augment": False, "average_decay": 0.0}
+    settings = replace(tiny(clips, start=str(start)), network=LearnNetwork())
+    return with_settings(settings, **{**steps, **rate, **data, **changes})
 
 
 def write_tiny(folder):

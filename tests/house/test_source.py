@@ -290,10 +290,20 @@ def methods(tree: ast.Module, *, of_protocols: bool) -> set[str]:
     return {one.name for one in inner if ast.get_docstring(one)}
 
 
+def of_bases(node: ast.ClassDef, classes: dict[str, ast.ClassDef]) -> set[str]:
+    """Names of the methods that the bases of a class in the package document."""
+    bases = [classes[name] for base in node.bases if (name := dotted(base).rpartition(".")[2]) in classes]
+    own = {
+        one.name for base in bases for one in base.body if isinstance(one, ast.FunctionDef) and ast.get_docstring(one)
+    }
+    return own.union(*(of_bases(base, classes) for base in bases))
+
+
 def test_public_methods_are_documented(package_dir: Path) -> None:
-    """But for torch's forward, and what a base of all verbs, or a protocol in the same module, explains. Of functions,
-    classes and annotations ruff takes care."""
+    """But for torch's forward, and what a base of the class or of all verbs, or a protocol in the module, explains. Of
+    functions, classes and annotations ruff takes care."""
     modules = dict(parsed(package_dir))
+    classes = {node.name: node for tree in modules.values() for node in tree.body if isinstance(node, ast.ClassDef)}
     of_steps = {"steps/step.py", "steps/engine.py"} & modules.keys()
     explained_steps = {name for module in of_steps for name in methods(modules[module], of_protocols=False)}
     explained_steps |= {"run_parts", "settings_in_list"}
@@ -301,8 +311,9 @@ def test_public_methods_are_documented(package_dir: Path) -> None:
     for name, tree in modules.items():
         explained = {"forward"} | methods(tree, of_protocols=True)
         explained |= explained_steps if name.startswith(("steps/", "benchmarks/")) else set()
-        classes = [kind for kind in tree.body if isinstance(kind, ast.ClassDef) and not kind.name.startswith("_")]
-        for node in [one for kind in classes for one in kind.body if isinstance(one, ast.FunctionDef)]:
+        explained.update(*(of_bases(node, classes) for node in tree.body if isinstance(node, ast.ClassDef)))
+        public = [kind for kind in tree.body if isinstance(kind, ast.ClassDef) and not kind.name.startswith("_")]
+        for node in [one for kind in public for one in kind.body if isinstance(one, ast.FunctionDef)]:
             asks = ast.unparse(node.body[0]) == "..."  # of a protocol, which says what it asks for
             if not (node.name.startswith("_") or asks or ast.get_docstring(node) or node.name in explained):
                 problems.append(f"{name}:{node.lineno}: {node.name} has no docstring")

@@ -145,7 +145,6 @@ class BezierNode(RigidNode):
         return cls(node.name, node.label, node.size_m, node.times_s, node.world_from_object)
 
     def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
-        """See ``StaticNode``."""
         placement = self._placement(time_s)
         if placement is None:
             return None
@@ -174,7 +173,6 @@ class BezierNode(RigidNode):
         return self._curves[tau]
 
     def to(self, device: torch.device) -> Self:
-        """See ``Node``."""
         return super().to(device).with_values(learnt=self.learnt.to(device), _curves={})
 
     def moved(self, object_from_new: NDArray[np.float64]) -> Self:
@@ -184,7 +182,6 @@ class BezierNode(RigidNode):
         return made
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """See ``StaticNode``."""
         facts, tensors = super().state()
         return facts, tensors | {f"learnt.{name}": value for name, value in self.learnt.state().items()}
 
@@ -213,7 +210,6 @@ class BezierRecipe(Recipe):
     """See the module's text."""
 
     def start(self, given: FitStart) -> SceneModel:
-        """See ``Recipe``."""
         model = given.model()
         columns = {name: value.detach() for name, value in model.table.columns.items()}
         table = Table(columns | {"curve": torch.zeros(len(model.table), 4, 3)}, model.table.labels)
@@ -221,7 +217,6 @@ class BezierRecipe(Recipe):
         return replace(model, table=table, nodes=nodes)
 
     def terms(self, drawn: DrawnView) -> dict[str, Tensor]:
-        """See ``Recipe``."""
         view = drawn.view
         terms = {"smooth": SMOOTH_WEIGHT * losses.edge_aware(drawn.inverse_depth, view.rgb)}
         terms |= drawn.lidar_term(LIDAR_WEIGHT)

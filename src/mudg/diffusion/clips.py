@@ -173,13 +173,8 @@ def _check_values(planes: Mapping[str, Tensor], path: Path) -> None:
 
 
 def _damaged(path: Path, expected: str, got: str) -> InputError:
-    return InputError(
-        "a shard of training clips is damaged",
-        where=str(path),
-        expected=expected,
-        got=got,
-        remedy="delete it; it is made again",
-    )
+    what, remedy = "a shard of training clips is damaged", "delete it; it is made again"
+    return InputError(what, where=str(path), expected=expected, got=got, remedy=remedy)
 
 
 def clip_at(path: Path, clip: int, frames: Sequence[int]) -> Clip:
@@ -188,13 +183,9 @@ def clip_at(path: Path, clip: int, frames: Sequence[int]) -> Clip:
         _check_arrays(shard, path)
         clips, most = shard.get_slice("rgb").get_shape()[:2]
         if not (0 <= clip < clips and 0 <= min(frames) and max(frames) < most):
-            raise InputError(
-                "a shard has fewer clips or frames",
-                where=str(path),
-                got=f"{clips} clips of {most} frames",
-                expected=f"clip {clip}, frame {max(frames)}",
-                remedy="choose another --data.clips, or a smaller --data.window",
-            )
+            what, got, expected = "a shard has fewer clips or frames", f"{clips} clips of {most} frames", max(frames)
+            remedy = "choose another --data.clips, or a smaller --data.window"
+            raise InputError(what, where=str(path), got=got, expected=f"clip {clip}, frame {expected}", remedy=remedy)
         made = _read_part(shard, "", clip, frames, path)
         if f"{FINE}place" not in shard.keys():
             return made
@@ -419,13 +410,9 @@ class TrainingClips:
         """Some frames of a clip; InputError if it has another size."""
         clip = self.shards.clip(shard, number, frames)
         if clip.rgb.shape[-2:] != size[::-1]:
-            raise InputError(
-                "the training clips have another size",
-                where=f"{self.config.data.clips or 'clips'}, shard {shard}",
-                expected=f"{size[0]}x{size[1]}",
-                got=f"{clip.rgb.shape[-1]}x{clip.rgb.shape[-2]}",
-                remedy="choose another --data.clips",
-            )
+            what, where = "the training clips have another size", f"{self.config.data.clips or 'clips'}, shard {shard}"
+            got, remedy = f"{clip.rgb.shape[-1]}x{clip.rgb.shape[-2]}", "choose another --data.clips"
+            raise InputError(what, where=where, expected=f"{size[0]}x{size[1]}", got=got, remedy=remedy)
         return clip
 
     def _picks(self, step: int, count: int, frames: int, purpose: str) -> list[tuple[int, int, range]]:

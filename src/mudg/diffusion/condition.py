@@ -236,9 +236,8 @@ class DriveInputs:
         level = torch.isin(ids, GROUND_IDS) & (falls > LEAST_FALL) & (falls[nearest] > LEAST_FALL)
         levelled = torch.where(level, depth * falls[nearest] / falls.clamp(min=LEAST_FALL), depth)
         depth = torch.where(valid, depth, levelled.clamp(max=FAR_M))
-        render = replace(
-            render, color=torch.where(hidden, color, render.color), semantics=torch.where(hidden, ids, render.semantics)
-        )
+        own_color, own_ids = torch.where(hidden, color, render.color), torch.where(hidden, ids, render.semantics)
+        render = replace(render, color=own_color, semantics=own_ids)
         shown = torch.where(solid, render.depth[0], torch.full_like(depth, FAR_M)).clamp(max=FAR_M)
         pick = lambda mine, theirs: torch.where(near | hidden, mine, theirs)
         depth = on_ground(pick(depth, shown))
@@ -503,9 +502,8 @@ def _among_measured(sparse: ProjectedPoints, depth: Tensor) -> Tensor:
     """Which pixels are measured, or have measured ones of their filled depth f32[H,W] to both sides in some direction,
     at most twice `REACH_PX` away, bool[H,W]: the surface goes on there, whatever a render with holes shows."""
     reach = 2 * REACH_PX
-    own = functional.pad(torch.where(sparse.valid, sparse.depth, torch.inf)[None, None], (reach,) * 4, value=torch.inf)[
-        0, 0
-    ]
+    measured = torch.where(sparse.valid, sparse.depth, torch.inf)
+    own = functional.pad(measured, (reach,) * 4, value=torch.inf)
     height, width = depth.shape
 
     def on_side(down: int, right: int) -> Tensor:
@@ -657,9 +655,8 @@ class PreparedImages(dict[int, WarpSource]):
 
     def __setitem__(self, number: int, image: WarpSource) -> None:
         coarse = (image.rgb * 255).round().clamp(0, 255).to(torch.uint8)
-        super().__setitem__(
-            number, replace(image, rgb=coarse) if torch.equal(coarse.float() / 255, image.rgb) else image
-        )
+        exact = torch.equal(coarse.float() / 255, image.rgb)
+        super().__setitem__(number, replace(image, rgb=coarse) if exact else image)
 
     def __getitem__(self, number: int) -> WarpSource:
         image = super().__getitem__(number)

@@ -54,9 +54,8 @@ def run(config: ConvertConfig, checkpoint: Path, to: Path, conversion: Conversio
     if replaces and not overwrite:
         raise UsageError("the folder exists", where=str(to), remedy="choose another --to, or add --overwrite")
     if replaces and not own_names(to):
-        raise UsageError(
-            "the folder holds files that do not belong to a model", where=str(to), remedy="choose another --to"
-        )
+        what = "the folder holds files that do not belong to a model"
+        raise UsageError(what, where=str(to), remedy="choose another --to")
     place = replacement.staging if replaces else to  # until it is whole, the old model stays as it is
     work, limit = conversion(place)
     if replaces:
@@ -131,12 +130,9 @@ def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: Pub
     network = replace(network, schedule=replace(network.schedule, base_scale=base_scale))
     text = {name.removeprefix("text."): tensors.pop(name) for name in list(tensors) if name.startswith("text.")}
     tensors["text"] = embed_captions(network, text)
+    sha256 = store.sha256_file(checkpoint)
     facts = {
-        "source": {
-            "file": checkpoint.name,
-            "bytes": checkpoint.stat().st_size,
-            "sha256": store.sha256_file(checkpoint),
-        },
+        "source": {"file": checkpoint.name, "bytes": checkpoint.stat().st_size, "sha256": sha256},
         "adapted": adapted,
         "base_scale": base_scale,
         "caption": clip.CAPTION,

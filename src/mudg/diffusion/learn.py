@@ -222,9 +222,8 @@ def making_clips(source: TrainingClips, folder: Path, rules: CityClipRules) -> c
         return contextlib.nullcontext()
     store.make_folder(folder)
     if not os.access(folder, os.W_OK):
-        raise ResourceError(
-            "training clips cannot be written here", where=str(folder), remedy="choose another --data.clips"
-        )
+        what, remedy = "training clips cannot be written here", "choose another --data.clips"
+        raise ResourceError(what, where=str(folder), remedy=remedy)
     log.info(f"learn: {len(missing)} cities to generate into {folder}, {workers} processes")
     return calls_beside(city_clips.write_city, [(rules, n, folder) for n in missing], workers)
 

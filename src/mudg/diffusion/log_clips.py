@@ -252,13 +252,10 @@ def plan_shards(
             rows.append((counts[window.held_out] + (first_held_out if window.held_out else 0), source, window))
             counts[window.held_out] += 1
     if not counts[False] or (rules.held_out_every and not counts[True]):
-        raise InputError(
-            "the logs are too short to hold out windows",
-            where=", ".join(str(s.scene) for s in sources),
-            got=f"{counts[False]} windows to train on, {counts[True]} to score",
-            remedy="smaller --data.stride or --data.window, or --data.held-out-every 0 (scores are then of clips"
-            " trained on)",
-        )
+        what, where = "the logs are too short to hold out windows", ", ".join(str(s.scene) for s in sources)
+        got = f"{counts[False]} windows to train on, {counts[True]} to score"
+        remedy = "smaller --data.stride or --data.window, or --data.held-out-every 0 (clips trained on are then scored)"
+        raise InputError(what, where=where, got=got, remedy=remedy)
     return rows
 
 

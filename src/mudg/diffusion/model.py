@@ -233,11 +233,7 @@ class MDM(nn.Module):
         with torch.no_grad():
             encoded = self.encode_condition([clip.condition for clip in clips])
             rgb, depth, ids = (torch.stack([getattr(c, name) for c in clips]) for name in ("rgb", "depth", "semantics"))
-            latents: dict[Modality, Tensor] = {
-                "rgb": self.codec.encode_rgb(rgb),
-                "depth": self.codec.encode_depth(depth),
-                "semantics": self.codec.encode_semantics(ids),
-            }
+            latents = self.codec.encode(rgb, depth, ids)
             pixels, shares = PixelTruth.of(clips, self.codec), semantic_shares(ids)
             known = functional.avg_pool2d(pixels.depth_known, self.codec.factor).unflatten(0, rgb.shape[:2])
         generator = seeds.torch_generator(part.seed, part.step, "noise")

@@ -153,9 +153,8 @@ def load_published(
     folder, content = Path(path), read_description(path)
     where = str(folder / MODEL_FILE)
     if content.get("kind") != PUBLISHED:
-        raise InputError(
-            "not a published-type model of this version", where=where, expected=f"schema 1, kind {PUBLISHED}"
-        )
+        what = "not a published-type model of this version"
+        raise InputError(what, where=where, expected=f"schema 1, kind {PUBLISHED}")
     with torch.device("meta"), records.understood("a published-type model", where):
         model = PublishedMDM(records.parse_dataclass(PublishedConfig, content.get("config"), f"{where}: config"))
     state = checkpoint.read_shards(folder, content["files"], remedy="convert the checkpoint again")

@@ -23,7 +23,6 @@ from mudg.base.run_folder import RunDir
 from mudg.base.types import Clip
 from mudg.core import losses, metrics
 from mudg.core.metrics import TrueFrame, flicker
-from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
 from mudg.diffusion import model_files
 from mudg.diffusion.clips import FAR_M, Shards, TrainingClips, counts_at
 from mudg.diffusion.condition import filled_depth
@@ -32,7 +31,7 @@ from mudg.diffusion.model_files import Model, generated
 from mudg.diffusion.network import MDMConfig
 from mudg.diffusion.parallel import Ranks, TrainingState, agreed_terms, mean_of
 from mudg.diffusion.published import PublishedMDM, WorkSplit
-from mudg.diffusion.requests import GeneratedClip, SampleRequest
+from mudg.diffusion.requests import GeneratedClip, SampleRequest, picture_row
 from mudg.diffusion.settings import LearnConfig
 from mudg.networks.codec import Modality, PatchCodec
 
@@ -114,13 +113,11 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
         model = model_files.load_published(config.start, dtype=torch.float32)
         frames = model.config.window
         if config.data.window != frames or config.optimizer.full_window_share < 1:
-            raise UsageError(
-                "a published-type model needs clips of exactly the length of its image tokens",
-                where="--data.window, --optimizer.full-window-share",
-                expected=f"{frames} frames in all steps",
-                got=f"{config.data.window} frames in {config.optimizer.full_window_share:.0%} of the steps",
-                remedy=f"--data.window {frames} --optimizer.full-window-share 1",
-            )
+            what = "a published-type model needs clips of exactly the length of its image tokens"
+            where, expected = "--data.window, --optimizer.full-window-share", f"{frames} frames in all steps"
+            got = f"{config.data.window} frames in {config.optimizer.full_window_share:.0%} of the steps"
+            remedy = f"--data.window {frames} --optimizer.full-window-share 1"
+            raise UsageError(what, where=where, expected=expected, got=got, remedy=remedy)
         model.check_clip(frames, config.data.height, config.data.width)
         with torch.no_grad():  # out of the mapped files: training writes in place
             for value in (*model.parameters(), *model.buffers()):
@@ -130,10 +127,8 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
         return model, set()
     before = model_files.load(config.start)
     if before.config.window != config.data.window:
-        log.info(
-            f"learn: training on clips of {config.data.window} frames; --start was trained on clips of"
-            f" {before.config.window}"
-        )
+        own = f"--start was trained on clips of {before.config.window}"
+        log.info(f"learn: training on clips of {config.data.window} frames; {own}")
     if not can_grow:
         own = {name: getattr(before.config, name) for name in ("renders", "finish_widths", "finish_blocks")}
         wanted = replace(wanted, **own)
@@ -183,9 +178,8 @@ def freeze(model: Model, what: str) -> int:
             parameter.requires_grad_(False)
             count += parameter.numel()
     if not count:
-        raise UsageError(
-            "there is nothing to freeze", where="--frozen", got=what, expected="a network with such layers"
-        )
+        expected = "a network with such layers"
+        raise UsageError("there is nothing to freeze", where="--frozen", got=what, expected=expected)
     log.info(f"learn: {what.replace('_', ' ')} are frozen ({count:,} parameters)")
     return count
 
@@ -257,11 +251,7 @@ def codec_loss(codec: PatchCodec, clips: Sequence[Clip], generator: torch.Genera
         torch.cat([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_weight", "semantics")
     )
     with torch.no_grad():
-        latents: dict[Modality, Tensor] = {
-            "rgb": codec.encode_rgb(rgb),
-            "depth": codec.encode_depth(depth),
-            "semantics": codec.encode_semantics(ids),
-        }
+        latents = codec.encode(rgb, depth, ids)
         amount = 0.15 * torch.rand(len(rgb), 1, 1, 1, generator=generator).to(rgb.device)
         keep = (torch.rand(3, len(rgb), 1, 1, 1, generator=generator) > 0.15).float().to(rgb.device)
         noisy: dict[Modality, Tensor] = {
@@ -465,11 +455,6 @@ def save_grid(path: Path, pairs: Sequence[tuple[Clip, GeneratedClip]], frame: in
         t = min(frame, len(sample.confidence) - 1)
         given = clip.condition
         measured = torch.where(given.measurement.valid[t], given.measurement.depth[t], 100.0)
-        cells = [
-            *(to_bytes(rgb) for rgb in (given.color[t], sample.rgb[t], clip.rgb[t])),
-            *(depth_colors(depth[0].numpy()) for depth in (measured, sample.depth[t], clip.depth[t])),
-            *(class_colors(ids.numpy()) for ids in (sample.semantics[t], clip.semantics[t])),
-            gray(sample.confidence[t, 0].numpy()),
-        ]
-        rows.append(np.concatenate(cells, 1))
+        colors, depths = (given.color[t], sample.rgb[t], clip.rgb[t]), (measured, sample.depth[t], clip.depth[t])
+        rows.append(picture_row(colors, depths, (sample.semantics[t], clip.semantics[t]), sample.confidence[t]))
     store.write_image(path, np.concatenate(rows, 0))

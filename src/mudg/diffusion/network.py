@@ -76,9 +76,8 @@ class MDMConfig:
             if (len(widths), len(blocks)) not in ((0, 0), (2, 2)):
                 raise UsageError(f"{name}_widths and {name}_blocks have two entries each, or none", got=str(widths))
         if self.finish_widths and not (self.refine_widths and self.renders):
-            raise UsageError(
-                "a finisher needs a refiner before it, and renders", got=f"renders {self.renders}, {self.refine_widths}"
-            )
+            got = f"renders {self.renders}, {self.refine_widths}"
+            raise UsageError("a finisher needs a refiner before it, and renders", got=got)
 
     @property
     def pixel_multiple(self) -> int:

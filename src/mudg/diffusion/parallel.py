@@ -97,13 +97,10 @@ class Ranks:
         clips cannot be divided evenly. Portions of different sizes would change the mean."""
         size, rest = divmod(clips, self.size * parts)
         if rest or not size:
-            raise UsageError(
-                "a step's clips cannot be divided evenly",
-                where="--optimizer.batch-frames, --compute.accumulate",
-                expected=f"a multiple of {self.size} processes x {parts} portions",
-                got=f"{clips} clips",
-                remedy="make --optimizer.batch-frames a multiple of window x processes x accumulate",
-            )
+            what, where = "a step's clips cannot be divided evenly", "--optimizer.batch-frames, --compute.accumulate"
+            expected = f"a multiple of {self.size} processes x {parts} portions"
+            remedy = "make --optimizer.batch-frames a multiple of window x processes x accumulate"
+            raise UsageError(what, where=where, expected=expected, got=f"{clips} clips", remedy=remedy)
         first = self.rank * parts * size
         return [slice(first + n * size, first + (n + 1) * size) for n in range(parts)]
 
@@ -120,9 +117,8 @@ def join_processes(wanted: str) -> Iterator[Ranks]:
     try:
         size, rank = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("RANK", "0"))
     except ValueError as error:
-        raise UsageError(
-            "the launcher's variables are not numbers", where="WORLD_SIZE, RANK", got=str(error)
-        ) from error
+        what = "the launcher's variables are not numbers"
+        raise UsageError(what, where="WORLD_SIZE, RANK", got=str(error)) from error
     if size == 1:
         yield _ranks_on_device(0, 1, wanted)
         return
@@ -210,12 +206,9 @@ def agreed_terms(
         where = f"learn, step {step}"
         if ranks.size > 1:
             where += f", process {', '.join(str(n) for n, flag in enumerate(flags) if flag)} of {ranks.size}"
-        raise NumericsError(
-            f"the {', '.join(names)} term of the {what} is not finite",
-            where=where,
-            got=", ".join(str(mean[n]) for n in names),
-            remedy="continue from the last checkpoint with a lower learning rate",
-        )
+        said, got = f"the {', '.join(names)} term of the {what} is not finite", ", ".join(str(mean[n]) for n in names)
+        remedy = "continue from the last checkpoint with a lower learning rate"
+        raise NumericsError(said, where=where, got=got, remedy=remedy)
     return mean, sums[len(terms)] > 0
 
 

@@ -81,18 +81,12 @@ class PublishedConfig:
 
     def __post_init__(self) -> None:
         net, tokens, latent = self.net, self.image_tokens, self.codec.latent_channels
+        widths = "caption and image tokens must have the width of the network's context"
+        planes = "the network must take three latents (noisy, colour, depth) and give one"
         for what, expected, got in (
-            (
-                "caption and image tokens must have the width of the network's context",
-                f"{net.context_width}, {net.context_width}",
-                f"{self.text.width}, {tokens.context_width}",
-            ),
+            (widths, f"{net.context_width}, {net.context_width}", f"{self.text.width}, {tokens.context_width}"),
             ("image tower and resampler differ in width", str(tokens.image_width), str(self.image.width)),
-            (
-                "the network must take three latents (noisy, colour, depth) and give one",
-                f"{3 * latent} -> {latent}",
-                f"{net.channels_in} -> {net.channels_out}",
-            ),
+            (planes, f"{3 * latent} -> {latent}", f"{net.channels_in} -> {net.channels_out}"),
         ):
             if expected != got:
                 raise UsageError(what, expected=expected, got=got)
@@ -195,13 +189,10 @@ class PublishedMDM(nn.Module):
         check_image_size(height, width, self.config.pixel_multiple)
         own = self.config.window
         if frames != own:
-            raise UsageError(
-                "a clip of the published model has a fixed number of frames: its image tokens belong to one frame each",
-                where="PublishedMDM",
-                expected=f"{own} frames",
-                got=f"{frames}",
-                remedy=f"use trajectories of at least {own} frames; they are made in windows of that length",
-            )
+            why = "its image tokens belong to one frame each"
+            what = f"a clip of the published model has a fixed number of frames: {why}"
+            remedy = f"use trajectories of at least {own} frames; they are made in windows of that length"
+            raise UsageError(what, where="PublishedMDM", expected=f"{own} frames", got=f"{frames}", remedy=remedy)
 
     def encode_condition(
         self,
@@ -298,9 +289,8 @@ class PublishedMDM(nn.Module):
                 "depth": self._share_of_cells(torch.stack([clip.depth_weight for clip in clips])),
                 "semantics": self._share_of_cells(classes),
             }
-        planes, features, seen = (
-            torch.cat([getattr(e, name) for e in encoded]) for name in ("planes", "features", "seen")
-        )
+        parts = ("planes", "features", "seen")
+        planes, features, seen = (torch.cat([getattr(e, name) for e in encoded]) for name in parts)
         return self.velocity_loss(
             truth,
             PublishedLatents(planes, features, encoded[0].grey, seen),
@@ -358,17 +348,15 @@ class PublishedMDM(nn.Module):
         dropouts = [m for m in self.modules() if isinstance(m, SeededDropout) and m.training]
         for number, layer in enumerate(dropouts):
             layer.seeds = tuple(seeds.key(seed, clip, f"dropout {number}") for clip in range(first, first + count))
-        stated = self.predict(
-            self.schedule.add_noise(x0, eps, t), encoded.planes, t, names, text, self.image_tokens(features)
-        )
+        noisy, tokens = self.schedule.add_noise(x0, eps, t), self.image_tokens(features)
+        stated = self.predict(noisy, encoded.planes, t, names, text, tokens)
         squares = (stated - self.schedule.velocity(x0, eps, t)).square()
         if known:
             everywhere = torch.ones_like(x0[0, :, :1])
             squares = squares * torch.stack([known[m][n] if m in known else everywhere for n, m in enumerate(names)])
         errors = squares.flatten(1).mean(1)
-        sums = {
-            m: sum(float(e) for e, name in zip(errors.detach(), names) if name == m) for m in MODALITIES if m in drawn
-        }
+        shown = [m for m in MODALITIES if m in drawn]
+        sums = {m: sum(float(e) for e, name in zip(errors.detach(), names) if name == m) for m in shown}
         return Losses(errors.mean(), {m: total * batch_clips / (count * drawn.count(m)) for m, total in sums.items()})
 
     def trained_part(self) -> nn.ModuleDict:

@@ -76,9 +76,8 @@ class CellAttention(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """[N,C,h,w] -> the same."""
         normed = self.norm(x)
-        q, k, v = (
-            layer(normed).flatten(2).transpose(1, 2).unsqueeze(1) for layer in (self.query, self.key, self.value)
-        )
+        layers = self.query, self.key, self.value
+        q, k, v = (layer(normed).flatten(2).transpose(1, 2).unsqueeze(1) for layer in layers)
         mixed = functional.scaled_dot_product_attention(q, k, v)[:, 0]
         return x + self.out(mixed.transpose(1, 2).unflatten(2, x.shape[2:]))
 
@@ -340,9 +339,8 @@ class VideoUNetConfig:
 
     def __post_init__(self) -> None:
         if len(self.multipliers) != len(self.attention):
-            raise UsageError(
-                "multipliers and attention need one entry per level", got=f"{self.multipliers}, {self.attention}"
-            )
+            got = f"{self.multipliers}, {self.attention}"
+            raise UsageError("multipliers and attention need one entry per level", got=got)
         if self.width % GROUPS:
             what = "the width is no multiple of the normalisation groups"
             raise UsageError(what, expected=f"multiple of {GROUPS}", got=str(self.width))
@@ -367,9 +365,8 @@ class SeededDropout(nn.Module):
             expected = f"a divisor of {len(x)} seeds"
             raise UsageError(what, where="SeededDropout", expected=expected, got=str(len(self.seeds)), remedy=remedy)
         shape = (len(x) // len(self.seeds), *x.shape[1:])
-        draws = [
-            torch.rand(shape, generator=torch.Generator(x.device).manual_seed(s), device=x.device) for s in self.seeds
-        ]
+        generators = [torch.Generator(x.device).manual_seed(seed) for seed in self.seeds]
+        draws = [torch.rand(shape, generator=generator, device=x.device) for generator in generators]
         return x * (torch.cat(draws) >= self.share).to(x) / (1 - self.share)
 
 
@@ -607,10 +604,8 @@ class VideoUNet(nn.Module):
         for level in reversed(range(top + 1)):
             outside = config.multipliers[level] * width
             for number in range(config.blocks + 1):
-                grow = level > 0 and number == config.blocks
-                self.up.append(
-                    Stage(inside + skips.pop(), outside, config, attention=config.attention[level], grow=grow)
-                )
+                how = {"attention": config.attention[level], "grow": level > 0 and number == config.blocks}
+                self.up.append(Stage(inside + skips.pop(), outside, config, **how))
                 inside = outside
         self.norm = nn.GroupNorm(GROUPS, inside)
         self.leave = _zero(nn.Conv2d(inside, config.channels_out, 3, padding=1))

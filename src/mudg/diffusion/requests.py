@@ -7,11 +7,13 @@ drawn on the CPU, so that it is the same for every device.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
@@ -22,6 +24,7 @@ from mudg.base.types import Condition
 from mudg.core import noise
 from mudg.core.depth import DepthFit
 from mudg.core.noise import Denoise, Prediction, Schedule
+from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
 from mudg.networks.codec import Modality
 
 
@@ -66,6 +69,15 @@ class GeneratedClip:
         """The same clip with its tensors on a device."""
         own = {f.name: x.to(device) for f in fields(self) if isinstance(x := getattr(self, f.name), Tensor)}
         return replace(self, **own, latents={m: z.to(device) for m, z in self.latents.items()})
+
+
+def picture_row(
+    colors: Iterable[Tensor], depths: Iterable[Tensor], ids: Iterable[Tensor], confidence: Tensor
+) -> NDArray[np.uint8]:
+    """Images f32[3,H,W], depths f32[1,H,W], classes i64[H,W] and a confidence f32[1,H,W] beside each other."""
+    cells = [*map(to_bytes, colors), *(depth_colors(depth[0].numpy()) for depth in depths)]
+    cells += [*(class_colors(own.numpy()) for own in ids), gray(confidence[0].numpy())]
+    return np.concatenate(cells, 1)
 
 
 # number formats -----------------------------------------------------------------------------------

@@ -98,10 +98,8 @@ class SceneList:
     def summary(self) -> str:
         """Data sets with their scenes and shares, a line each."""
         lines = [f"{len(self.scenes)} scenes, {len(self.scored)} of them held out"]
-        lines += [
-            f"  {name}: {len(of)} scenes, {100 * self.shares[name]:.3g} % of the clips"
-            for name, of in self.members.items()
-        ]
+        for name, of in self.members.items():
+            lines.append(f"  {name}: {len(of)} scenes, {100 * self.shares[name]:.3g} % of the clips")
         return "\n".join(lines)
 
 
@@ -193,13 +191,9 @@ class FolderOfShards:
         got = hashlib.sha256(content).hexdigest()
         wanted = self.sums.get(name, got)
         if got != wanted:
-            raise IntegrityError(
-                "what came is not what was uploaded",
-                where=f"{self.place}/{name}",
-                expected=f"sha256 {wanted[:16]}...",
-                got=f"sha256 {got[:16]}...",
-                remedy="upload the clips again",
-            )
+            what, remedy = "what came is not what was uploaded", "upload the clips again"
+            said = {"expected": f"sha256 {wanted[:16]}...", "got": f"sha256 {got[:16]}..."}
+            raise IntegrityError(what, where=f"{self.place}/{name}", **said, remedy=remedy)
         store.atomic_write(path, content)
 
 
@@ -256,13 +250,11 @@ class ListedShards(Shards):
             count = len({bad // SPAN for bad in self.bad})
         most = int(self._limit * len(scenes))
         if count > most or count == len(scenes):
-            raise UsageError(
-                "too many scenes of the list are missing or damaged",
-                where=f"{self.scenes.where}, --data.bad-scenes",
-                expected=f"at most {most} of {len(scenes)}",
-                got=f"{count}, the last: {str(error).splitlines()[0]}",
-                remedy="repair the scenes named above or take them off the list",
-            ) from error
+            what = "too many scenes of the list are missing or damaged"
+            where = f"{self.scenes.where}, --data.bad-scenes"
+            expected, got = f"at most {most} of {len(scenes)}", f"{count}, the last: {str(error).splitlines()[0]}"
+            remedy = "repair the scenes named above or take them off the list"
+            raise UsageError(what, where=where, expected=expected, got=got, remedy=remedy) from error
 
     def scored(self) -> list[int]:
         """The first shard of every held-out scene, or of one trained on where none is. Those that cannot be used are
@@ -320,9 +312,8 @@ class ListedShards(Shards):
                 if not path.is_file():  # else another clip of the log is at fault
                     raise
 
-        return _OpenScene(
-            range(len(windows)), lambda n: self._cache.get(f"{folder}/{shard_path(Path(), n).name}", bring)
-        )
+        find = lambda n: self._cache.get(f"{folder}/{shard_path(Path(), n).name}", bring)
+        return _OpenScene(range(len(windows)), find)
 
 
 class ListedClips(TrainingClips):

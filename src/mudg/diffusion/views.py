@@ -29,14 +29,13 @@ from mudg.base.records import understood
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Condition, FusedCloud, Observation, Photo, RenderPlanes, Scene, Trajectory, View
 from mudg.core import trajectory
-from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
 from mudg.core.raster.cpu import release_memory
 from mudg.diffusion import model_files, published
 from mudg.diffusion.condition import FAR_M, ConditionRules, DriveInputs, PreparedImages, WarpSource, build_conditions
 from mudg.diffusion.model import MDM
 from mudg.diffusion.model_files import Model, generated, is_published
 from mudg.diffusion.published import PublishedMDM, WorkSplit
-from mudg.diffusion.requests import GeneratedClip, SampleRequest, half_format
+from mudg.diffusion.requests import GeneratedClip, SampleRequest, half_format, picture_row
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.gaussians.rendering import render_planes
 from mudg.gaussians.storage import load_model
@@ -133,58 +132,38 @@ def check_config(config: SynthesizeConfig, fitted: bool, *, weather: bool = Fals
     the device. InputError: no such model. ResourceError: no such device."""
     device = choose_device(config.device, "diffusion model", NETWORK_KINDS)
     if device.type != "cpu" and config.processes > 1:
-        raise UsageError(
-            f"on {device} one process makes all trajectories",
-            where="--processes",
-            expected="0 or 1",
-            got=str(config.processes),
-            remedy="leave it out, or give --device cpu",
-        )
+        what, remedy = f"on {device} one process makes all trajectories", "leave it out, or give --device cpu"
+        raise UsageError(what, where="--processes", expected="0 or 1", got=str(config.processes), remedy=remedy)
     config = replace(config, device=str(device))
     half_of(config)
     full_size, repairs = is_published(config.model), config.condition == "repair"
     if not full_size:
         MDM.check_request(request_of(config))
-    for wrong, what, where, expected, got, remedy in (
-        (
-            full_size and fitted and not weather,
-            "a published-type model uses a fitted scene for weather and light of --edits only",
-            *("--fitted", "", "", "leave it out"),
-        ),
-        (
-            repairs and not (fitted or full_size),
-            "this condition is made of renders of a fitted scene",
-            *("--condition", "", "repair", "give the folder of a finished fit as --fitted"),
-        ),
-        (
-            full_size and repairs,
-            "a published-type model does not know this condition",
-            *("--condition", "full, reference, points, concat", "repair", "leave it out, or choose another --model"),
-        ),
-        (
-            config.condition != "full" and fitted and not repairs,
-            "parts of the condition cannot be switched off here",
-            *("--condition", "full", "--fitted: renders are left out of such a condition"),
-            "leave out --condition or --fitted",
-        ),
-        (
-            bool(config.memory_budget_gb) and not full_size,
-            "this setting applies to published-type models only",
-            *("--memory-budget-gb", "", "", "leave it out"),
-        ),
-    ):
-        if wrong:
-            raise UsageError(what, where=where, expected=expected, got=got, remedy=remedy)
+    if full_size and fitted and not weather:
+        what = "a published-type model uses a fitted scene for weather and light of --edits only"
+        raise UsageError(what, where="--fitted", remedy="leave it out")
+    if repairs and not (fitted or full_size):
+        what = "this condition is made of renders of a fitted scene"
+        remedy = "give the folder of a finished fit as --fitted"
+        raise UsageError(what, where="--condition", got="repair", remedy=remedy)
+    if full_size and repairs:
+        what, known = "a published-type model does not know this condition", "full, reference, points, concat"
+        remedy = "leave it out, or choose another --model"
+        raise UsageError(what, where="--condition", expected=known, got="repair", remedy=remedy)
+    if config.condition != "full" and fitted and not repairs:
+        what, remedy = "parts of the condition cannot be switched off here", "leave out --condition or --fitted"
+        got = "--fitted: renders are left out of such a condition"
+        raise UsageError(what, where="--condition", expected="full", got=got, remedy=remedy)
+    if config.memory_budget_gb and not full_size:
+        what = "this setting applies to published-type models only"
+        raise UsageError(what, where="--memory-budget-gb", remedy="leave it out")
     if full_size:
         return replace(config, processes=config.processes or 1)  # one copy of a large model in memory
     model = model_files.load(config.model)  # fails now rather than in every process
     if fitted and not model.config.renders:
-        raise UsageError(
-            "this model was not trained with renders of a fitted scene",
-            where="--fitted",
-            got=config.model,
-            remedy="leave it out, or choose another --model",
-        )
+        what = "this model was not trained with renders of a fitted scene"
+        remedy = "leave it out, or choose another --model"
+        raise UsageError(what, where="--fitted", got=config.model, remedy=remedy)
     return config
 
 
@@ -217,10 +196,8 @@ def load_any(config: SynthesizeConfig) -> Model:
     if not is_published(config.model):
         return model_files.load(config.model).to(device)
     if config.steps < FEW_STEPS:
-        log.warn(
-            f"synthesize: the published model was trained for 50 denoising steps, but --steps is {config.steps}"
-            " (recommended: --steps 50)"
-        )
+        trained = "synthesize: the published model was trained for 50 denoising steps"
+        log.warn(f"{trained}, but --steps is {config.steps} (recommended: --steps 50)")
     half = half_of(config)
     dtype = None if device.type == "cpu" else half or torch.float32
     model = model_files.load_published(config.model, dtype=dtype)
@@ -234,17 +211,13 @@ def load_any(config: SynthesizeConfig) -> Model:
 
 def _choose_split(model: PublishedMDM, config: SynthesizeConfig, budget_gb: float, bytes_per_value: int) -> WorkSplit:
     """How the model's work is cut to fit a memory budget in GB."""
-    split, peak_bytes = published.choose(
-        published.needs_of(model.config, bytes_per_value), int(budget_gb * 1e9), guidance=config.guidance != 1
-    )
+    needs, guidance = published.needs_of(model.config, bytes_per_value), config.guidance != 1
+    split, peak_bytes = published.choose(needs, int(budget_gb * 1e9), guidance=guidance)
     if peak_bytes > budget_gb * 1e9:
-        raise ResourceError(
-            "the model does not fit into the memory budget, however its work is split",
-            where="--memory-budget-gb" if config.memory_budget_gb else f"free memory of --device {config.device}",
-            expected=f">= {peak_bytes / 1e9:.1f} GB",
-            got=f"{budget_gb:.4g} GB",
-            remedy="use the 320x512 model, or bfloat16",
-        )
+        what = "the model does not fit into the memory budget, however its work is split"
+        where = "--memory-budget-gb" if config.memory_budget_gb else f"free memory of --device {config.device}"
+        expected, got = f">= {peak_bytes / 1e9:.1f} GB", f"{budget_gb:.4g} GB"
+        raise ResourceError(what, where=where, expected=expected, got=got, remedy="use the 320x512 model, or bfloat16")
     log.info(
         f"synthesize: modalities {'together' if split.modalities_together else 'one by one'}, guidance "
         f"{'together' if split.guidance_together else 'in two passes'}, {split.frames_at_once} frames per decoding, "
@@ -485,10 +458,8 @@ def usual_processes(config: SynthesizeConfig, paths: Sequence[Trajectory]) -> in
     need = PROCESS_BYTES + pixels * (PIXEL_BYTES + frames * FRAME_PIXEL_BYTES)
     possible = max(1, min(wanted, free // need))
     if possible < wanted:
-        log.info(
-            f"synthesize: {possible} of {wanted} processes: at {camera.width}x{camera.height} each takes about "
-            f"{memory.in_words(need)}, and {memory.in_words(free)} are free"
-        )
+        each = f"at {camera.width}x{camera.height} each takes about {memory.in_words(need)}"
+        log.info(f"synthesize: {possible} of {wanted} processes: {each}, and {memory.in_words(free)} are free")
     return possible
 
 
@@ -535,14 +506,9 @@ def make_trajectory(
                     numbers = (fit.scale, fit.shift_m, fit.residual_before, fit.residual)
                     fits[f"{index:06d}"] = [round(x, 5) if math.isfinite(x) else None for x in numbers]
                 if index % every == 0:
-                    cells = [
-                        *(to_bytes(rgb[place]) for rgb in (condition.color, sample.rgb)),
-                        depth_colors(sample.depth[place, 0].numpy()),
-                        class_colors(sample.semantics[place].numpy()),
-                        gray(sample.confidence[place, 0].numpy()),
-                    ]
-                    row = {"row": np.concatenate(cells, 1)}
-                    store.write_safetensors(state / f"row{index:06d}.safetensors", row)
+                    colors, own = (condition.color[place], sample.rgb[place]), sample.semantics[place]
+                    row = picture_row(colors, [sample.depth[place]], [own], sample.confidence[place])
+                    store.write_safetensors(state / f"row{index:06d}.safetensors", {"row": row})
             store.write_json(state / FITS, fits)
             store.write_safetensors(state / f"{number + 1:04d}.safetensors", dict(sample.latents))
             (state / f"{number:04d}.safetensors").unlink(missing_ok=True)

@@ -171,6 +171,11 @@ class PatchCodec(nn.Module):
         minus its mean over classes; a patch without labels is all zero."""
         return self.shares_to_latent(semantic_shares(ids))
 
+    def encode(self, rgb: Tensor, depth_m: Tensor, ids: Tensor) -> dict[Modality, Tensor]:
+        """Latents of all modalities."""
+        latents = self.encode_rgb(rgb), self.encode_depth(depth_m), self.encode_semantics(ids)
+        return dict(zip(MODALITIES, latents, strict=True))
+
     @staticmethod
     def shares_to_latent(shares: Tensor) -> Tensor:
         """Class shares [..,19,h,w] (sum 1, or 0 where unlabelled) -> centred latent of the same shape."""

@@ -108,16 +108,14 @@ def write_scores(
 def _distances(config: ScoreConfig) -> dict[str, PairDistance]:
     """The rows that need weights and have them."""
     found: dict[str, PairDistance] = {}
-    if not (config.perceptual_views or any(getattr(config, flag) for flag in LPIPS_FILES)):
-        return found
-    device = choose_device(config.device, "networks of the scores")
+    files = {flag: weights for flag in LPIPS_FILES if (weights := getattr(config, flag))}
+    device = choose_device(config.device, "networks of the scores") if files or config.perceptual_views else None
     if config.perceptual_views:
         found["perceptual"] = PerceptualDistance(CodecFeatures(mdm_files.load("embedded").codec), device=device)
-    for flag, (row, trunk) in LPIPS_FILES.items():
-        if getattr(config, flag):
-            weights = getattr(config, flag)
-            network = LpipsFeatures(read_checkpoint(Path(weights)), weights, trunk, config.lpips_input)
-            found[row] = PerceptualDistance(network, network.channel_weights, device)
+    for flag, weights in files.items():
+        row, trunk = LPIPS_FILES[flag]
+        network = LpipsFeatures(read_checkpoint(Path(weights)), weights, trunk, config.lpips_input)
+        found[row] = PerceptualDistance(network, network.channel_weights, device)
     return found
 
 

@@ -167,11 +167,8 @@ class TrajectorySets:
             return ImageSet(len(counted), lambda number: views.rgb_u8(indices[counted[number]]))
 
         def true_image(number: int) -> NDArray[np.uint8]:
-            place = counted[number]
-            true = reference.truth.at_view(trajectory.views[place], trajectory.frames[place], trajectory.name)
-            if true is None:
-                raise InputError("a view has no ground truth", where=f"{trajectory.name}, view {place}")
-            return to_bytes(true.seen.rgb)
+            view, frame = trajectory.views[counted[number]], trajectory.frames[counted[number]]
+            return to_bytes(reference.truth.at_view(view, frame, trajectory.name).seen.rgb)
 
         methods = {name: chosen(found, trajectory.indices[name]) for name, found in trajectory.sets.items()}
         every = range(len(trajectory.views))

@@ -111,9 +111,6 @@ def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path) -> N
             with ObservationWriter(out / path.name, path.name, "truth", "recorded") as writer:
                 for view in path.views:
                     true = truth.at_view(view, None, path.name)
-                    if true is None or true.moving is None or true.instance is None or true.marking is None:
-                        where = f"{path.name}, {view.time_s:g} s"
-                        raise InputError("the city has no ground truth at this view", where=where)
                     own = (true.moving[0].numpy().astype(np.uint8), true.instance, true.marking.astype(np.uint8))
                     for found, value in zip(maps.values(), own, strict=True):
                         found.append(value)
@@ -207,9 +204,10 @@ class LogPoints:
         near = [nearest_sweeps(sweeps, time_s, 1) for sweeps in self._sensors.values()]
         return self._merged([s for found in near for s in found if abs(s.time_s - time_s) <= SAME_SWEEP_S])
 
-    def around(self, time_s: float, count: int = MERGED_SWEEPS) -> OwnedPoints | None:
-        """Points of the ``count`` sweeps of each LiDAR that are nearest in time, or None where none is near."""
-        return self._merged([s for sweeps in self._sensors.values() for s in nearest_sweeps(sweeps, time_s, count)])
+    def around(self, time_s: float) -> OwnedPoints | None:
+        """Points of the sweeps of each LiDAR that are nearest in time, or None where none is near."""
+        every = (nearest_sweeps(sweeps, time_s, MERGED_SWEEPS) for sweeps in self._sensors.values())
+        return self._merged([sweep for sweeps in every for sweep in sweeps])
 
     def placed(self, points: OwnedPoints, time_s: float) -> NDArray[np.float32]:
         """Where points are at a moment, f32[N, 3] in the world; NaN where their object has no box then."""
