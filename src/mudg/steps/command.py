@@ -48,11 +48,20 @@ def parse(cls: type[Step], words: Sequence[str]) -> tuple[Step, Common]:
     listed |= {option.name: option for option in common_options() if option.name not in listed}
     parser = _Parser(prog=f"mudg {cls.verb()}", add_help=False, allow_abbrev=False)
     for option in listed.values():
-        _add(parser, option)
+        flag, about = flag_name(option.name), dict[str, Any](dest=option.name, default=argparse.SUPPRESS)
+        if option.kind is bool:
+            parser.add_argument(flag, action="store_true", **about)
+            parser.add_argument(_negated(option.name), action="store_false", **about)
+        else:
+            parser.add_argument(flag, nargs="*" if is_many(option.kind) else None, **about)
     parser.add_argument("words", nargs="*")
     found, unknown = parser.parse_known_intermixed_args(_plain_flags(words))
     if unknown:
-        _refuse_unknown(cls, unknown[0], listed)
+        flag, known = unknown[0].partition("=")[0], [flag_name(name) for name in listed]
+        ends = (one for one in known if one.endswith(flag.removeprefix("--")) and len(flag) > 4)
+        near = nearest(flag, known, 0.6) or next(ends, None)
+        remedy = f"did you mean {near}?" if near else f"see mudg {cls.verb()} --help-all"
+        raise UsageError(f"mudg {cls.verb()} has no flag {flag}", remedy=remedy)
     given: dict[str, Any] = {name: value for name, value in vars(found).items() if name in listed}
     own = {name: _value(listed[name].kind, given.pop(name)) for name in list(given) if listed[name].own}
     its_own = {field.name for field in dataclasses.fields(cls)}
@@ -73,17 +82,6 @@ def common_options() -> list[Option]:
     return list(options(Common))
 
 
-def _add(parser: argparse.ArgumentParser, option: Option) -> None:
-    flag, about = flag_name(option.name), dict[str, Any](dest=option.name, default=argparse.SUPPRESS)
-    if option.kind is bool:
-        parser.add_argument(flag, action="store_true", **about)
-        parser.add_argument(_negated(option.name), action="store_false", **about)
-    elif is_many(option.kind):
-        parser.add_argument(flag, nargs="*", **about)
-    else:
-        parser.add_argument(flag, **about)
-
-
 def _negated(name: str) -> str:
     """``render.video`` as ``--render.no-video``."""
     group, dot, last = name.rpartition(".")
@@ -97,15 +95,6 @@ def _plain_flags(words: Iterable[str]) -> list[str]:
         head, equals, value = word.partition("=")
         plain.append(head.replace("_", "-") + equals + value if word.startswith("--") else word)
     return plain
-
-
-def _refuse_unknown(cls: type[Step], word: str, listed: dict[str, Option]) -> NoReturn:
-    flag = word.partition("=")[0]
-    known = [flag_name(name) for name in listed]
-    ends = (one for one in known if one.endswith(flag.removeprefix("--")) and len(flag) > 4)
-    near = nearest(flag, known, 0.6) or next(ends, None)
-    remedy = f"did you mean {near}?" if near else f"see mudg {cls.verb()} --help-all"
-    raise UsageError(f"mudg {cls.verb()} has no flag {flag}", remedy=remedy)
 
 
 def _value(kind: Any, value: Any) -> Any:
