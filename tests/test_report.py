@@ -45,8 +45,12 @@ def grey(_index: int, seen: Observation) -> Observation:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the chain leaves behind, made from toy views; tests only read, or copy it."""
-    out = tmp_path_factory.mktemp("run") / "run"
+    """A run that tests only read, or copy."""
+    return finished_run(tmp_path_factory.mktemp("run") / "run")
+
+
+def finished_run(out: Path) -> Path:
+    """What the chain leaves behind, made from toy views."""
     scene = toy_views.write_scene(out / "scene")
     plain = toy_views.write_views(scene, out / "render" / "street_gaussians", "street_gaussians", (0.0, 2.0), dark(0.8))
     guided = toy_views.write_views(scene, out / "render" / "mudg_s", "mudg_s", (0.0, 2.0), dark(0.9))
