@@ -191,13 +191,13 @@ def test_the_image_of_a_view_fits_it_and_the_truth_is_exact(small: CityConfig) -
     poses, boxes = PoseFaults(0.05, 0.2, 0.05, 0.2), BoxFaults(0.1, 2, 0.1)
     log = record_with_faults(small, SensorFaults(looks, {}, LidarFaults((0.3, 0, 0)), poses, boxes), range(4), 77)
     view = log.world.frame_views("front")[2]
-    claimed = log.claimed(view)
+    claimed = city_clips.claimed_view(log.world, log.errors, view)
     assert 0.001 < np.linalg.norm(claimed.center_world - view.center_world) < 0.5
     assert np.allclose(log.recorded[2].view.world_from_cam, claimed.world_from_cam)
     assert np.array_equal(log.truth(view).rgb_u8, log.recorded[2].rgb)  # no noise or blur was asked for
     assert np.array_equal(log.truth(view).depth, log.world.render(view).depth)
     sideways = city_clips.shifted_view(log.world, view, 1.0)
-    step = log.claimed(sideways).center_world - claimed.center_world
+    step = city_clips.claimed_view(log.world, log.errors, sideways).center_world - claimed.center_world
     assert np.linalg.norm(step) == pytest.approx(1.0, abs=1e-9)
 
 

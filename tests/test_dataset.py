@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,12 +26,13 @@ from toy_fitted import write_toy_run
 import mudg
 from mudg.base import geometry
 from mudg.base.errors import ResourceError, UsageError
-from mudg.base.types import Camera, View
+from mudg.base.types import Camera, Scene, View
 from mudg.core import trajectory
 from mudg.datasets import coco, kitti, write
 from mudg.datasets.samples import LabelledView, Labeller, ObjectBox, around, outside
 from mudg.datasets.settings import DatasetConfig
 from mudg.datasets.tensors import as_dataset, collate
+from mudg.sim.returns import learn_returns
 from mudg.sim.session import Session, Trust
 from mudg.steps.export import Dataset
 
@@ -52,8 +55,32 @@ def provenance(out: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (out / "provenance.jsonl").read_text().splitlines()]
 
 
+@functools.cache
 def labeller_of(run: tuple[Path, Path], lidar: str = "") -> Labeller:
     return Labeller(Session(run[1], scene=run[0]), lidar)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _learnt_once() -> Iterator[None]:
+    """What the sweeps of a log tell is learnt once for all tests, because it takes seconds."""
+    kept: dict[str, Any] = {}
+
+    def learn(scene: Scene, *more: Any) -> Any:
+        if scene.root not in kept:
+            kept[scene.root] = learn_returns(scene, *more)
+        return kept[scene.root]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mudg.sim.session.learn_returns", learn)
+        yield
+
+
+@pytest.fixture(scope="module")
+def lidar(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A small LiDAR, as a file of beams."""
+    file = tmp_path_factory.mktemp("beams") / "small.json"
+    file.write_text(json.dumps({"elevations_deg": list(range(-15, 1)), "azimuth_step_deg": 1.0}))
+    return str(file)
 
 
 # -- formats ---------------------------------------------------------------------------------------
@@ -156,9 +183,9 @@ def test_coco_agrees_with_its_panoptic_images_and_pycocotools_reads_its_masks(
 
 
 def test_a_sequence_of_kitti_is_read_again_with_its_poses_tracks_and_scans(
-    run: tuple[Path, Path], tmp_path: Path
+    run: tuple[Path, Path], lidar: str, tmp_path: Path
 ) -> None:
-    chosen = {"cameras": ("front",), "shifts_m": (0.0, 0.5), "every": 2, "least_pixels": 1, "lidar": "vlp16"}
+    chosen = {"cameras": ("front",), "shifts_m": (0.0, 0.5), "every": 4, "least_pixels": 1, "lidar": lidar}
     out = write_set(run, "kitti-tracking", tmp_path / "kitti", **chosen)
     assert (out / "ImageSets/train.txt").read_text().split() == ["0000", "0001"]
     mudg.ingest(str(out), out=tmp_path / "back", sequence="0001", test_every=0)
@@ -176,8 +203,7 @@ def test_a_sequence_of_kitti_is_read_again_with_its_poses_tracks_and_scans(
             pose = ids["car"].pose_at(back.frames[index].view.time_s)
             there = geometry.invert(mine[index])[:3] @ np.array([*box["position_world_m"], 1.0])
             assert np.abs(there - (geometry.invert(theirs[index]) @ pose)[:3, 3]).max() < 1e-3
-    labeller = labeller_of(run, "vlp16")
-    again = labeller.label("x", labelled_view(run, lines[0]), ("rgb",)).sweep
+    again = labeller_of(run, lidar).label("x", labelled_view(run, lines[0]), ("rgb",)).sweep
     points = mudg.read_points(back, back.sweeps[0])
     assert again is not None and len(points.xyz) == len(again.reply.xyz) > 50
     ours = geometry.invert(mine[0]) @ again.world_from_lidar
@@ -201,28 +227,23 @@ def test_returns_lie_on_what_the_log_measured_and_are_counted_by_box(run: tuple[
     assert max(box.returns for box in labelled.boxes) > 10
 
 
-def test_drives_of_one_split_share_no_list_with_those_of_the_other(tmp_path: Path) -> None:
-    runs = [write_toy_run(tmp_path / name) for name in ("a", "b")]
-    drives = [
-        write.LabelledDrive(name, fit, scene, split=split)
-        for (scene, fit, _, _), name, split in zip(runs, ("a", "b"), ("train", "val"), strict=True)
-    ]
+def test_drives_of_one_split_share_no_list_with_those_of_the_other(run: tuple[Path, Path], tmp_path: Path) -> None:
+    scene, fit = run
+    drives = [write.LabelledDrive(name, fit, scene, split=split) for name, split in (("a", "train"), ("b", "val"))]
     for name in ("kitti", "coco", "nuscenes"):
-        (tmp_path / name).mkdir()
-        summary = write.write_dataset(
-            name, DatasetConfig(cameras=("front",)), drives, SimpleNamespace(path=tmp_path / name)
-        )
-        assert summary["images"] == 10
+        folder, chosen = tmp_path / name, DatasetConfig(cameras=("front",), every=2)
+        folder.mkdir()
+        assert write.write_dataset(name, chosen, drives, SimpleNamespace(path=folder))["images"] == 6
     lists = {split: (tmp_path / f"kitti/ImageSets/{split}.txt").read_text().split() for split in ("train", "val")}
-    assert (lists["train"], lists["val"]) == ([f"{n:06d}" for n in range(5)], [f"{n:06d}" for n in range(5, 10)])
+    assert (lists["train"], lists["val"]) == ([f"{n:06d}" for n in range(3)], [f"{n:06d}" for n in range(3, 6)])
     for number, split in enumerate(("train", "val")):
         images = json.loads((tmp_path / f"coco/annotations/instances_{split}.json").read_text())["images"]
-        assert [image["id"] for image in images] == list(range(5 * number, 5 * number + 5))
+        assert [image["id"] for image in images] == list(range(3 * number, 3 * number + 3))
     splits = json.loads((tmp_path / "nuscenes/splits.json").read_text())
     assert splits == {"train": ["scene-a-recorded"], "val": ["scene-b-recorded"]}
 
 
-def test_a_path_of_your_own_stands_for_the_shifts(run: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_path_of_your_own_stands_for_the_shifts(run: tuple[Path, Path], lidar: str, tmp_path: Path) -> None:
     scene = mudg.read_scene(run[0])
     poses = [frame.view.world_from_cam.copy() for frame in scene.frames_of("front")[1:3]]
     for pose in poses:
@@ -233,11 +254,12 @@ def test_a_path_of_your_own_stands_for_the_shifts(run: tuple[Path, Path], tmp_pa
     lines = provenance(out)
     assert [line["view"] for line in lines] == ["drone/000000", "drone/000001"]
     assert np.abs(np.array([line["world_from_camera"] for line in lines]) - poses).max() < 1e-9
-    views = as_dataset(run[1], run[0], path=file, cameras="front", fov_deg=70.0, lidar="vlp16")
-    focal = views[1]["intrinsics"][0, 0].item()
-    assert 2 * math.degrees(math.atan(views[1]["rgb"].shape[2] / 2 / focal)) == pytest.approx(70.0, abs=1e-3)
-    batch = collate([views[0], views[1]])
-    assert [len(points) for points in batch["points"]] == [len(views[n]["points"]) for n in (0, 1)]
+    views = as_dataset(run[1], run[0], path=file, cameras="front", fov_deg=70.0, lidar=lidar)
+    first, second = views[0], views[1]
+    focal = second["intrinsics"][0, 0].item()
+    assert 2 * math.degrees(math.atan(second["rgb"].shape[2] / 2 / focal)) == pytest.approx(70.0, abs=1e-3)
+    batch = collate([first, second])
+    assert [len(points) for points in batch["points"]] == [len(one["points"]) for one in (first, second)]
     assert batch["points"][0].shape[1] == 4 and batch["world_from_lidar"].shape == (2, 4, 4)
 
 
@@ -274,7 +296,8 @@ def test_its_own_reader_loads_123d(run: tuple[Path, Path], tmp_path: Path) -> No
 def test_an_interrupted_data_set_equals_an_uninterrupted_one(
     run: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = write_set(run, "coco", tmp_path / "whole", cameras=("front",))
+    chosen = {"cameras": ("front",), "every": 2}
+    whole = write_set(run, "coco", tmp_path / "whole", **chosen)
     label, calls = Labeller.label, []
 
     def interrupted(self: Labeller, *args: object, **more: object) -> LabelledView:
@@ -285,14 +308,16 @@ def test_an_interrupted_data_set_equals_an_uninterrupted_one(
 
     monkeypatch.setattr(Labeller, "label", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        write_set(run, "coco", tmp_path / "resumed", cameras=("front",))
-    resumed = write_set(run, "coco", tmp_path / "resumed", cameras=("front",))
+        write_set(run, "coco", tmp_path / "resumed", **chosen)
+    resumed = write_set(run, "coco", tmp_path / "resumed", **chosen)
     frames = len(json.loads((whole / "annotations/instances.json").read_text())["images"])
     assert len(calls) == frames + 1
-    files = lambda folder: {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-    apart = {Path("run.json"), Path("lock")}
-    a, b = files(whole), files(resumed)
-    assert {name for name in a.keys() | b.keys() if a.get(name) != b.get(name)} <= apart | {Path("manifest.json")}
+    a, b = (
+        {p.relative_to(out).as_posix(): p.read_bytes() for p in out.rglob("*") if p.is_file()}
+        for out in (whole, resumed)
+    )
+    apart = {name for name in a.keys() | b.keys() if a.get(name) != b.get(name)}
+    assert apart <= {"run.json", "lock", "manifest.json"}
 
 
 def test_a_full_disk_is_said_before_anything_is_drawn(
@@ -315,9 +340,9 @@ def test_objects_seen_from_unknown_sides_and_tiny_ones_are_left_out(run: tuple[P
     other = labeller.label("x", View(recorded.camera, beside, recorded.time_s), ("rgb",))
     moved = next((box for box in other.boxes if box.label == "car"), None)
     assert moved is None or moved.seen_from_deg > 10
-    assert not write.wanted(here, DatasetConfig(least_pixels=100_000)).boxes
+    assert not here.wanted(DatasetConfig(least_pixels=100_000)).boxes
     strict = replace(here, boxes=(replace(car, seen_from_deg=80.0),))
-    assert not write.wanted(strict, DatasetConfig(farthest_seen_deg=60.0, least_pixels=0)).boxes
+    assert not strict.wanted(DatasetConfig(farthest_seen_deg=60.0, least_pixels=0)).boxes
 
 
 def test_words_for_what_cannot_be(run: tuple[Path, Path], tmp_path: Path) -> None:
@@ -404,9 +429,9 @@ def overlap(a: tuple[float, ...], b: tuple[float, ...]) -> float:
 
 
 def test_nuscenes_tables_refer_to_each_other_and_boxes_lie_where_they_are(
-    run: tuple[Path, Path], tmp_path: Path
+    run: tuple[Path, Path], lidar: str, tmp_path: Path
 ) -> None:
-    chosen = {"cameras": ("front",), "shifts_m": (0.0, 0.5), "every": 2, "least_pixels": 1, "lidar": "vlp16"}
+    chosen = {"cameras": ("front",), "shifts_m": (0.0, 0.5), "every": 4, "least_pixels": 1, "lidar": lidar}
     out = write_set(run, "nuscenes", tmp_path / "nuscenes", **chosen)
     tables = {path.stem: json.loads(path.read_text()) for path in (out / "v1.0-mini").glob("*.json")}
     known = {name: {row["token"]: row for row in rows} for name, rows in tables.items()}
@@ -430,9 +455,9 @@ def test_nuscenes_tables_refer_to_each_other_and_boxes_lie_where_they_are(
     for row in tables["sample_data"]:
         ego = known["ego_pose"][row["ego_pose_token"]]
         mount = known["calibrated_sensor"][row["calibrated_sensor_token"]]
-        lidar = row["fileformat"] == "pcd"
-        assert (out / row["filename"]).is_file() and lidar == ("LIDAR_TOP" in row["filename"])
-        if lidar:
+        cloud = row["fileformat"] == "pcd"
+        assert (out / row["filename"]).is_file() and cloud == ("LIDAR_TOP" in row["filename"])
+        if cloud:
             rows = np.fromfile(out / row["filename"], "<f4").reshape(-1, 5)
             assert len(rows) > 50 and 0 <= rows[:, 3].min() <= rows[:, 3].max() <= 255
             continue

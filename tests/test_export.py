@@ -43,7 +43,7 @@ from mudg.gaussians.fit import render_view
 from mudg.gaussians.model import SceneModel, compose
 from mudg.gaussians.nodes import DeformableNode, RigidNode
 from mudg.gaussians.storage import load_model, save_model
-from mudg.scene.read import open_files, read_points
+from mudg.scene.read import read_points
 from mudg.steps.edit import AssetImport
 from mudg.steps.export import Export
 
@@ -419,7 +419,7 @@ def test_one_file_holds_the_messages_of_the_bag(
     assert app.main(["export", "mcap", str(folder / "scene"), "--out", str(tmp_path / "a.mcap")]) == 0
     assert (tmp_path / "a.mcap").read_bytes() == (folder / "out" / "log_0.mcap").read_bytes()
     monkeypatch.setattr(ros2, "CHUNK_BYTES", 20_000)
-    write_mcap(tmp_path / "b.mcap", ros2.Ros2Messages(log_of(scene)))
+    write_mcap(tmp_path / "b.mcap", ros2.Ros2Messages(LogRecords(scene)))
     with (tmp_path / "b.mcap").open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         times = [message.log_time for _, _, message in reader.iter_messages(log_time_order=False)]
@@ -445,17 +445,12 @@ def test_points_of_the_world_fall_on_their_pixels_through_frames_and_calibration
         assert info.distortion_model == "plumb_bob" and (info.width, info.height) == (24, 12)
 
 
-def log_of(scene: Scene, fused: PointCloud | None = None) -> LogRecords:
-    files = open_files(scene.root)
-    return LogRecords(scene, lambda f: files.read(f.image.path), lambda s: read_points(scene, s), fused)
-
-
 def test_transforms_come_first_and_sensors_that_move_hang_on_the_map(tmp_path: Path) -> None:
     scene = street(tmp_path / "scene")
     late = replace(scene.frames[2].view, world_from_cam=scene.frames[2].view.world_from_cam @ geometry.yaw_matrix(0.1))
     moved = replace(scene, frames=(*scene.frames[:2], replace(scene.frames[2], view=late)))
     fused = PointCloud(np.ones((1, 3), np.float32), np.array([[1, 2, 3]], np.uint8), "world")
-    messages = list(ros2.Ros2Messages(log_of(moved, fused)))
+    messages = list(ros2.Ros2Messages(LogRecords(moved, fused)))
     order = [(m.time_s, not m.topic.startswith("/tf")) for m in messages]
     assert order == sorted(order)
     static = next(m.value() for m in messages if m.topic == "/tf_static")
@@ -472,12 +467,12 @@ def test_names_are_those_that_ros_accepts(exported: tuple[Scene, Path]) -> None:
     assert list(names.values()) == ["front", "CAM_front_left", "cam_front_left", "n02", "sensor", "sensor_2"]
     scene = replace(exported[0], tracks=(replace(exported[0].tracks[0], label="a\0b"),))
     with pytest.raises(InputError, match="zero byte"):
-        ros2.Ros2Messages(log_of(scene))
+        ros2.Ros2Messages(LogRecords(scene))
 
 
 def test_the_same_log_gives_the_same_bag_in_bounded_memory(exported: tuple[Scene, Path], tmp_path: Path) -> None:
     scene, folder = exported
-    first, read, log = (folder / "out" / "log_0.mcap").read_bytes(), [], log_of(scene)
+    first, read, log = (folder / "out" / "log_0.mcap").read_bytes(), [], LogRecords(scene)
     picture = log.picture
     log.picture = lambda frame: read.append(frame.id) or picture(frame)
     messages = ros2.Ros2Messages(log)

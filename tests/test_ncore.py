@@ -27,7 +27,7 @@ from roundtrip import needs_native
 from mudg import app
 from mudg.base import geometry
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.base.types import Camera, EgoPath, Frame, Scene, SweepPoints
+from mudg.base.types import Camera, EgoPath, Frame, Scene
 from mudg.formats.exporters.messages import LogRecords
 from mudg.formats.exporters.ncore import PoseKeys, package, sensor_ids, write_ncore
 from mudg.formats.importers import RECOGNISERS
@@ -52,8 +52,7 @@ pytestmark = [needs_native, pytest.mark.filterwarnings("ignore::DeprecationWarni
 
 
 def records(scene: Scene, **changes: Any) -> LogRecords:
-    files, changed = open_files(scene.root), replace(scene, **changes)
-    return LogRecords(changed, lambda frame: files.read(frame.image.path), lambda sweep: read_points(scene, sweep))
+    return LogRecords(replace(scene, **changes))
 
 
 @pytest.fixture(scope="module")
@@ -165,9 +164,7 @@ def test_shutters_masks_and_sensors_that_move(truth: Scene, tmp_path: Path) -> N
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mudg.formats.exporters.ncore.read_label", lambda *_: bonnet)
         labelled = tuple(replace(frame, labels={"ego": frame.image}) for frame in shaken.frames)
-        write_ncore(
-            tmp_path, LogRecords(replace(shaken, frames=labelled), records(truth).picture, records(truth).points)
-        )
+        write_ncore(tmp_path, records(shaken, frames=labelled))
     scene = ingest(tmp_path, tmp_path / "back")
     assert scene.cameras["front"].shutter == "bottom_to_top"
     assert scene.cameras["front"].readout_s == 0.03 and scene.cameras["front_left"].readout_s == 0.0
@@ -323,14 +320,10 @@ def test_what_cannot_be_written_is_refused(truth: Scene, tmp_path: Path) -> None
     refused("vehicle's path", write_ncore, tmp_path, records(truth, ego=nowhere))
     twice = replace(truth.frames[0], id="front/000099")
     refused("front/000099", write_ncore, tmp_path, records(truth, frames=(*truth.frames, twice)))
-    early = replace(truth, sweeps=truth.sweeps[:1])
-    reads = records(early)
-
-    def late_points(sweep: Any) -> SweepPoints:
-        return replace(reads.points(sweep), dt_s=reads.points(sweep).dt_s - 3)
-
-    late = LogRecords(early, reads.picture, late_points)
-    refused("more than a second", write_ncore, tmp_path, late)
+    early = records(truth, sweeps=truth.sweeps[:1])
+    points = early.points
+    early.points = lambda sweep: replace(points(sweep), dt_s=points(sweep).dt_s - 3)
+    refused("more than a second", write_ncore, tmp_path, early)
     assert not list(tmp_path.iterdir())
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mudg.base import store
 from mudg.base.palette import CLASSES, DISPLAY_COLORS, DYNAMIC_IDS, ID, UNLABELLED
 from mudg.base.versions import version
-from mudg.datasets.samples import DatasetPlace, LabelledView, ObjectBox, around
+from mudg.datasets.samples import LabelledView, ObjectBox, around
 
 FILES: Final = ("images/*.png", "panoptic/*.png", "annotations/*.json", "provenance.jsonl")
 CATEGORY_OF: Final = {
@@ -28,37 +28,36 @@ CATEGORY_OF: Final = {
 """Label -> class, where they differ."""
 
 
-def write_view(folder: Path, target: DatasetPlace, view: LabelledView) -> dict[str, Any]:
+def write_view(folder: Path, view: LabelledView) -> dict[str, Any]:
     """The image, its panoptic image, and its annotations."""
-    number = target.number
-    classes, instances = view.layers["classes"], view.layers["instances"]
+    name, classes, instances = f"{view.number:06d}.png", view.layers["classes"], view.layers["instances"]
     height, width = classes.shape
-    store.write_image(folder / "images" / f"{number:06d}.png", view.layers["rgb"])
+    store.write_image(folder / "images" / name, view.layers["rgb"])
     segments, ids, annotations = [], np.zeros((height, width), np.uint32), []
     for box in view.boxes:
         mask = instances == box.number
-        category, segment = 1 + class_of(box, classes[mask]), len(segments) + 1
-        ids[mask] = segment
-        rectangle = _rectangle(mask)
-        whole = {"id": segment, "category_id": category, "area": box.pixels, "bbox": rectangle, "iscrowd": 0}
-        segments.append(whole)
+        whole = _segment(mask, ids, segments, class_of(box, classes[mask]), False)
         mask_of = {"size": [height, width], "counts": run_lengths(mask)}
-        annotations.append(
-            {**whole, "segmentation": mask_of, "track_id": box.track_id, "seen_from_deg": box.seen_from_deg}
-        )
+        more = {"segmentation": mask_of, "track_id": box.track_id, "seen_from_deg": box.seen_from_deg}
+        annotations.append({**whole, **more})
     for train_id in np.unique(classes[ids == 0]).tolist():
-        stuff = (classes == train_id) & (ids == 0)
-        if train_id == UNLABELLED:
-            continue
-        segment, crowd = len(segments) + 1, int(train_id in DYNAMIC_IDS)
-        ids[stuff] = segment
-        about = {"id": segment, "category_id": 1 + train_id, "area": int(stuff.sum()), "bbox": _rectangle(stuff)}
-        segments.append({**about, "iscrowd": crowd})
-    store.write_image(
-        folder / "panoptic" / f"{number:06d}.png", np.stack([(ids >> s) & 255 for s in (0, 8, 16)], -1).astype(np.uint8)
-    )
-    image = {"id": number, "file_name": f"{number:06d}.png", "width": width, "height": height}
+        if train_id != UNLABELLED:
+            _segment((classes == train_id) & (ids == 0), ids, segments, train_id, train_id in DYNAMIC_IDS)
+    panoptic = np.stack([(ids >> s) & 255 for s in (0, 8, 16)], -1).astype(np.uint8)
+    store.write_image(folder / "panoptic" / name, panoptic)
+    image = {"id": view.number, "file_name": name, "width": width, "height": height}
     return {"entry": image, "annotations": annotations, "segments": segments}
+
+
+def _segment(
+    mask: NDArray[np.bool_], ids: NDArray[np.uint32], segments: list[dict[str, Any]], train_id: int, crowd: bool
+) -> dict[str, Any]:
+    """Add a segment of some pixels to the list and to the picture of ids; returns it."""
+    left, top, right, bottom = around(mask)
+    whole = {"id": len(segments) + 1, "category_id": 1 + train_id, "area": int(mask.sum())}
+    segments.append({**whole, "bbox": [left, top, right - left, bottom - top], "iscrowd": int(crowd)})
+    ids[mask] = len(segments)
+    return segments[-1]
 
 
 def write_whole(folder: Path, records: Sequence[Mapping[str, Any]]) -> None:
@@ -98,8 +97,3 @@ def run_lengths(mask: NDArray[np.bool_]) -> list[int]:
     edges = np.flatnonzero(np.diff(flat)) + 1
     lengths = np.diff(np.concatenate([[0], edges, [len(flat)]])).tolist()
     return [0, *lengths] if flat[0] else lengths
-
-
-def _rectangle(mask: NDArray[np.bool_]) -> list[float]:
-    left, top, right, bottom = around(mask)
-    return [left, top, right - left, bottom - top]

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mudg.base import geometry, store
-from mudg.datasets.samples import DatasetPlace, LabelledView, ObjectBox, clipped
+from mudg.datasets.samples import LabelledView, ObjectBox, clipped
 
 FILES: Final = tuple("image_2/*.png velodyne/*.bin calib/*.txt label_2/*.txt ImageSets/*.txt provenance.jsonl".split())
 TRACKING_FILES: Final = tuple(
@@ -43,9 +43,9 @@ EARTH_RADIUS_M: Final = 6378137.0
 Matrix = NDArray[np.float64]
 
 
-def write_view(folder: Path, target: DatasetPlace, view: LabelledView) -> dict[str, Any]:
+def write_view(folder: Path, view: LabelledView) -> dict[str, Any]:
     """The files of a frame of the object benchmark."""
-    name = f"{target.number:06d}"
+    name = f"{view.number:06d}"
     cam_from_velo, velo_from_imu = _write_sensors(folder, "image_2", name, view)
     named = {"R0_rect": np.eye(3), "Tr_velo_to_cam": cam_from_velo[:3], "Tr_imu_to_velo": velo_from_imu[:3]}
     store.write_text(folder / "calib" / f"{name}.txt", calibration(view, named))
@@ -61,13 +61,13 @@ def write_whole(folder: Path, records: Sequence[Mapping[str, Any]]) -> None:
         store.write_text(folder / "ImageSets" / f"{split}.txt", _text(dict.fromkeys(names)))
 
 
-def write_tracked(folder: Path, target: DatasetPlace, view: LabelledView) -> dict[str, Any]:
+def write_tracked(folder: Path, view: LabelledView) -> dict[str, Any]:
     """The files of a frame of the tracking benchmark; every path is a sequence."""
-    sequence = f"{target.sequence:04d}"
-    cam_from_velo, velo_from_imu = _write_sensors(folder, "image_02", f"{sequence}/{target.frame:06d}", view)
+    sequence = f"{view.sequence:04d}"
+    cam_from_velo, velo_from_imu = _write_sensors(folder, "image_02", f"{sequence}/{view.frame:06d}", view)
     named = {"R_rect": np.eye(3), "Tr_velo_cam": cam_from_velo[:3], "Tr_imu_velo": velo_from_imu[:3]}
     lines = [
-        f"{target.frame} {box.number} " + label_line(box, view, str(sum(box.truncation >= share for share in LEVELS)))
+        f"{view.frame} {box.number} " + label_line(box, view, str(sum(box.truncation >= share for share in LEVELS)))
         for box in view.boxes
     ]
     packet = packet_line(view.view.world_from_cam @ cam_from_velo @ velo_from_imu)
@@ -95,8 +95,7 @@ def _write_sensors(folder: Path, images: str, name: str, view: LabelledView) -> 
     store.write_image(folder / images / f"{name}.png", view.layers["rgb"])
     mount, sweep = view.mount, view.sweep
     if sweep is not None:
-        rows = np.column_stack([sweep.reply.xyz, sweep.reply.intensity]).astype("<f4")
-        store.write_blocks(folder / "velodyne" / f"{name}.bin", [rows.tobytes()])
+        store.write_blocks(folder / "velodyne" / f"{name}.bin", [sweep.points.tobytes()])
     if mount is None:
         return VELO_TO_CAM, np.eye(4)
     cam_from_velo = VELO_TO_CAM if sweep is None else geometry.invert(mount) @ sweep.vehicle_from_lidar

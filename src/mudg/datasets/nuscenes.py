@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import geometry, store
-from mudg.datasets.samples import DatasetPlace, LabelledView
+from mudg.datasets.samples import LabelledView
 from mudg.formats.importers.nuscenes import CAMERAS
 
 RELEASE: Final = "v1.0-mini"
@@ -49,12 +49,12 @@ def token(*words: object) -> str:
     return hashlib.sha256(" ".join(map(str, words)).encode()).hexdigest()[:32]
 
 
-def write_view(folder: Path, target: DatasetPlace, view: LabelledView) -> Row:
+def write_view(folder: Path, view: LabelledView) -> Row:
     """The image of a sample and, if it has one, its sweep, and what the tables need to know of them."""
     camera = view.view.camera
     channel = CHANNELS.get(camera.name, f"CAM_{camera.name.upper()}")
     ending, index = view.name.removeprefix(f"{camera.name}_").split("/")
-    ending = f"{target.drive}-{ending}"
+    ending = f"{view.drive}-{ending}"
     name = f"samples/{channel}/mudg__{ending}__{channel}__{index}.png"
     store.write_image(folder / name, view.layers["rgb"])
     intrinsics = [[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]]
@@ -67,7 +67,7 @@ def write_view(folder: Path, target: DatasetPlace, view: LabelledView) -> Row:
     mount = NOWHERE if view.mount is None else pose_row(view.mount)
     pose = view.view.world_from_cam if view.mount is None else view.view.world_from_cam @ geometry.invert(view.mount)
     time_us = START_US + round(view.view.time_s * 1e6)
-    whole: Row = {"drive": target.drive, "scene": ending, "index": index, "channel": channel, "filename": name}
+    whole: Row = {"drive": view.drive, "scene": ending, "index": index, "channel": channel, "filename": name}
     whole |= {"time_us": time_us, "width": camera.width, "height": camera.height, "ego": pose_row(pose)}
     whole |= {"mount": {**mount, "camera_intrinsic": intrinsics}, "boxes": boxes}
     if view.sweep is not None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mudg.base import geometry, store
 from mudg.base.errors import ResourceError
 from mudg.datasets import nuscenes
-from mudg.datasets.samples import DatasetPlace, LabelledView
+from mudg.datasets.samples import LabelledView
 
 FILES: Final = ("logs/*/*/*.arrow", "provenance.jsonl")
 CAMERAS: Final = {
@@ -41,11 +41,7 @@ Row = Mapping[str, Any]
 
 
 def library() -> Any:
-    """The package.
-
-    Raises:
-        ResourceError: it is not installed.
-    """
+    """The package. ResourceError: it is not installed."""
     try:
         import py123d
     except ImportError as error:
@@ -54,10 +50,9 @@ def library() -> Any:
     return py123d
 
 
-def write_view(folder: Path, target: DatasetPlace, view: LabelledView) -> dict[str, Any]:
+def write_view(folder: Path, view: LabelledView) -> dict[str, Any]:
     """Image, sweep and facts of a view as of nuScenes, until ``write_whole`` takes them into the log."""
-    camera = nuscenes.pose_row(view.view.world_from_cam)
-    return {**nuscenes.write_view(folder, target, view), "camera": camera}
+    return {**nuscenes.write_view(folder, view), "camera": nuscenes.pose_row(view.view.world_from_cam)}
 
 
 def write_whole(folder: Path, records: Sequence[Row]) -> None:

@@ -8,7 +8,7 @@ depth that fits its box.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -18,6 +18,7 @@ from mudg.base import geometry
 from mudg.base.errors import UsageError
 from mudg.base.palette import DYNAMIC_IDS
 from mudg.base.types import Camera, Track, View
+from mudg.datasets.settings import DatasetConfig
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.rendering import outline_mask
 from mudg.sim.lidar import LidarReply, LidarRequest, mounted
@@ -37,19 +38,14 @@ Rectangle = tuple[float, float, float, float]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectBox:
-    """An object in a view.
-
-    Args:
-        track_id, label: of the log. number: value of its pixels in ``LabelledView.instances``.
-        world_from_box: f64[4, 4] of its centre (x forward, z up). size_m: length, width, height in metres.
-        amodal_px: of the whole box, unclipped by the image and by what hides it. visible_px: of its visible pixels;
-            None where there are none.
-        pixels: how many of it are visible. occlusion: share of its pixels in the image that something hides, [0, 1];
-            NaN for parked objects, which cannot be drawn alone. truncation: share of ``amodal_px`` outside the image.
-        seen_from_deg: angle between this view of it and the nearest from which it was recorded: a side that no camera
-            saw is guesswork.
-        returns: how many returns of the view's sweep lie in the box; 0 without one.
-    """
+    """An object in a view. ``track_id``, ``label``: of the log. ``number``: value of its pixels in
+    ``LabelledView.instances``. ``world_from_box``: f64[4, 4] of its centre (x forward, z up). ``size_m``: length,
+    width, height in metres. ``amodal_px``: of the whole box, unclipped by the image and by what hides it.
+    ``visible_px``: of its visible pixels; None where there are none. ``pixels``: how many of it are visible.
+    ``occlusion``: share of its pixels in the image that something hides, [0, 1]; NaN for parked objects, which cannot
+    be drawn alone. ``truncation``: share of ``amodal_px`` outside the image. ``seen_from_deg``: angle between this view
+    of it and the nearest from which it was recorded: a side that no camera saw is guesswork. ``returns``: how many
+    returns of the view's sweep lie in the box; 0 without one."""
 
     track_id: str
     label: str
@@ -64,6 +60,21 @@ class ObjectBox:
     seen_from_deg: float
     returns: int = 0
 
+    def record(self) -> dict[str, Any]:
+        """As JSON values."""
+        return {
+            "id": self.track_id,
+            "label": self.label,
+            "position_world_m": self.world_from_box[:3, 3].tolist(),
+            "yaw_world_rad": geometry.yaw_of(self.world_from_box),
+            "size_m": list(self.size_m),
+            "pixels": self.pixels,
+            "occlusion": None if np.isnan(self.occlusion) else round(self.occlusion, 4),
+            "truncation": round(self.truncation, 4),
+            "seen_from_deg": round(self.seen_from_deg, 2),
+            "returns": self.returns,
+        }
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewSweep:
@@ -75,17 +86,16 @@ class ViewSweep:
     world_from_lidar: NDArray[np.float64]
     name: str
 
+    @property
+    def points(self) -> NDArray[np.float32]:
+        """x, y, z in metres in the sensor's frame and intensity of every return, f32[N, 4]."""
+        return np.column_stack([self.reply.xyz, self.reply.intensity]).astype("<f4")
 
-@dataclass(frozen=True, slots=True)
-class DatasetPlace:
-    """Where a view stands in a data set: its number among all views, drive, split (train or val), number of its path
-    (``sequence``, counted over all drives), and number within the path, without gaps."""
-
-    number: int
-    drive: str
-    split: str
-    sequence: int
-    frame: int
+    def inside(self, world_from_box: NDArray[np.float64], size_m: Sequence[float]) -> int:
+        """How many returns lie in a box."""
+        box_from_lidar = geometry.invert(world_from_box) @ self.world_from_lidar
+        local = geometry.transform_points(box_from_lidar, self.reply.xyz.astype(np.float64))
+        return int((np.abs(local) <= np.asarray(size_m) / 2).all(1).sum())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +103,8 @@ class LabelledView:
     """A view with its labels. ``name``: of its trajectory and number, such as ``front_shift+2.0/000003``. ``layers``:
     as in ``CameraReply``; ``instances`` u16[H, W] also marks parked objects. ``boxes``: of all objects with at least
     part of their box in the image. ``mount``: vehicle-from-camera f64[4, 4]; None: the log does not tell. ``sweep``: of
-    the LiDAR that was asked for."""
+    the LiDAR that was asked for. In a data set: ``number`` among all views, ``drive``, number of its path
+    (``sequence``, counted over all drives), and ``frame``, its number within the path, without gaps."""
 
     name: str
     view: View
@@ -102,17 +113,20 @@ class LabelledView:
     trust: Trust
     mount: NDArray[np.float64] | None = None
     sweep: ViewSweep | None = None
+    number: int = 0
+    drive: str = ""
+    sequence: int = 0
+    frame: int = 0
+
+    def wanted(self, config: DatasetConfig) -> LabelledView:
+        """The view with the objects that the settings do not leave out."""
+        seen = (box for box in self.boxes if box.pixels >= max(config.least_pixels, 1))
+        return replace(self, boxes=tuple(box for box in seen if box.seen_from_deg <= config.farthest_seen_deg))
 
 
 class Labeller:
-    """Makes labelled views of a session.
-
-    Args:
-        session: of a run, with its log. lidar: as the setting of ``mudg dataset``; empty: none.
-
-    Raises:
-        UsageError: a fit without its log, or one that tells nothing of such a LiDAR.
-    """
+    """Makes labelled views of a session of a run, with its log. ``lidar``: as the setting of ``mudg dataset``; empty:
+    none. UsageError: a fit without its log, or one that tells nothing of such a LiDAR."""
 
     def __init__(self, session: Session, lidar: str = "") -> None:
         if session.scene is None:
@@ -135,19 +149,14 @@ class Labeller:
     ) -> LabelledView:
         """A view with its layers and boxes; ``swept``: and with its sweep, if there is a LiDAR. ``motion_to``: as in
         ``CameraRequest``, of the layer ``motion``."""
-        now = Instant(view.time_s, view.world_from_cam)
+        now, camera = Instant(view.time_s, view.world_from_cam), view.camera
         needed: tuple[Layer, ...] = tuple(dict.fromkeys((*layers, "depth", "classes", "instances")))
-        camera = view.camera
+        later = motion_to if "motion" in layers else None
         request = CameraRequest(
-            optics=Pinhole(camera.width, camera.height, *camera.intrinsics),
-            start=now,
-            layers=needed,
-            colors_of=camera.name,
-            motion_to=motion_to if "motion" in layers else None,
+            optics=Pinhole.of(camera), start=now, layers=needed, colors_of=camera.name, motion_to=later
         )
         (reply,) = self.session.render([request])
-        instances = self._instances(view, reply)
-        drawn = {**reply.layers, "instances": instances}
+        drawn = {**reply.layers, "instances": self._instances(view, reply)}
         mount = self.mount(camera.name)
         sweep = self._sweep(view, mount) if swept else None
         boxes = tuple(self._boxes(view, now, drawn, sweep))
@@ -222,11 +231,6 @@ class Labeller:
                 within = outline_mask(view, pose, size)
                 hidden &= within if within is not None else False
                 occlusion = float(hidden.sum() / (hidden.sum() + pixels)) if pixels else 1.0
-            returns = 0
-            if sweep is not None:
-                xyz = sweep.reply.xyz.astype(np.float64)
-                local = geometry.transform_points(geometry.invert(pose) @ sweep.world_from_lidar, xyz)
-                returns = int((np.abs(local) <= np.asarray(size) / 2).all(1).sum())
             yield ObjectBox(
                 track_id=name,
                 label=self.labels[name],
@@ -239,7 +243,7 @@ class Labeller:
                 occlusion=occlusion,
                 truncation=outside(amodal, view.camera),
                 seen_from_deg=self._seen_from_deg(name, track, pose, view),
-                returns=returns,
+                returns=0 if sweep is None else sweep.inside(pose, size),
             )
 
     def _seen_from_deg(self, name: str, track: Track | None, pose: NDArray[np.float64], view: View) -> float:

@@ -14,7 +14,7 @@ from torch.utils.data import Dataset, default_collate
 from mudg.base import config as configuration
 from mudg.datasets.samples import LabelledView, Labeller
 from mudg.datasets.settings import DatasetConfig
-from mudg.datasets.write import LabelledDrive, wanted
+from mudg.datasets.write import LabelledDrive
 from mudg.sim.session import Layer
 
 LAYERS: Final[tuple[Layer, ...]] = ("rgb", "depth", "classes", "instances", "confidence")
@@ -36,13 +36,9 @@ class LabelledViews(Dataset[dict[str, Any]]):
     f32[P, 4]: x, y, z in metres in the frame of the sensor, intensity in [0, 1]; and ``world_from_lidar`` f64[4, 4].
     Nothing is drawn at random: the same index gives the same bytes in any process.
 
-    Args:
-        run, scene: as for ``mudg.sim.Session``, as paths, so that every worker opens its own. settings: which views.
-        path: file of a camera path that stands for the shifts, as of ``mudg render --path``.
-
-    Raises:
-        InputError, UsageError: as ``Session`` and ``Labeller``.
-    """
+    ``run``, ``scene``: as for ``mudg.sim.Session``, as paths, so that every worker opens its own. ``settings``: which
+    views. ``path``: file of a camera path that stands for the shifts, as of ``mudg render --path``. Raises what
+    ``Session`` and ``Labeller`` raise."""
 
     def __init__(
         self,
@@ -69,7 +65,7 @@ class LabelledViews(Dataset[dict[str, Any]]):
             raise IndexError(f"view {index} of {len(self)}")
         self._labeller = self._labeller or self.drive.labeller(self.settings)
         name, view = self.views[index]
-        return entry(wanted(self._labeller.label(name, view, LAYERS), self.settings))
+        return entry(self._labeller.label(name, view, LAYERS).wanted(self.settings))
 
 
 def entry(view: LabelledView) -> dict[str, Any]:
@@ -79,8 +75,7 @@ def entry(view: LabelledView) -> dict[str, Any]:
     rows = lambda values, shape: torch.tensor(np.array(list(values), np.float32).reshape(len(boxes), *shape))
     swept: dict[str, Tensor] = {}
     if view.sweep is not None:
-        reply = view.sweep.reply
-        swept["points"] = torch.from_numpy(np.column_stack([reply.xyz, reply.intensity]).astype(np.float32))
+        swept["points"] = torch.from_numpy(view.sweep.points)
         swept["world_from_lidar"] = torch.from_numpy(view.sweep.world_from_lidar.copy())
     return {
         **swept,

@@ -16,13 +16,13 @@ from typing import Any, Final, cast
 
 import numpy as np
 
-from mudg.base import geometry, log, store
+from mudg.base import log, store
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.memory import in_words
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Scene, View
 from mudg.datasets import coco, kitti, nuscenes, py123d
-from mudg.datasets.samples import DatasetPlace, LabelledView, Labeller, ObjectBox
+from mudg.datasets.samples import LabelledView, Labeller
 from mudg.datasets.settings import DatasetConfig
 from mudg.editing.render import trajectories
 from mudg.editing.runs import find_run, scene_at
@@ -30,7 +30,7 @@ from mudg.editing.script import EditScript
 from mudg.editing.settings import RenderConfig
 from mudg.scene.read import read_scene
 from mudg.sim.lidar import mounted
-from mudg.sim.session import Instant, Layer, Session, Trust
+from mudg.sim.session import Instant, Layer, Session
 
 Record = Mapping[str, Any]
 PNG_BYTES: Final = 2.2
@@ -49,7 +49,7 @@ class Format:
 
     layers: tuple[Layer, ...]
     files: tuple[str, ...]
-    view: Callable[[Path, DatasetPlace, LabelledView], dict[str, Any]]
+    view: Callable[[Path, LabelledView], dict[str, Any]]
     whole: Callable[[Path, Sequence[Record]], None]
     one_sweep: bool = False
     check: Callable[[], object] = lambda: None
@@ -67,12 +67,9 @@ FORMATS: Final[Mapping[str, Format]] = {
 
 @dataclass(frozen=True, slots=True)
 class LabelledDrive:
-    """A reconstruction whose views are wanted.
-
-    Args:
-        name: unlike that of other drives of the data set. run, scene, edits: as for ``Session``. split: train or val.
-        path: file of a camera path that stands for the shifts. provenance: kept with every image.
-    """
+    """A reconstruction whose views are wanted. ``name``: unlike that of other drives of the data set. ``run``,
+    ``scene``, ``edits``: as for ``Session``. ``split``: train or val. ``path``: file of a camera path that stands for
+    the shifts. ``provenance``: kept with every image."""
 
     name: str
     run: Path
@@ -83,11 +80,8 @@ class LabelledDrive:
     provenance: Record = dataclasses.field(default_factory=dict)
 
     def views(self, config: DatasetConfig) -> list[tuple[str, View]]:
-        """Names and views, trajectory by trajectory.
-
-        Raises:
-            UsageError: a camera, LiDAR or path that its log does not have, or a fit without its log.
-        """
+        """Names and views, trajectory by trajectory. UsageError: a camera, LiDAR or path that its log does not have, or
+        a fit without its log."""
         scene = self.log()
         if config.lidar:
             mounted(scene, config.lidar)
@@ -148,14 +142,15 @@ def _written(
             number += 1
             sequence = (drive.name, title.partition("/")[0])
             sequences[sequence] = sequences.get(sequence, -1) + 1
-            place = DatasetPlace(number, drive.name, drive.split, list(sequences).index(sequence), sequences[sequence])
+            place = {"number": number, "sequence": list(sequences).index(sequence), "frame": sequences[sequence]}
             path = folder / RECORDS / f"{number:06d}.json"
             if not path.is_file():
                 labeller = labeller or drive.labeller(config)
                 swept = not chosen.one_sweep or view.camera.name == cameras[0]
-                labelled = wanted(labeller.label(title, view, chosen.layers, swept=swept), config)
-                made = chosen.view(folder, place, labelled)
-                store.write_json(path, {**made, "split": drive.split, "about": about(place, labelled, drive)})
+                labelled = labeller.label(title, view, chosen.layers, swept=swept).wanted(config)
+                labelled = dataclasses.replace(labelled, drive=drive.name, **place)
+                made = chosen.view(folder, labelled)
+                store.write_json(path, {**made, "split": drive.split, "about": about(labelled, drive)})
             yield store.read_json(path)
 
 
@@ -172,16 +167,10 @@ def require_disk(views: Sequence[View], config: DatasetConfig, folder: Path) -> 
         raise ResourceError(what, where=str(folder), expected=in_words(size), got=in_words(free), remedy=remedy)
 
 
-def wanted(view: LabelledView, config: DatasetConfig) -> LabelledView:
-    """A view with the objects that the settings do not leave out."""
-    keep = lambda box: box.pixels >= config.least_pixels and box.seen_from_deg <= config.farthest_seen_deg
-    return dataclasses.replace(view, boxes=tuple(box for box in view.boxes if box.pixels and keep(box)))
-
-
-def about(target: DatasetPlace, view: LabelledView, drive: LabelledDrive) -> dict[str, Any]:
+def about(view: LabelledView, drive: LabelledDrive) -> dict[str, Any]:
     """Where an image comes from, and how far it can be trusted."""
     return {
-        "image": f"{target.number:06d}",
+        "image": f"{view.number:06d}",
         **drive.provenance,
         "drive": drive.name,
         "split": drive.split,
@@ -189,36 +178,14 @@ def about(target: DatasetPlace, view: LabelledView, drive: LabelledDrive) -> dic
         "camera": view.view.camera.name,
         "time_s": view.view.time_s,
         "world_from_camera": view.view.world_from_cam.tolist(),
-        "trust": trust_record(view.trust),
+        "trust": view.trust.record(),
         "lidar": None if view.sweep is None else view.sweep.name,
         "labels": [box.label for box in view.boxes],
-        "objects": [object_record(box) for box in view.boxes],
-    }
-
-
-def trust_record(trust: Trust) -> dict[str, float | None]:
-    """How far a view can be trusted, as JSON values."""
-    return {name: None if np.isnan(value) else round(value, 4) for name, value in dataclasses.asdict(trust).items()}
-
-
-def object_record(box: ObjectBox) -> dict[str, Any]:
-    """An object as JSON values."""
-    return {
-        "id": box.track_id,
-        "label": box.label,
-        "position_world_m": box.world_from_box[:3, 3].tolist(),
-        "yaw_world_rad": geometry.yaw_of(box.world_from_box),
-        "size_m": list(box.size_m),
-        "pixels": box.pixels,
-        "occlusion": None if np.isnan(box.occlusion) else round(box.occlusion, 4),
-        "truncation": round(box.truncation, 4),
-        "seen_from_deg": round(box.seen_from_deg, 2),
-        "returns": box.returns,
+        "objects": [box.record() for box in view.boxes],
     }
 
 
 # --- mudg render --layers -------------------------------------------------------------------------
-#
 # OUT/layers/<trajectory>/layers.json            objects by number; per view its file, time, pose, trust and boxes
 # OUT/layers/<trajectory>/000000.safetensors     arrays as in ``CameraReply.layers``
 # OUT/layers/<trajectory>/000000_instances.png   u16; 000000_normals.png: u8, (n + 1) / 2, black without a surface
@@ -268,9 +235,9 @@ def _write_layers_of(
         "camera": dataclasses.asdict(view.camera),
         "time_s": view.time_s,
         "world_from_camera": view.world_from_cam.tolist(),
-        "trust": trust_record(labelled.trust),
+        "trust": labelled.trust.record(),
         "boxes": [
-            {**object_record(box), "number": box.number, "amodal_px": box.amodal_px, "visible_px": box.visible_px}
+            {**box.record(), "number": box.number, "amodal_px": box.amodal_px, "visible_px": box.visible_px}
             for box in labelled.boxes
         ],
     }

@@ -46,10 +46,9 @@ from mudg.gaussians.nodes import DeformableNode, NodeRows, RigidNode, StaticNode
 from mudg.gaussians.rendering import DRAWING
 from mudg.gaussians.storage import load_model, model_of_scene, save_model
 from mudg.scene.clouds import read_fused
-from mudg.scene.read import open_files, read_points, read_scene
+from mudg.scene.read import read_scene
 
 # scenes -------------------------------------------------------------------------------------------
-#
 # A fitted scene as files hold it: plain arrays by object, its motion as keys, its sky as a picture; and a file's
 # Gaussians as a scene.
 
@@ -112,9 +111,9 @@ def _node(
 def _cloud(
     rows: NodeRows, log_scales: Tensor, sh: NDArray[np.float32], classes: NDArray[np.uint8] | None
 ) -> SplatCloud:
-    columns = [values.detach().cpu().numpy() for values in (rows.means, rows.quats, log_scales, rows.opacity)]
-    means, quats, logs, opacity = columns
-    full = np.concatenate([rows.sh_dc.detach().cpu().numpy(), sh[:, 1:]], 1)
+    parts = (rows.means, rows.quats, log_scales, rows.opacity, rows.sh_dc)
+    means, quats, logs, opacity, first = (values.detach().cpu().numpy() for values in parts)
+    full = np.concatenate([first, sh[:, 1:]], 1)
     return SplatCloud(means, unit(quats, "the fitted scene"), logs, logit(opacity), full, classes)
 
 
@@ -166,20 +165,24 @@ def with_sky_sphere(scene: SplatScene) -> SplatScene:
 
 def model_of_cloud(cloud: SplatCloud, name: str) -> SceneModel:
     """The Gaussians of a file as a fitted scene in which nothing moves; classes where the file holds them."""
+    known: tuple[int, ...] = ()
+    if cloud.class_ids is not None:
+        known = tuple(int(value) for value in np.unique(cloud.class_ids) if value < 19)
+    table = Table(_tensors(cloud, known), {"node": torch.zeros(len(cloud), dtype=torch.int32)})
+    drawing = {DRAWING: {"antialias": True}} if cloud.antialias else {}
+    facts = {"method": "imported", "source": name, **drawing}
+    return SceneModel(table, (StaticNode(),), None, known, cloud.degree, facts)
+
+
+def _tensors(cloud: SplatCloud, known: Sequence[int] = ()) -> dict[str, Tensor]:
+    """The columns of a table; with scores of the ``known`` classes."""
     columns = {name: getattr(cloud, name) for name in ("means", "quats", "log_scales", "logits")}
     columns["sh_dc"] = cloud.sh[:, :1]
     if cloud.degree:
         columns["sh_rest"] = cloud.sh[:, 1:]
-    known: tuple[int, ...] = ()
-    if cloud.class_ids is not None:
-        known = tuple(int(value) for value in np.unique(cloud.class_ids) if value < 19)
     if known and cloud.class_ids is not None:
         columns["semantics"] = np.where(cloud.class_ids[:, None] == np.array(known), CLASS_LOGIT, -CLASS_LOGIT)
-    tensors = {key: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for key, value in columns.items()}
-    table = Table(tensors, {"node": torch.zeros(len(cloud), dtype=torch.int32)})
-    drawing = {DRAWING: {"antialias": True}} if cloud.antialias else {}
-    facts = {"method": "imported", "source": name, **drawing}
-    return SceneModel(table, (StaticNode(),), None, known, cloud.degree, facts)
+    return {key: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for key, value in columns.items()}
 
 
 # export -------------------------------------------------------------------------------------------
@@ -261,7 +264,7 @@ def write_folder(name: str, exported: Exported, recorded: Scene, work: RunDir) -
     """Write cameras, or a log over time, to the work folder; returns a summary."""
     out = work.path
     if name not in CAMERAS:
-        return _write_messages(name, _records(recorded, _points(exported)), out)
+        return _write_messages(name, messages.LogRecords(recorded, _points(exported)), out)
     names = picture_names(recorded)
     with log.task("export", len(names)) as bar:
         for place, content in pictures(recorded):
@@ -324,7 +327,8 @@ def _gaussians(config: ExportConfig, name: str, exported: Exported, out: Path) -
     """Write the Gaussians; returns what the file is."""
     request = requested(config, name, exported)
     content, lost = FORMATS[name].write(request), losses(name, request)
-    count = _count(request.scene) if request.time_s is None else len(request.cloud)
+    whole = request.time_s is None
+    count = sum(len(node.cloud) for node in request.scene.nodes) if whole else len(request.cloud)
     store.atomic_write(out, content)
     when = "all of the motion" if request.time_s is None else f"at {request.time_s:g} s"
     log.info(f"export: {count} Gaussians, {when}, {len(content) / 1e6:.2f} MB")
@@ -342,26 +346,15 @@ def _gaussians(config: ExportConfig, name: str, exported: Exported, out: Path) -
     }
 
 
-def _count(scene: SplatScene) -> int:
-    return sum(len(node.cloud) for node in scene.nodes)
-
-
 # -- cameras and messages --------------------------------------------------------------------------
-
-
-def _records(scene: Scene, fused: PointCloud | None) -> messages.LogRecords:
-    """The records of a scene on disk; pictures and points are read when they are asked for."""
-    files = open_files(scene.root)
-    picture = lambda frame: files.read(frame.image.path)
-    return messages.LogRecords(scene, picture, lambda sweep: read_points(scene, sweep), fused)
 
 
 def _log(exported: Exported, out: Path) -> dict[str, Any]:
     """Write the log as one MCAP file; returns its size."""
-    records = _records(recorded_scene(exported), _points(exported))
+    records = messages.LogRecords(recorded_scene(exported), _points(exported))
     messages.write_mcap(out, messages.Ros2Messages(records))
     size = out.stat().st_size
-    log.info(f"export: {_counts(records)}, {size / 1e6:.2f} MB")
+    log.info(f"export: {records}, {size / 1e6:.2f} MB")
     return {"bytes": size}
 
 
@@ -377,12 +370,8 @@ def _write_messages(name: str, records: messages.LogRecords, out: Path) -> dict[
         if rolling := ", ".join(name for name, camera in cameras if ncore.unknown_shutter(camera)):
             log.warn(f"export: the scene does not say which way the shutters of {rolling} roll; ncore says downwards")
         largest, what, count = ncore.write_ncore(out, records)[0], "boxes", len(records.scene.tracks)
-    log.info(f"export: {_counts(records)}, {count} {what}, {largest.stat().st_size / 1e6:.2f} MB in {out}")
+    log.info(f"export: {records}, {count} {what}, {largest.stat().st_size / 1e6:.2f} MB in {out}")
     return {"format": name, what: count}
-
-
-def _counts(records: messages.LogRecords) -> str:
-    return f"{len(records.scene.frames)} pictures, {len(records.scene.sweeps)} sweeps"
 
 
 def recorded_scene(exported: Exported) -> Scene:
@@ -411,7 +400,6 @@ def _points(exported: Exported) -> PointCloud | None:
 
 
 # imports -------------------------------------------------------------------------------------------
-#
 # asset import: a file of Gaussians from another program -> an asset that edit scripts can insert, or a scene in which
 # nothing moves.
 
@@ -465,17 +453,17 @@ def refuse_other_settings(config: ImportConfig) -> None:
         raise UsageError(what, where="--origin-m", remedy="leave it out, or add --kind scene")
 
 
-def read_file(file: Path, config: ImportConfig) -> tuple[SplatCloud, str]:
-    """The Gaussians of a file in the axes of this program, and its format."""
-    return read_cloud(store.read_bytes(bounded(file)), str(file), config.axes)
-
-
 def bounded(file: Path) -> Path:
     """The file; InputError for one that is too large to be read."""
     size = store.regular(file).stat().st_size
     if size > MAX_BYTES:
         raise InputError("the file is too large", where=str(file), expected=f"at most {MAX_BYTES} bytes", got=str(size))
     return file
+
+
+def read_file(file: Path, config: ImportConfig) -> tuple[SplatCloud, str]:
+    """The Gaussians of a file in the axes of this program, and its format."""
+    return read_cloud(store.read_bytes(bounded(file)), str(file), config.axes)
 
 
 def asset_of_cloud(cloud: SplatCloud, config: ImportConfig, origin: str) -> Asset:
@@ -491,19 +479,15 @@ def asset_of_cloud(cloud: SplatCloud, config: ImportConfig, origin: str) -> Asse
     scale = 1.0 if config.length_m is None else config.length_m / float(size[0])
     means = ((cloud.means - (low + high) / 2) * scale).astype(np.float32)
     if cloud.antialias:
-        log.warn(
-            f"{origin}: its Gaussians are meant to be drawn antialiased; an object is drawn as the scene that it"
-            " stands in"
-        )
+        meant = "its Gaussians are meant to be drawn antialiased"
+        log.warn(f"{origin}: {meant}; an object is drawn as the scene that it stands in")
     logs = (cloud.log_scales + np.log(scale)).astype(np.float32)
-    columns = {"means": means, "quats": cloud.quats, "log_scales": logs, "logits": cloud.logits}
-    columns["sh_dc"] = cloud.sh[:, :1]
+    tensors = _tensors(replace(cloud, means=means, log_scales=logs, sh=cloud.sh[:, :1]))
     label = config.label.strip().lower()
     ids = np.full(len(cloud), TRAIN_IDS.get(label, ID.get(label, -1)), np.int64)
     if cloud.class_ids is not None:
         ids = np.where(cloud.class_ids < len(CLASSES), cloud.class_ids.astype(np.int64), ids)
     length, width, height = (float(value) for value in size * scale)
-    tensors = {key: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for key, value in columns.items()}
     return Asset(tensors, ids, None, config.label, (length, width, height), None, (), origin)
 
 
@@ -513,13 +497,9 @@ def _origin(cloud: SplatCloud, config: ImportConfig, file: Path) -> list[float]:
     origin = [0.0, 0.0, 0.0] if config.origin_m is None else list(config.origin_m)
     if config.origin_m is None and spacing_m(cloud.means) > COARSE_M:
         origin = [float(value) for value in np.round(np.median(cloud.means, 0))]
-        log.warn(
-            f"{file}: its Gaussians lie far from the origin of the file: {origin} becomes the origin; --origin-m sets"
-            " another"
-        )
+        far = f"{file}: its Gaussians lie far from the origin of the file"
+        log.warn(f"{far}: {origin} becomes the origin; --origin-m sets another")
     if (step := spacing_m(cloud.means - np.array(origin))) > COARSE_M:
-        log.warn(
-            f"{file}: its Gaussians lie so far from the origin that their places are rounded to {step * 1000:.3g} mm; "
-            "--origin-m takes an offset away before"
-        )
+        far = f"{file}: its Gaussians lie so far from the origin that their places are rounded to {step * 1000:.3g} mm"
+        log.warn(f"{far}; --origin-m takes an offset away before")
     return origin

@@ -4,7 +4,7 @@ of many sweeps as one cloud per rigid part of the world."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -28,13 +28,9 @@ SAME_MOMENT_S: Final = 0.06
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Beams:
-    """Beams of a sweep.
-
-    Args:
-        directions: unit vectors f64[B, 3] in the sensor's frame when each is fired. share: f64[B] in [0, 1], when.
-        range_m: f64[B], NaN: nothing returned. intensity: f64[B], NaN likewise.
-        start, end: world-from-sensor f64[4, 4]. start_s, end_s: on the scene's clock.
-    """
+    """Beams of a sweep. ``directions``: unit vectors f64[B, 3] in the sensor's frame when each is fired. ``share``:
+    f64[B] in [0, 1], when. ``range_m``: f64[B], NaN: nothing returned. ``intensity``: f64[B], NaN likewise. ``start``,
+    ``end``: world-from-sensor f64[4, 4]. ``start_s``, ``end_s``: on the scene's clock."""
 
     directions: Floats
     share: Floats
@@ -134,15 +130,10 @@ def with_silent(beams: Beams, like: Rows | None = None) -> Beams:
     turned = begin[at] + part * gap[at]
     share = beams.share[left[at]] + rate * (turned - azimuth[left[at]])
     points = rows.points(turned, rows.elevations_deg[row[left[at]]], 1 / nearness)
-    nan = np.full(len(at), np.nan)
-    join = lambda a, b: np.concatenate([a, b])
-    return Beams(
-        join(beams.directions, points / np.linalg.norm(points, axis=1, keepdims=True)),
-        join(beams.share, share % 1.0 if whole and rate else share.clip(0, 1)),
-        join(beams.range_m, nan),
-        join(beams.intensity, nan),
-        *(beams.start, beams.end, beams.start_s, beams.end_s),
-    )
+    nan, away = np.full(len(at), np.nan), np.linalg.norm(points, axis=1, keepdims=True)
+    more = {"directions": points / away, "share": share % 1.0 if whole and rate else share.clip(0, 1)}
+    more |= {"range_m": nan, "intensity": nan}
+    return replace(beams, **{name: np.concatenate([getattr(beams, name), one]) for name, one in more.items()})
 
 
 # which sweeps -------------------------------------------------------------------------------------
@@ -170,11 +161,8 @@ def moving_tracks(scene: Scene) -> tuple[Track, ...]:
 
 def returns_of(scene: Scene, sweep: Sweep, silent: Beams | None = None) -> dict[str, Returns]:
     """Returns of a sweep by what they belong to: ``WORLD`` in the world, moving tracks each in the frame of its box.
-
-    Args:
-        silent: the sweep's beams (``with_silent``). Those without a return stand, without intensity, as far away as
-            the return nearest in angle.
-    """
+    ``silent``: the sweep's beams (``with_silent``). Those without a return stand, without intensity, as far away as the
+    return nearest in angle."""
     points, tracks, place = read_points(scene, sweep), moving_tracks(scene), sweep.world_from_lidar[:3, 3]
     xyz, dt_s, intensity = points.xyz, points.dt_s, points.intensity
     if silent is not None and not silent.returned.all():
@@ -184,11 +172,8 @@ def returns_of(scene: Scene, sweep: Sweep, silent: Beams | None = None) -> dict[
     shots = SweepShots(sweep.time_s, sweep.world_from_lidar, SweepPoints(xyz, intensity, dt_s), ())
     owner, owned = separate(shots, tracks, FusionRules())
     still = owner == STATIC
-    parts = {
-        WORLD: Returns(
-            geometry.transform_points(sweep.world_from_lidar, xyz[still].astype(np.float64)), place, intensity[still]
-        )
-    }
+    world = geometry.transform_points(sweep.world_from_lidar, xyz[still].astype(np.float64))
+    parts = {WORLD: Returns(world, place, intensity[still])}
     for number, own in owned.items():
         pose = tracks[number].pose_at(sweep.time_s)
         if pose is not None:
@@ -213,15 +198,9 @@ def _silent_ends(sweep: Sweep, beams: Beams) -> tuple[NDArray[np.float32], NDArr
 def placed(
     parts: Sequence[tuple[str, Returns]], poses: Mapping[str, Floats], origin: Floats
 ) -> tuple[Floats, NDArray[np.int64]]:
-    """Returns where their objects are, without those that were seen from behind.
-
-    Args:
-        parts: with the name of what they belong to. poses: world-from-box of the objects; parts of others are left
-            out. origin: f64[3].
-
-    Returns:
-        Places f64[N, 3] relative to the origin in the world's axes, and numbers i64[N] among all returns of ``parts``.
-    """
+    """Returns where their objects are, without those that were seen from behind: places f64[N, 3] relative to the
+    origin f64[3] in the world's axes, and numbers i64[N] among all returns of ``parts``. ``parts``: with the name of
+    what they belong to. ``poses``: world-from-box of the objects; parts of others are left out."""
     xyz, numbers, first = [np.zeros((0, 3))], [np.zeros(0, np.int64)], 0
     for name, part in parts:
         if name == WORLD or name in poses:

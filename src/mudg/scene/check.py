@@ -51,18 +51,14 @@ def describe(name: str, alignment: EdgeAlignment) -> str:
             why = f"no turn of up to {TURNS_DEG[-1]:g} degrees stands out"
         elif max(abs(angle) for angle in alignment.best_turn_deg) == TURNS_DEG[-1]:
             why = "the best turn is at the end of the range tried"
-        return (
-            f"camera {name}: {alignment.jumps} depth edges do not tell whether LiDAR and images agree ({why}); look at"
-            " the contact sheet"
-        )
+        edges = f"{alignment.jumps} depth edges do not tell whether LiDAR and images agree"
+        return f"camera {name}: {edges} ({why}); look at the contact sheet"
     score = f"score {alignment.score:.2f}, {alignment.jumps} depth edges"
     if alignment.verdict == "right":
         return f"camera {name}: LiDAR and image edges agree ({score})"
     right, up = alignment.best_turn_deg
-    return (
-        f"camera {name}: LiDAR edges fit the image better when moved by {right:+.1f} degrees to the right and {up:+.1f}"
-        f" up ({score}); check calibration, poses and clocks"
-    )
+    moved = f"when moved by {right:+.1f} degrees to the right and {up:+.1f} up ({score})"
+    return f"camera {name}: LiDAR edges fit the image better {moved}; check calibration, poses and clocks"
 
 
 def to_json(alignment: EdgeAlignment) -> dict[str, Any]:
@@ -137,11 +133,8 @@ def _note(where: str, message: str) -> Finding:
 
 
 def check_scene(path: Path | str) -> list[Finding]:
-    """Check a scene directory, reading every image, sweep and label.
-
-    Nothing is raised for what is wrong with the scene: it is all in the list, worst first. An empty list means that
-    nothing was found.
-    """
+    """Check a scene directory, reading every image, sweep and label. Nothing is raised for what is wrong with the
+    scene: it is all in the list, worst first. An empty list means that nothing was found."""
     findings: list[Finding] = []
     try:
         scene = load_scene(path, lambda problem: findings.append(finding_of(problem, str(path))))
@@ -150,23 +143,19 @@ def check_scene(path: Path | str) -> list[Finding]:
     findings.extend(check_records(scene))
     records = (*scene.frames, *scene.sweeps)
     for record in log.progress(records, len(records), "checking files"):
-        findings.extend(collected(_check_file(scene, record), str(path)))
-        for name in record.labels if isinstance(record, Frame) else ():
-            findings.extend(collected(_check_label(scene, record, name), str(path)))
+        for name in (None, *record.labels) if isinstance(record, Frame) else (None,):
+            findings.extend(collected(_check_file(scene, record, name), str(path)))
     return worst_first(findings)
 
 
-def _check_file(scene: Scene, record: Frame | Sweep) -> Findings:
-    if isinstance(record, Frame):
-        yield from check_image(record, read_image(scene, record))
-    else:
+def _check_file(scene: Scene, record: Frame | Sweep, label: str | None) -> Findings:
+    """Of a sweep, or of a frame's image or label."""
+    if not isinstance(record, Frame):
         yield from check_points(scene, record, read_points(scene, record))
-
-
-def _check_label(scene: Scene, frame: Frame, name: str) -> Findings:
-    label = read_label(scene, frame, name)
-    if name == "depth" and not np.isfinite(label).any():
-        yield _warning(f"frame {frame.id}", "its depth label has no valid pixel")
+    elif label is None:
+        yield from check_image(record, read_image(scene, record))
+    elif not np.isfinite(read_label(scene, record, label)).any():
+        yield _warning(f"frame {record.id}", "its depth label has no valid pixel")
 
 
 def collected(findings: Findings, where: str) -> list[Finding]:
@@ -193,11 +182,8 @@ def finding_of(problem: MudgError, where: str) -> Finding:
 
 def check_records(scene: Scene) -> Findings:
     """What can be said without opening images and clouds: motion, boxes, how things relate."""
-    yield from _check_cameras(scene)
-    yield from _check_ego(scene)
-    yield from _check_gaps(scene)
-    yield from _check_tracks(scene)
-    yield from _check_relations(scene)
+    for check in (_check_cameras, _check_ego, _check_gaps, _check_tracks, _check_relations):
+        yield from check(scene)
 
 
 def _speeds(places_m: NDArray[np.float64], times_s: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,19 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import store
-from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import InputError, IntegrityError
 from mudg.base.geometry import invert
-from mudg.base.types import EgoPath, FusedCloud, PointCloud, SweepPoints
+from mudg.base.types import SAME_COLORS, CameraColors, EgoPath, FusedCloud, PointCloud, SweepPoints
 
 # returns ------------------------------------------------------------------------------------------
-# Beams without a return. Sensors and drivers write them among the points: as (0, 0, 0), as NaN, or with a range of
-# zero.
-#
-# In a file of points in the sensor's own frame such rows are told by their numbers (``is_return``). Once a format or an
+# Sensors and drivers write beams without a return among the points: as (0, 0, 0), as NaN, or with a range of zero. In a
+# file of points in the sensor's own frame such rows are told by their numbers (``is_return``). Once a format or an
 # importer has moved points (to the vehicle's frame, to one moment), the zeros lie at the sensor's own place
 # (``at_sensor``), where no real return can be.
-
 
 LEAST_RANGE_M: Final = 0.05
 """Nearer than this lies the sensor's own housing."""
@@ -51,14 +47,8 @@ def near_places(xyz: NDArray[Any], places: Iterable[NDArray[np.float64]]) -> NDA
 def at_sensor(
     points: SweepPoints, time_s: float, world_from_lidar: NDArray[np.float64], ego: EgoPath
 ) -> NDArray[np.bool_]:
-    """Points within 0.05 m of where the sensor was at the sweep's time or at the point's own, bool[N].
-
-    Args:
-        points: in the LiDAR's frame at ``time_s``.
-        time_s: of the sweep.
-        world_from_lidar: f64[4, 4] at ``time_s``.
-        ego: the vehicle, which carries the sensor.
-    """
+    """Points within 0.05 m of where the sensor was at the sweep's time or at the point's own, bool[N]. ``points``: in
+    the LiDAR's frame at ``time_s``, that of the sweep. ``ego``: the vehicle, which carries the sensor."""
     near = near_places(points.xyz, [np.zeros(3, np.float32)])
     mount = ego.pose_at(time_s)
     if mount is None or not len(points.dt_s) or not points.dt_s.any():
@@ -67,12 +57,10 @@ def at_sensor(
     moments = np.linspace(float(points.dt_s.min()), float(points.dt_s.max()), _MOMENTS)
     lidar_from_world, ego_from_lidar = invert(world_from_lidar), invert(mount) @ world_from_lidar
     poses = [ego.pose_at(min(max(time_s + float(moment), first), last)) for moment in moments]
-    places = np.stack(
-        [np.zeros(3) if pose is None else (lidar_from_world @ pose @ ego_from_lidar)[:3, 3] for pose in poses]
-    )
+    moved = [np.eye(4) if pose is None else lidar_from_world @ pose @ ego_from_lidar for pose in poses]
+    places = np.stack(moved)[:, :3, 3]
     reach = float(np.linalg.norm(places, axis=1).max()) + LEAST_RANGE_M
-    # few: the rest is farther away than the sensor ever was
-    close = np.flatnonzero((np.abs(points.xyz) < reach).all(1))
+    close = np.flatnonzero((np.abs(points.xyz) < reach).all(1))  # the rest is farther than the sensor ever was
     place = np.stack([np.interp(points.dt_s[close], moments, places[:, axis]) for axis in range(3)], 1)
     near[close] |= np.linalg.norm(points.xyz[close] - place, axis=1) < LEAST_RANGE_M
     return near
@@ -137,7 +125,6 @@ def _read_cloud(folder: Path, entry: Mapping[str, Any], frame: str) -> PointClou
         what = "a cloud was altered after it was written"
         raise IntegrityError(what, where=str(path), remedy="run `mudg fuse` again")
     arrays = store.read_safetensors(path)
-    xyz = arrays["xyz"]
-    if not np.isfinite(xyz).all():
+    if not np.isfinite(arrays["xyz"]).all():
         raise InputError("a cloud holds coordinates that are not finite", where=str(path))
-    return PointCloud(xyz, arrays["rgb"], frame, arrays.get("semantics"))
+    return PointCloud(arrays["xyz"], arrays["rgb"], frame, arrays.get("semantics"))

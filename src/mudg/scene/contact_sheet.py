@@ -8,7 +8,7 @@ people violet, of all else light blue, and the edges of their fronts red.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Final
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from mudg.base import geometry
-from mudg.base.types import Frame, Scene, Track, View
+from mudg.base.types import Frame, Scene, Sweep, Track, View
 from mudg.core.pictures import depth_colors, resize_area
 from mudg.scene.motion import VEHICLES
 from mudg.scene.read import read_image, read_points, spread, sweeps_beside
@@ -24,7 +24,6 @@ from mudg.scene.read import read_image, read_points, spread, sweeps_beside
 Floats = NDArray[np.float64]
 
 # a scene from above: points, the recorded path, boxes and their courses ---------------------------
-
 
 GROUND_COLOR: Final = (18, 18, 18)
 TEXT_COLOR: Final = (235, 235, 235)
@@ -52,14 +51,10 @@ def draw_top_view(
     dot_px: int = 1,
     outer_percent: float = 4.0,
 ) -> Image.Image:
-    """Draw a scene from above, x to the right, y up.
-
-    Args:
-        size: width and height of the picture. xyz: points f64[N, 3] in the world. rgb: their colours u8[N, 3]; higher
-            points lie over lower ones.
-        boxes: id of a track -> ``world_from_object`` of its box, or None for its course alone. caption: upper left.
-        dot_px: side of a point, pixels. outer_percent: of the points on each side that need not fit into the picture.
-    """
+    """Draw a scene from above, x to the right, y up. ``size``: width and height of the picture. ``xyz``: points
+    f64[N, 3] in the world. ``rgb``: their colours u8[N, 3]; higher points lie over lower ones. ``boxes``: id of a track
+    -> ``world_from_object`` of its box, or None for its course alone. ``caption``: upper left. ``dot_px``: side of a
+    point, pixels. ``outer_percent``: of the points on each side that need not fit into the picture."""
     path, (width, height) = scene.ego.world_from_ego[:, :3, 3], size
     tracks = [track for track in scene.tracks if track.id in boxes]
     places = [xyz] if len(xyz) else [track.world_from_object[:, :3, 3] for track in tracks]
@@ -125,7 +120,6 @@ def pairs(points: Floats) -> list[tuple[float, float]]:
 
 # contact sheet ------------------------------------------------------------------------------------
 
-
 NAME: Final = "contact_sheet.jpg"
 TILE_WIDTH_PX: Final = 480
 FRAMES_PER_CAMERA: Final = 3
@@ -169,10 +163,7 @@ def frame_tile(scene: Scene, frame: Frame) -> Image.Image:
     view = frame.view.resized(width, height)
     pixels = np.array(resize_area(read_image(scene, frame), width, height))
     sweeps = sweeps_beside(scene, frame, MAX_GAP_S)
-    world = lambda sweep, xyz: geometry.transform_points(sweep.world_from_lidar, xyz.astype(np.float64))
-    draw_points(
-        pixels, view, np.concatenate([np.zeros((0, 3)), *(world(s, read_points(scene, s).xyz) for s in sweeps)])
-    )
+    draw_points(pixels, view, points_of(scene, sweeps))
     tile = Image.fromarray(pixels)
     draw = ImageDraw.Draw(tile)
     for track in scene.tracks:
@@ -183,6 +174,16 @@ def frame_tile(scene: Scene, frame: Frame) -> Image.Image:
     split = " held out" if scene.split.get(frame.id) == "test" else ""
     draw_caption(draw, f"{frame.id}  {frame.view.time_s:.2f} s{gap}{split}")
     return tile
+
+
+def points_of(scene: Scene, sweeps: Iterable[Sweep], most: int | None = None) -> Floats:
+    """Points f64[N, 3] of sweeps in the world; of each about ``most``."""
+    parts = [np.zeros((0, 3))]
+    for sweep in sweeps:
+        points = read_points(scene, sweep).xyz
+        points = points[:: max(1, len(points) // (most or len(points) or 1))].astype(np.float64)
+        parts.append(geometry.transform_points(sweep.world_from_lidar, points))
+    return np.concatenate(parts)
 
 
 def draw_points(pixels: NDArray[np.uint8], view: View, xyz_world: Floats) -> None:
@@ -202,11 +203,9 @@ def draw_points(pixels: NDArray[np.uint8], view: View, xyz_world: Floats) -> Non
 
 
 def visible_edges(view: View, corners_world: Floats) -> list[tuple[int, Floats]]:
-    """Edges of a box as the camera sees them: number of the edge and its ends f64[2, 2] in pixels.
-
-    What lies nearer than ``NEAR_M``, or behind the camera, is cut off before projection. Edges that lie far outside the
-    image are left out.
-    """
+    """Edges of a box as the camera sees them: number of the edge and its ends f64[2, 2] in pixels. What lies nearer
+    than ``NEAR_M``, or behind the camera, is cut off before projection. Edges that lie far outside the image are left
+    out."""
     camera = view.camera
     xyz = geometry.transform_points(view.cam_from_world, corners_world)
     found = []
@@ -252,12 +251,7 @@ def draw_box(draw: ImageDraw.ImageDraw, view: View, world_from_object: Floats, t
 def top_view(scene: Scene, width: int, height: int) -> Image.Image:
     """Points of up to 24 sweeps by height above the vehicle's path, the path, boxes at the middle of the log and their
     courses."""
-    parts = [np.zeros((0, 3))]
-    for sweep in spread(scene.sweeps, _TOP_SWEEPS):
-        points = read_points(scene, sweep).xyz
-        points = points[:: max(1, len(points) // _TOP_POINTS)].astype(np.float64)
-        parts.append(geometry.transform_points(sweep.world_from_lidar, points))
-    xyz = np.concatenate(parts)
+    xyz = points_of(scene, spread(scene.sweeps, _TOP_SWEEPS), _TOP_POINTS)
     height_m = (xyz[:, 2] - np.median(scene.ego.world_from_ego[:, 2, 3])).clip(-2.5, 4.0)
     grey = np.repeat((60 + 170 * (height_m + 2.5) / 6.5).astype(np.uint8)[:, None], 3, 1)
     middle_s = float(np.median(scene.ego.times_s))

@@ -14,11 +14,10 @@ from PIL import Image
 
 from mudg.base import config as configuration
 from mudg.base import log, store
-from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import InputError
 from mudg.base.geometry import transform_points
 from mudg.base.run_folder import RunDir
-from mudg.base.types import FusedCloud, Photo, Scene
+from mudg.base.types import SAME_COLORS, CameraColors, FusedCloud, Photo, Scene
 from mudg.core.calibration import match_cameras
 from mudg.core.fusion import (
     STATIC,
@@ -150,10 +149,8 @@ def report_record(report: FusionReport, rules: FusionRules) -> dict[str, Any]:
     """The report as JSON values for ``fuse.json``."""
     values = dataclasses.asdict(report)
     verdicts, points, left_out = (values.pop(name) for name in ("verdicts", "object_points", "left_out"))
-    tracks = {
-        name: {**verdict, "points": points.get(name), "left_out": left_out.get(name)}
-        for name, verdict in verdicts.items()
-    }
+    more = {name: {"points": points.get(name), "left_out": left_out.get(name)} for name in verdicts}
+    tracks = {name: {**verdict, **more[name]} for name, verdict in verdicts.items()}
     return {"counts": values, "rules": dataclasses.asdict(rules), "tracks": tracks}
 
 
@@ -179,9 +176,7 @@ def top_view(scene: Scene, cloud: FusedCloud, report: FusionReport) -> Image.Ima
     """The clouds from above, dynamic objects at the middle of their tracks."""
     middles = {track.id: track.world_from_object[len(track.times_s) // 2] for track in scene.tracks}
     boxes = {track_id: pose for track_id, pose in middles.items() if report.verdicts[track_id].moving}
-    placed = [
-        transform_points(middles[track_id], one.xyz.astype(np.float64)) for track_id, one in cloud.objects.items()
-    ]
+    placed = (transform_points(middles[name], one.xyz.astype(np.float64)) for name, one in cloud.objects.items())
     xyz = np.concatenate([cloud.static.xyz.astype(np.float64), *placed])
     rgb = np.concatenate([cloud.static.rgb, *(one.rgb for one in cloud.objects.values())])
     caption = f"{scene.id}: {len(xyz)} points, {len(boxes)} dynamic objects"

@@ -37,8 +37,7 @@ def read_label(scene: Scene, frame: Frame, name: str) -> NDArray[Any]:
     *_confidence         f32[H, W]    0 (unknown) .. 1 (measured)
     ==================== ============ ==================================================================
 
-    Raises:
-        InputError: the frame does not have the label, or the file is damaged.
+    InputError: the frame does not have the label, or the file is damaged.
     """
     _check_label_name(name, f"{scene.root}: {frame.id}")
     ref = frame.labels.get(name)

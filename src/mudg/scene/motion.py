@@ -141,11 +141,9 @@ def heading_flips(times_s: Times, poses: Matrix, most_rad_s: float) -> NDArray[n
 
 
 def unflipped(times_s: Times, poses: Matrix, most_rad_s: float) -> tuple[Matrix, NDArray[np.intp]]:
-    """Poses with flipped headings turned back, and the keys that were.
-
-    Headings agree but for their sign. The sign of the rarer third or less is wrong; where it is more, the direction of
-    travel decides; where nothing moves either, nothing is changed.
-    """
+    """Poses with flipped headings turned back, and the keys that were. Headings agree but for their sign. The sign of
+    the rarer third or less is wrong; where it is more, the direction of travel decides; where nothing moves either,
+    nothing is changed."""
     flips = heading_flips(times_s, poses, most_rad_s)
     if not len(flips):
         return poses, flips
@@ -173,14 +171,9 @@ def unflipped(times_s: Times, poses: Matrix, most_rad_s: float) -> tuple[Matrix,
 
 
 def jumps(times_s: Times, poses: Matrix, least_m: float) -> list[tuple[int, float, float]]:
-    """Steps between keys that the motion before and after does not explain.
-
-    A step is compared with the median velocity of up to two steps on either side: what is left over is the jump.
-
-    Returns:
-        Key after which it is, metres, and metres per second squared, the largest first; those of ``least_m`` and
-        ``MOST_JUMP_M_S2`` on.
-    """
+    """Steps between keys that the motion before and after does not explain: key after which it is, metres, and metres
+    per second squared, the largest first; those of ``least_m`` and ``MOST_JUMP_M_S2`` on. A step is compared with the
+    median velocity of up to two steps on either side: what is left over is the jump."""
     steps_s = np.diff(times_s)
     if len(steps_s) < 3:
         return []
@@ -195,7 +188,6 @@ def jumps(times_s: Times, poses: Matrix, least_m: float) -> list[tuple[int, floa
 
 
 # the recorded path as a road -----------------------------------------------------------------------
-
 
 Matrix = NDArray[np.float64]
 LEAST_STEP_M: Final = 0.2

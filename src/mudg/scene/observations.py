@@ -42,11 +42,9 @@ _HEADER_BYTES = 4096
 
 
 class ObservationWriter:
-    """Write observations of one trajectory, in order, resumably.
-
-    Observations written by an interrupted run are kept: ``done`` says how many. The index appears when the writer is
-    closed without an exception, so an unfinished folder is not readable as a finished one.
-    """
+    """Write observations of one trajectory, in order, resumably. Those written by an interrupted run are kept: ``done``
+    says how many. The index appears when the writer is closed without an exception, so an unfinished folder is not
+    readable as a finished one."""
 
     def __init__(self, out: Path, trajectory: str, source: str, kind: ObservationKind = "virtual") -> None:
         self._out, self._trajectory, self._source, self._kind = Path(out), trajectory, source, kind
@@ -72,27 +70,19 @@ class ObservationWriter:
             what = "colours of an observation are not finite"
             raise InputError(what, where=f"{self._out}, view {name}", got=f"{count} values")
         store.write_image(self._out / "rgb" / f"{name}.png", to_bytes(observation.rgb), compress_level=1)
-        arrays = {
-            "confidence": _numpy(observation.confidence[0], np.float16),
-            "mask": _numpy(observation.mask[0], np.uint8),
-        }
+        given = {"confidence": observation.confidence[0], "mask": observation.mask[0]}
         if observation.depth is not None:
-            arrays["depth"] = _numpy(observation.depth[0], np.float32)
+            given["depth"] = observation.depth[0]
         if observation.semantics is not None:
-            arrays["semantics"] = _numpy(observation.semantics, np.uint8)
+            given["semantics"] = observation.semantics
+        arrays = {name: values.detach().cpu().numpy().astype(_TYPES[name]) for name, values in given.items()}
         store.atomic_write(data_path(self._out, len(self._records)), _packed(arrays))
-        self._record(observation.view, observation.depth is not None, observation.semantics is not None)
+        self._record(observation.view, "depth" in given, "semantics" in given)
 
     def _record(self, view: View, has_depth: bool, has_semantics: bool) -> None:
-        self._records.append(
-            {
-                "camera": {"name": view.camera.name, **camera_to_json(view.camera)},
-                "world_from_cam": view.world_from_cam.tolist(),
-                "time_s": view.time_s,
-                "depth": has_depth,
-                "semantics": has_semantics,
-            }
-        )
+        camera = {"name": view.camera.name, **camera_to_json(view.camera)}
+        place = {"camera": camera, "world_from_cam": view.world_from_cam.tolist(), "time_s": view.time_s}
+        self._records.append({**place, "depth": has_depth, "semantics": has_semantics})
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
@@ -136,10 +126,6 @@ def _unpacked(content: bytes, path: Path, shape: tuple[int, int], wanted: Sequen
             got = got if array is None else f"{array.dtype}{list(array.shape)}"
             raise InputError(what, where=f"{path}: {name}", expected=f"{_TYPES[name]}{list(shape)}", got=got)
     return arrays
-
-
-def _numpy(tensor: torch.Tensor, dtype: type[np.generic]) -> NDArray[Any]:
-    return tensor.detach().cpu().numpy().astype(dtype)
 
 
 @dataclass(frozen=True)
@@ -223,7 +209,6 @@ def list_observation_sets(path: Path) -> dict[str, Path]:
 
 
 # simulated sweeps: what ``mudg render --lidar`` writes and ``mudg score`` reads -------------------------
-#
 # sweeps.json          schema, trajectory, sensor, shift in metres; one record per sweep: id of the recorded sweep, if
 #                      its own beams are fired, times and world-from-sensor poses of start and end, file
 # 000000.safetensors   xyz f32[N, 3], intensity f32[N], dt_s f32[N], classes u8[N] as a scene stores sweeps, in the
@@ -239,12 +224,9 @@ _RETURN_COLUMNS: Final = {"xyz": (3,), "intensity": (), "dt_s": (), "beam": ()}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedSweep:
-    """A sweep of a set.
-
-    Args:
-        id: of the recorded sweep at whose time it is taken. own_beams: it fires that sweep's beams.
-        start, end: world-from-sensor f64[4, 4]. start_s, end_s: on the scene's clock. file: name in the folder.
-    """
+    """A sweep of a set. ``id``: of the recorded sweep at whose time it is taken. ``own_beams``: it fires that sweep's
+    beams. ``start``, ``end``: world-from-sensor f64[4, 4]. ``start_s``, ``end_s``: on the scene's clock. ``file``: name
+    in the folder."""
 
     id: str
     own_beams: bool
@@ -291,27 +273,26 @@ def write_index(sweeps: SweepSet) -> None:
 def read_sweep_sets(folder: Path) -> dict[str, SweepSet]:
     """The sets below ``folder/lidar``, by trajectory; none where that folder is not there. InputError: a malformed
     index."""
-    places = sorted((Path(folder) / "lidar").iterdir()) if (Path(folder) / "lidar").is_dir() else []
-    return {place.name: _read_set(place) for place in places if (place / SWEEPS_INDEX).is_file()}
+    found = {}
+    for index in sorted((Path(folder) / "lidar").glob(f"*/{SWEEPS_INDEX}")):
+        with understood("simulated sweeps", str(index)):
+            content, place = store.read_json(index), index.parent
+            if content["schema"] != _SWEEPS_SCHEMA:
+                what, got = "unknown schema of simulated sweeps", str(content["schema"])
+                raise InputError(what, where=str(index), expected=str(_SWEEPS_SCHEMA), got=got)
+            sweeps = tuple(_sweep(record, str(index)) for record in content["sweeps"])
+            sensor, shift_m = str(content["sensor"]), float(content["shift_m"])
+            found[place.name] = SweepSet(place, place.name, sensor, shift_m, sweeps)
+    return found
 
 
-def _read_set(folder: Path) -> SweepSet:
-    with understood("simulated sweeps", str(folder / SWEEPS_INDEX)):
-        content = store.read_json(folder / SWEEPS_INDEX)
-        if content["schema"] != _SWEEPS_SCHEMA:
-            what, got = "unknown schema of simulated sweeps", str(content["schema"])
-            raise InputError(what, where=str(folder / SWEEPS_INDEX), expected=str(_SWEEPS_SCHEMA), got=got)
-        sweeps = tuple(_sweep(record, folder) for record in content["sweeps"])
-        return SweepSet(folder, folder.name, str(content["sensor"]), float(content["shift_m"]), sweeps)
-
-
-def _sweep(record: Mapping[str, Any], folder: Path) -> SimulatedSweep:
+def _sweep(record: Mapping[str, Any], where: str) -> SimulatedSweep:
     start, end = (np.array(record[name], np.float64) for name in ("start", "end"))
     for pose in (start, end):
         if problem := geometry.rigid_problem(pose):
-            raise InputError(f"a pose of a simulated sweep is not rigid: {problem}", where=str(folder / SWEEPS_INDEX))
+            raise InputError(f"a pose of a simulated sweep is not rigid: {problem}", where=where)
     name = str(record["file"])
     if "/" in name or not name.endswith(".safetensors") or name.startswith("."):
-        raise InputError("a simulated sweep lies elsewhere", where=str(folder / SWEEPS_INDEX), got=name[:80])
+        raise InputError("a simulated sweep lies elsewhere", where=where, got=name[:80])
     times = float(record["start_s"]), float(record["end_s"])
-    return SimulatedSweep(str(record["id"]), bool(record["own_beams"]), start, end, times[0], times[1], name)
+    return SimulatedSweep(str(record["id"]), bool(record["own_beams"]), start, end, *times, name)

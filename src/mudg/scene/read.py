@@ -24,9 +24,7 @@ from mudg.scene.schema import parse_object, ref_problem
 
 # files --------------------------------------------------------------------------------------------
 # Nothing outside the scene can be reached: references are checked as text, and on disk as real paths. What this package
-# wrote carries a manifest of sha256 sums, and every file read is compared with it: a flipped bit is an error, not a
-# point somewhere else.
-
+# wrote carries a manifest of sha256 sums, and every file read is compared with it.
 
 Record = TypeVar("Record")
 MAX_FILE_BYTES: Final = 4 * 1024**3
@@ -107,21 +105,14 @@ _open_cached = functools.lru_cache(maxsize=16)(lambda path, *_state: SceneFiles(
 
 # read ---------------------------------------------------------------------------------------------
 
-
 _EXIF_ORIENTATION: Final = 0x0112
 _PNG: Final = b"\x89PNG"
 
 
 def read_scene(path: Path | str) -> Scene:
-    """Read and check a scene; images, points and labels stay on disk until asked for.
-
-    Args:
-        path: a scene directory.
-
-    Raises:
-        InputError: a record, reference or relation is wrong, or a referenced file is missing.
-        IntegrityError: a file differs from the scene's manifest.
-    """
+    """Read and check a scene directory; images, points and labels stay on disk until asked for. InputError: a record,
+    reference or relation is wrong, or a referenced file is missing. IntegrityError: a file differs from the scene's
+    manifest."""
     return load_scene(path, schema.raise_first)
 
 
@@ -167,11 +158,9 @@ def decode_image(content: bytes, where: str, camera: Camera | None = None) -> ND
 
 
 def check_image(content: bytes, where: str, camera: Camera | None = None) -> bool:
-    """Refuse PNG or JPEG bytes that ``decode_image`` would refuse, at less cost; returns whether the image is grey.
-
-    All data are read. Of a JPEG they are turned into a picture of an eighth of the size, a tenth of the work; a PNG's
-    checksums are compared, too, which decoding leaves out.
-    """
+    """Refuse PNG or JPEG bytes that ``decode_image`` would refuse, at less cost; returns whether the image is grey. All
+    data are read. Of a JPEG they are turned into a picture of an eighth of the size, a tenth of the work; a PNG's
+    checksums are compared, too, which decoding leaves out."""
     if content[:4] == _PNG:
         with _explained(content, where), Image.open(io.BytesIO(content), formats=("PNG",)) as image:
             image.verify()
@@ -193,12 +182,12 @@ def is_grey(content: bytes, where: str, camera: Camera) -> bool:
 def _opened(content: bytes, where: str, camera: Camera | None) -> Iterator[Image.Image]:
     """An opened image of a kind that scenes hold; what goes wrong with it in the block becomes an InputError."""
     with _explained(content, where), Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as image:
+        size = f"{image.width}x{image.height}"
         if camera is not None and image.size != (camera.width, camera.height):
-            what, got = "image does not have its camera's size", f"{image.width}x{image.height}"
-            remedy = "correct the camera's size and intrinsics, or the image"
-            raise InputError(what, where=where, got=got, expected=f"{camera.width}x{camera.height}", remedy=remedy)
+            what, remedy = "image does not have its camera's size", "correct camera and intrinsics, or the image"
+            raise InputError(what, where=where, got=size, expected=f"{camera.width}x{camera.height}", remedy=remedy)
         if max(image.size) > schema.MAX_IMAGE_SIDE_PX:
-            raise InputError("image is too large", where=where, got=f"{image.width}x{image.height}")
+            raise InputError("image is too large", where=where, got=size)
         if image.getexif().get(_EXIF_ORIENTATION, 1) != 1:
             what, remedy = "image is stored rotated (EXIF orientation)", "apply the rotation and write the image again"
             raise InputError(what, where=where, expected="upright pixels", remedy=remedy)
@@ -244,13 +233,12 @@ def read_points(scene: Scene, sweep: Sweep) -> SweepPoints:
 def sweeps_beside(scene: Scene, frame: Frame, max_gap_s: float) -> list[Sweep]:
     """The nearest sweep of each LiDAR within ``max_gap_s`` seconds of the image, in the order of their distance in
     time."""
+    gap_s = lambda sweep: abs(sweep.time_s - frame.view.time_s)
     nearest: dict[str, Sweep] = {}
     for sweep in scene.sweeps:
-        best = nearest.get(sweep.sensor)
-        gap = abs(sweep.time_s - frame.view.time_s)
-        if gap <= max_gap_s and (best is None or gap < abs(best.time_s - frame.view.time_s)):
+        if gap_s(sweep) <= max_gap_s and (sweep.sensor not in nearest or gap_s(sweep) < gap_s(nearest[sweep.sensor])):
             nearest[sweep.sensor] = sweep
-    return sorted(nearest.values(), key=lambda sweep: abs(sweep.time_s - frame.view.time_s))
+    return sorted(nearest.values(), key=gap_s)
 
 
 def spread(records: Sequence[Record], count: int) -> list[Record]:

@@ -55,29 +55,21 @@ def parse_object(data: bytes, where: str) -> dict[str, Any]:
 
 
 def ref_problem(text: object) -> str | None:
-    """Say why ``text`` is no acceptable file reference inside a scene, or return None.
-
-    Accepted: relative POSIX paths of plain components. Refused: absolute paths, ``.``/``..``, empty components,
-    backslashes, colons (drive letters, streams), control characters, components ending in a dot or space.
-    """
+    """Say why ``text`` is no acceptable file reference inside a scene (a relative POSIX path of plain components), or
+    return None."""
     if not isinstance(text, str) or not text:
         return "is not a non-empty text"
-    if len(text) > 400:
-        return "is longer than 400 characters"
-    if any(ord(character) < 32 or ord(character) == 127 for character in text):
-        return "contains control characters"
-    if "\\" in text:
-        return "contains a backslash (references use forward slashes)"
-    if ":" in text:
-        return "contains a colon (drive letters and streams are not allowed)"
-    if text.startswith("/"):
-        return "is absolute (references are relative to the scene)"
-    for component in text.split("/"):
-        if component in ("", ".", ".."):
-            return f"contains the component {component!r}"
-        if component[-1] in ". ":
-            return f"has the component {component!r} that ends in a dot or space"
-    return None
+    parts = text.split("/")
+    problems = (
+        (len(text) > 400, "is longer than 400 characters"),
+        (any(ord(character) < 32 or ord(character) == 127 for character in text), "contains control characters"),
+        ("\\" in text, "contains a backslash (references use forward slashes)"),
+        (":" in text, "contains a colon (drive letters and streams are not allowed)"),
+        (text.startswith("/"), "is absolute (references are relative to the scene)"),
+        *((part in ("", ".", ".."), f"contains the component {part!r}") for part in parts),
+        *((part.endswith((".", " ")), f"has the component {part!r} that ends in a dot or space") for part in parts),
+    )
+    return next((words for wrong, words in problems if wrong), None)
 
 
 def check_ref(value: str) -> str:
@@ -280,18 +272,10 @@ def parse_scene(
     where: str,
     complain: Complain = raise_first,
 ) -> Scene:
-    """Build a Scene from the two parsed files.
-
-    Args:
-        scene_json: content of ``scene.json``.
-        tracks_json: content of ``tracks.json``; None when the scene has none.
-        root: where the files lie, kept in the Scene.
-        where: path of ``scene.json`` for messages.
-        complain: called with each problem; raises in the strict reader. A record with a problem is left out.
-
-    Raises:
-        InputError: the frame of the file itself is wrong, or ``complain`` raised.
-    """
+    """Build a Scene from the parsed ``scene.json`` and ``tracks.json`` (None when the scene has none). ``root``: where
+    the files lie, kept in the Scene. ``where``: path of ``scene.json`` for messages. ``complain``: called with each
+    problem; raises in the strict reader. A record with a problem is left out. Raises InputError: the frame of the file
+    itself is wrong, or ``complain`` raised."""
     _check_format(scene_json, FORMAT, where)
     top = parse_record(_SceneIndex, scene_json, f"{where}: ")
     if not top.cameras:
@@ -360,9 +344,8 @@ def check_relations(scene: Scene, where: str, complain: Complain = raise_first) 
     frames."""
     if not scene.frames:
         complain(InputError("scene has no frames", where=f"{where}: frames", expected="at least one image"))
-    for kind, records in (("frames", scene.frames), ("sweeps", scene.sweeps), ("tracks", scene.tracks)):
-        twice = repeated(record.id for record in records)
-        if twice:
+    for kind in ("frames", "sweeps", "tracks"):
+        if twice := repeated(record.id for record in getattr(scene, kind)):
             got = ", ".join(twice[:5])
             complain(InputError("an id occurs twice", where=f"{where}: {kind}", got=got, expected="unique ids"))
     times_by_sensor: dict[str, list[float]] = {}
@@ -373,12 +356,11 @@ def check_relations(scene: Scene, where: str, complain: Complain = raise_first) 
     for sensor, times in times_by_sensor.items():
         problem = increasing_problem(np.array(times))
         if problem is not None:
-            expected, remedy = "seconds, strictly increasing per sensor", "sort the records by time"
-            place_of = f"{where}: {sensor}"
-            complain(InputError("times do not increase", where=place_of, got=problem, expected=expected, remedy=remedy))
+            what, expected = "times do not increase", "seconds, strictly increasing per sensor"
+            at, remedy = f"{where}: {sensor}", "sort the records by time"
+            complain(InputError(what, where=at, got=problem, expected=expected, remedy=remedy))
     known = {frame.id for frame in scene.frames}
-    unknown = [frame_id for frame_id in scene.split if frame_id not in known]
-    if unknown:
+    if unknown := [frame_id for frame_id in scene.split if frame_id not in known]:
         what, got = "split names frames that the scene does not have", ", ".join(unknown[:5])
         complain(InputError(what, where=f"{where}: split", got=got))
 
@@ -402,17 +384,19 @@ def scene_to_json_text(scene: Scene) -> str:
     }
     cameras = [f"{json.dumps(name)}: {_dumps(camera_to_json(camera))}" for name, camera in scene.cameras.items()]
     ego = {"times_s": scene.ego.times_s.tolist(), "world_from_ego": _poses_to_json(scene.ego.world_from_ego)}
-    lines = [f" {json.dumps(key)}: {_dumps(value)}," for key, value in head.items()]
-    lines.append(' "cameras": {\n  ' + ",\n  ".join(cameras) + "\n },")
-    lines.append(' "frames": [' + _record_lines(_frame_to_json(frame) for frame in scene.frames) + "],")
     sweeps = (
         {"id": one.id, "sensor": one.sensor, "time_s": one.time_s}
         | {"world_from_lidar": _poses_to_json(one.world_from_lidar[None])[0], "points": one.points.path}
         for one in scene.sweeps
     )
-    lines.append(' "sweeps": [' + _record_lines(sweeps) + "],")
-    lines.append(' "split": ' + _dumps(dict(scene.split)) + ",")
-    lines.append(' "ego": ' + _dumps(ego))
+    lines = [
+        *(f" {json.dumps(key)}: {_dumps(value)}," for key, value in head.items()),
+        ' "cameras": {\n  ' + ",\n  ".join(cameras) + "\n },",
+        f' "frames": [{_record_lines(map(_frame_to_json, scene.frames))}],',
+        f' "sweeps": [{_record_lines(sweeps)}],',
+        f' "split": {_dumps(dict(scene.split))},',
+        f' "ego": {_dumps(ego)}',
+    ]
     return "{\n" + "\n".join(lines) + "\n}\n"
 
 
@@ -459,10 +443,8 @@ def _record_lines(records: Iterable[dict[str, Any]]) -> str:
 def _dumps(value: object) -> str:
     try:
         return json.dumps(value, allow_nan=False)
-    except ValueError as error:
+    except (ValueError, TypeError) as error:
         what, remedy = "a value that is NaN or infinite cannot be written into a scene", "check poses and times"
-        raise InputError(what, where="scene.json", got=str(error), remedy=remedy) from error
-    except TypeError as error:
-        remedy = "give plain numbers, texts, lists and dicts in the source recipe"
-        what = "a value that JSON cannot hold"
+        if isinstance(error, TypeError):
+            what, remedy = "a value that JSON cannot hold", "give plain numbers, texts, lists and dicts in the recipe"
         raise InputError(what, where="scene.json", got=str(error), remedy=remedy) from error

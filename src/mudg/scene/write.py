@@ -29,10 +29,11 @@ _MAX_PENDING_WRITES: Final = 8
 
 
 class SceneWriter:
-    """Writes a scene; use it as a context manager so that a failure leaves nothing behind.
-
-    Images and labels are encoded and written by two threads while the caller goes on; ``add_*`` may be called from
-    several threads. Frames and sweeps are stored in the order of their times. Example::
+    """Writes a scene; use it as a context manager so that a failure leaves nothing behind. Images and labels are
+    encoded and written by two threads while the caller goes on; ``add_*`` may be called from several threads. Frames
+    and sweeps are stored in the order of their times. ``root``: destination directory; it must not hold a scene yet.
+    Other files there (a run's bookkeeping) are left alone. ``source``: where the log comes from and under which
+    licence. Example::
 
         with SceneWriter(root, "city-7", source) as writer:
             writer.add_camera(camera)
@@ -40,12 +41,6 @@ class SceneWriter:
             writer.add_sweep("lidar/000000", "lidar", time_s, world_from_lidar, points)
             writer.set_ego(ego)
             scene = writer.finish()
-
-    Args:
-        root: destination directory; it must not hold a scene yet. Other files there (a run's bookkeeping) are left
-            alone.
-        scene_id: name of the scene.
-        source: where the log comes from and under which licence.
     """
 
     def __init__(self, root: Path | str, scene_id: str, source: Source) -> None:
@@ -96,15 +91,10 @@ class SceneWriter:
         image: NDArray[np.uint8] | Path | bytes,
         labels: Mapping[str, NDArray[Any]] | None = None,
     ) -> None:
-        """Add one image.
-
-        Args:
-            frame_id: ``<camera>/<digits>``, e.g. ``front/000012``.
-            view: its camera (equal to the one added) and pose.
-            image: u8[H, W, 3] RGB; or the path or the bytes of a PNG or JPEG file, kept as they are after a check that
-                they can be decoded. Grey ones are counted in the scene's notes.
-            labels: see ``add_label``.
-        """
+        """Add one image. ``frame_id``: ``<camera>/<digits>``, e.g. ``front/000012``. ``view``: its camera (equal to the
+        one added) and pose. ``image``: u8[H, W, 3] RGB; or the path or the bytes of a PNG or JPEG file, kept as they
+        are after a check that they can be decoded. Grey ones are counted in the scene's notes. ``labels``: see
+        ``add_label``."""
         where = f"SceneWriter: frame {frame_id}"
         if not isinstance(image, np.ndarray):
             content = image if isinstance(image, bytes) else store.read_bytes(image)
@@ -180,10 +170,8 @@ class SceneWriter:
 
     def copy_frame(self, scene: Scene, frame: Frame, labels: Mapping[str, NDArray[Any]] | None = None) -> None:
         """Add a frame of another scene with its image and its labels; ``labels`` (name -> array) fill in what it lacks.
-
         Files that the other scene's manifest proves to be as they were written are copied byte for byte; others are
-        checked and labels encoded anew.
-        """
+        checked and labels encoded anew."""
         files, camera = open_files(scene.root), frame.view.camera
         where, content = f"{scene.root}: {frame.image.path}", files.read(frame.image.path)
         check = is_grey if files.is_hashed(frame.image.path) else check_image
@@ -322,10 +310,8 @@ def write_photos(
     photos: Sequence[Photo],
     sweeps: Iterable[PlacedSweep],
 ) -> None:
-    """Write a scene of some photographs, with their classes where they have any, all of them for training.
-
-    Frames and sweeps are numbered per camera and sensor in the order given. Photographs of one camera have one size.
-    """
+    """Write a scene of some photographs, with their classes where they have any, all of them for training. Frames and
+    sweeps are numbered per camera and sensor in the order given. Photographs of one camera have one size."""
     counts: dict[str, int] = {}
 
     def numbered(name: str) -> str:
@@ -333,12 +319,11 @@ def write_photos(
         return f"{name}/{counts[name]:06d}"
 
     with SceneWriter(folder, "photographs", source) as writer:
-        for photo in photos:
-            writer.add_camera(photo.view.camera)
         writer.set_ego(ego)
         for track in tracks:
             writer.add_track(track)
         for photo in photos:
+            writer.add_camera(photo.view.camera)
             labels = {} if photo.semantics is None else {"semantics": photo.semantics}
             writer.add_frame(numbered(photo.view.camera.name), photo.view, photo.rgb, labels)
         for sensor, time_s, world_from_lidar, points in sweeps:
@@ -360,21 +345,15 @@ def write_part(
     places: Sequence[Frame] = (),
     held_out: Collection[str] = (),
 ) -> Scene:
-    """Write some frames and sweeps of a scene, with all tracks and the whole ego path, without classes of points.
-
-    Args:
-        scene: what is copied, byte by byte where its manifest allows.
-        frames, sweeps: ids of what is shown; these frames are for training, but for those of ``held_out``, which are
-            for scoring.
-        places: frames of which camera, pose and time are told, with a black image; they are held out. They may belong
-            to a larger scene of the same log.
-    """
+    """Write some frames and sweeps of a scene, with all tracks and the whole ego path, without classes of points; byte
+    by byte where its manifest allows. ``frames``, ``sweeps``: ids of what is shown; these frames are for training, but
+    for those of ``held_out``, which are for scoring. ``places``: frames of which camera, pose and time are told, with a
+    black image; they are held out. They may belong to a larger scene of the same log."""
     shown = [frame for frame in scene.frames if frame.id in frames]
     cameras = {frame.view.camera.name: frame.view.camera for frame in (*shown, *places)}
     ordered = {name: cameras[name] for name in dict.fromkeys((*scene.cameras, *cameras)) if name in cameras}
-    base = replace(
-        scene, cameras=ordered, split={}, sweeps=tuple(sweep for sweep in scene.sweeps if sweep.id in sweeps)
-    )
+    kept = tuple(sweep for sweep in scene.sweeps if sweep.id in sweeps)
+    base = replace(scene, cameras=ordered, split={}, sweeps=kept)
     with SceneWriter(root, scene.id, replace(scene.source, recipe=None)) as writer:
         writer.copy_all_but_frames(base, point_classes=False)
         for frame in shown:

@@ -193,15 +193,11 @@ class RoadUser:
 
 @dataclass(slots=True)
 class Drive:
-    """One drive: the vehicle, the other road users, and the clock.
-
-    Args:
-        road: the recorded path. actors: recorded road users by name. motion, time_s: where and when it begins.
-        traffic: ``log``: they move as recorded. idm: those that moved by more than a metre keep to their recorded path
-            and follow whoever is ahead, this vehicle included, by the intelligent driver model.
-        solid: f32[N, 3] centres of opaque Gaussians that stand still; empty: the surroundings stop nobody.
-        car: the vehicle.
-    """
+    """One drive: the vehicle, the other road users, and the clock. ``road``: the recorded path. ``actors``: recorded
+    road users by name. ``motion``, ``time_s``: where and when it begins. ``traffic``: ``log``: they move as recorded.
+    ``idm``: those that moved by more than a metre keep to their recorded path and follow whoever is ahead, this vehicle
+    included, by the intelligent driver model. ``solid``: f32[N, 3] centres of opaque Gaussians that stand still; empty:
+    the surroundings stop nobody."""
 
     road: Road
     actors: Mapping[str, RoadUser]
@@ -251,18 +247,15 @@ class Drive:
         """Everybody moves for a step. UsageError: controls that are no finite numbers."""
         if not (math.isfinite(controls.acceleration_mps2) and math.isfinite(controls.steer_rate_radps)):
             raise UsageError("controls are not finite", where="action", got=str(controls))
-        now = self.boxes()
-        speeds = {name: self._speed(name) for name in now}
-        bodies = {name: (box, speeds[name]) for name, box in now.items()}
-        bodies[""] = (self.car.box(self.pose), self.motion.speed_mps)
+        bodies = {"": (self.car.box(self.pose), self.motion.speed_mps)}
+        for name, box in self._boxes():
+            follower = self._followers.get(name)
+            speed = self.actors[name].speed_at(self.time_s) if follower is None else follower.speed_mps
+            bodies[name] = (box, speed)
         for name, follower in self._followers.items():
             follower.move({other: body for other, body in bodies.items() if other != name}, step_s)
         self.motion = self.motion.after(controls, step_s, self.car)
         self.time_s += step_s
-
-    def _speed(self, name: str) -> float:
-        follower = self._followers.get(name)
-        return self.actors[name].speed_at(self.time_s) if follower is None else follower.speed_mps
 
     def collision(self) -> str:
         """Name of the object that the vehicle overlaps, ``SURROUNDINGS``, or empty."""
@@ -270,14 +263,11 @@ class Drive:
         for name, box in self._boxes():
             if body.meets(box):
                 return name
-        return SURROUNDINGS if self._solid_inside() >= FEWEST_SOLID else ""
-
-    def _solid_inside(self) -> int:
         x, y, z = geometry.transform_points(geometry.invert(self.pose), self.solid).T
         rear = MARGIN_M - self.car.overhang_m
         inside = (x > rear) & (x < rear + self.car.length_m - 2 * MARGIN_M)
         inside &= (abs(y) < self.car.width_m / 2 - MARGIN_M) & (z > SOLID_ABOVE_M[0]) & (z < SOLID_ABOVE_M[1])
-        return int(inside.sum())
+        return SURROUNDINGS if inside.sum() >= FEWEST_SOLID else ""
 
 
 def beginning(pose: Matrix, speed_mps: float, shift_m: float = 0.0) -> BicycleState:
@@ -338,14 +328,8 @@ class Cockpit:
     def see(self, drive: Drive) -> dict[str, CameraReply]:
         """What the cameras see, by name; where road users move as recorded, all that the scene knows."""
         objects = {name: box.world_from_box for name, box in drive.boxes().items()} if drive.traffic != "log" else None
-        moments = {name: Instant(drive.time_s, drive.pose @ mount, objects) for name, mount in self.mounts.items()}
-        requests = [
-            CameraRequest(
-                optics=Pinhole(camera.width, camera.height, *camera.intrinsics),
-                start=moments[name],
-                layers=self.layers,
-                colors_of=name,
-            )
-            for name, camera in self.cameras.items()
-        ]
+        requests = []
+        for name, camera in self.cameras.items():
+            lens, start = Pinhole.of(camera), Instant(drive.time_s, drive.pose @ self.mounts[name], objects)
+            requests.append(CameraRequest(optics=lens, start=start, layers=self.layers, colors_of=name))
         return dict(zip(self.cameras, self.session.render(requests), strict=True))

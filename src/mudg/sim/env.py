@@ -49,15 +49,10 @@ class Env(gym.Env[Observation, NDArray[np.float32]]):
     world, ``progress_m``, ``shift_m`` to the left of the path, ``collision`` (name of an object, "surroundings" or
     empty), ``trust`` by camera, and ``boxes`` of the road users: pose f64[4, 4] and size.
 
-    Args:
-        run, scene: as for ``Session``, or an open one. cameras: names (empty: the first one). width_px: of the pictures
-            (0 = as recorded). layers: of the pictures; motion is not among them. step_s: seconds per step.
-        traffic: ``log``: road users as recorded; ``idm``: they follow whoever is ahead.
-        largest_shift_m: see above.
-
-    Raises:
-        As ``Session`` and ``Cockpit``. UsageError: an unknown layer, or a step that is no positive time.
-    """
+    ``run``, ``scene``: as for ``Session``, or an open one. ``cameras``: names (empty: the first one). ``width_px``: of
+    the pictures (0 = as recorded). ``layers``: of the pictures; motion is not among them. ``step_s``: seconds per step.
+    ``traffic``: ``log``: road users as recorded; ``idm``: they follow whoever is ahead. Raises what ``Session`` and
+    ``Cockpit`` raise. UsageError: an unknown layer, or a step that is no positive time."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
 
@@ -79,9 +74,8 @@ class Env(gym.Env[Observation, NDArray[np.float32]]):
             raise UsageError("no such layer", where="layers", expected=", ".join(LIMITS), got=", ".join(unknown))
         if not (math.isfinite(step_s) and step_s > 0):
             raise UsageError("a step takes a positive time", where="step_s", got=str(step_s))
-        self.cockpit = Cockpit(
-            run if isinstance(run, Session) else Session(run, scene=scene), cameras, width_px, layers
-        )
+        session = run if isinstance(run, Session) else Session(run, scene=scene)
+        self.cockpit = Cockpit(session, cameras, width_px, layers)
         self.step_s, self.largest_shift_m, self.render_mode = step_s, largest_shift_m, render_mode
         self.traffic: Traffic = traffic
         self.metadata = {**self.metadata, "render_fps": round(1 / step_s)}
@@ -143,19 +137,10 @@ class Env(gym.Env[Observation, NDArray[np.float32]]):
 
     def _look(self, drive: Drive) -> tuple[Observation, dict[str, Any]]:
         self._seen = self.cockpit.see(drive)
-        observation: Observation = {name: _finite(reply.layers) for name, reply in self._seen.items()}
+        observation: Observation = {name: reply.finite() for name, reply in self._seen.items()}
         observation["motion"] = np.array([drive.motion.speed_mps, drive.motion.steer_rad], np.float32)
         station, shift = drive.road.locate((drive.motion.x_m, drive.motion.y_m))
         info = {"time_s": drive.time_s, "pose": drive.pose, "progress_m": station, "shift_m": shift}
         info |= {"collision": drive.collision(), "trust": {name: reply.trust for name, reply in self._seen.items()}}
         info["boxes"] = {n: (box.world_from_box.copy(), np.array(box.size_m)) for n, box in drive.boxes().items()}
         return observation, info
-
-
-def _finite(layers: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Layers without NaN, which no space contains."""
-    missing = lambda name: 0.0 if name == "normals" else np.inf
-    return {
-        name: np.where(np.isnan(layer), np.float32(missing(name)), layer) if layer.dtype.kind == "f" else layer
-        for name, layer in layers.items()
-    }

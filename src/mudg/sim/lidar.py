@@ -17,7 +17,7 @@ from mudg.base import geometry, log, seeds, store
 from mudg.base.errors import UsageError
 from mudg.base.palette import UNLABELLED
 from mudg.base.records import Number, StrictRecord, parse_record
-from mudg.base.types import Scene, Sweep, SweepPoints, View
+from mudg.base.types import Scene, Sweep, SweepPoints
 from mudg.base.weather_settings import WeatherSettings
 from mudg.core.trajectory import ego_left_world, trajectory_name
 from mudg.core.weather.air import SOFT, sweep_in_weather
@@ -26,7 +26,7 @@ from mudg.editing.settings import RenderConfig
 from mudg.scene.beams import Beams, beams_of, with_silent
 from mudg.scene.observations import SWEEPS_INDEX, SimulatedSweep, SweepSet, write_index
 from mudg.scene.read import read_scene
-from mudg.sim.optics import faces_of, nearest, surface
+from mudg.sim.optics import faces_of, nearest
 from mudg.sim.returns import LogReturns
 from mudg.sim.session import Instant, Session
 
@@ -83,16 +83,9 @@ class BeamTable:
             got = f"{columns} columns of {len(elevations)} rows"
             raise UsageError("too many beams", where="azimuth_step_deg", expected=f"at most {MOST_BEAMS}", got=got)
         share = (np.arange(columns) + 0.5) / columns
-        azimuth = np.pi * (1 - 2 * share) * (1 if clockwise else -1)
-        level = np.cos(elevations)[None]
-        away = np.stack(
-            [
-                np.cos(azimuth)[:, None] * level,
-                np.sin(azimuth)[:, None] * level,
-                np.tile(np.sin(elevations), (columns, 1)),
-            ],
-            -1,
-        )
+        azimuth = (np.pi * (1 - 2 * share) * (1 if clockwise else -1))[:, None]
+        level, up = np.cos(elevations)[None], np.tile(np.sin(elevations), (columns, 1))
+        away = np.stack([np.cos(azimuth) * level, np.sin(azimuth) * level, up], -1)
         ring = np.tile(np.arange(len(elevations), dtype=np.uint16), columns)
         return cls(away.reshape(-1, 3), ring, np.repeat(share, len(elevations)), range_m)
 
@@ -143,14 +136,10 @@ def read_table(path: Path) -> BeamTable:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class LidarRequest:
-    """A sweep that a LiDAR would take.
-
-    Args:
-        beams: what is fired. start, end: of the sweep; ``end`` None: all at one moment.
-        weather: fog and rain that take from and add to it, or None. seed: of the noise of weather.
-        focal_px: pixels per radian of the views that are sampled.
-        like: the LiDAR of the log that it resembles: what that one measured counts. Empty: the log's first.
-    """
+    """A sweep that a LiDAR would take. ``beams``: what is fired. ``start``, ``end``: of the sweep; ``end`` None: all at
+    one moment. ``weather``: fog and rain that take from and add to it, or None. ``seed``: of the noise of weather.
+    ``focal_px``: pixels per radian of the views that are sampled. ``like``: the LiDAR of the log that it resembles:
+    what that one measured counts. Empty: the log's first."""
 
     beams: BeamTable
     start: Instant
@@ -167,17 +156,13 @@ class LidarRequest:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LidarReply:
-    """A simulated sweep: the beams that returned.
-
-    Args:
-        beam: i64[N], their numbers in the table. range_m: f32[N] from the sensor at the moment of the beam, metres.
-        xyz: f32[N, 3] metres, in the sensor's frame at the end of the sweep. dt_s: f32[N], seconds after the end.
-        intensity: f32[N] in [0, 1]: as the log's sweeps measured it there; elsewhere how well the surface faces the
-            beam, times 0.5.
-        classes: u8[N] train ids, 255 = none. instances: u16[N], 1 + index into ``objects``, 0 = none.
-        surface_m: f32[B] of all beams of the table: range of what each meets, also where it is lost; NaN: nothing.
-        facing: f32[B], how well that surface faces the beam, [0, 1].
-    """
+    """A simulated sweep: the beams that returned. ``beam``: i64[N], their numbers in the table. ``range_m``: f32[N]
+    from the sensor at the moment of the beam, metres. ``xyz``: f32[N, 3] metres, in the sensor's frame at the end of
+    the sweep. ``dt_s``: f32[N], seconds after the end. ``intensity``: f32[N] in [0, 1]: as the log's sweeps measured it
+    there; elsewhere how well the surface faces the beam, times 0.5. ``classes``: u8[N] train ids, 255 = none.
+    ``instances``: u16[N], 1 + index into ``objects``, 0 = none. ``surface_m``: f32[B] of all beams of the table: range
+    of what each meets, also where it is lost; NaN: nothing. ``facing``: f32[B], how well that surface faces the beam,
+    [0, 1]."""
 
     beam: NDArray[np.int64]
     range_m: NDArray[np.float32]
@@ -190,6 +175,13 @@ class LidarReply:
     objects: tuple[str, ...]
     surface_m: NDArray[np.float32]
     facing: NDArray[np.float32]
+
+    def arrays(self, beams: BeamTable) -> dict[str, NDArray[Any]]:
+        """What a file of sweeps holds (``scene/observations.py``)."""
+        kept = {name: getattr(self, name) for name in ("xyz", "dt_s", "classes", "ring", "facing")}
+        kept |= {"intensity": self.intensity.astype(np.float32), "beam": self.beam.astype(np.int64)}
+        fired = {name: getattr(beams, name).astype(np.float32) for name in ("directions", "share")}
+        return {**kept, **fired, "range_m": self.surface_m}
 
 
 def _sweep(session: Session, request: LidarRequest) -> LidarReply:
@@ -250,15 +242,10 @@ def _draw(session: Session, moment: Instant, rays: Floats, own: NDArray[np.int64
     """Draw a slice of a sweep; ``rays`` f64[n, 3] in camera axes."""
     world_from_camera = moment.world_from_sensor @ geometry.from_rotation_translation(AXES, (0.0, 0.0, 0.0))
     for face in faces_of(rays, focal_px):
-        turned = geometry.from_rotation_translation(face.cam_from_face, (0.0, 0.0, 0.0))
-        view = View(face.camera, world_from_camera @ turned, moment.time_s)
-        planes = session.pinhole(view, moment, instances=True)
-        depth, target = planes.seen.depth.numpy(), own[face.pixels]
-        z, facing = surface(depth, face.uv, face.camera)
-        x, y = geometry.pinhole_ray(face.camera.intrinsics, *face.uv.T)
-        hits.distance[target] = z * np.sqrt(x * x + y * y + 1)
-        hits.facing[target] = facing
-        hits.intensity[target] = 0.5 * facing
+        planes = session.pinhole(face.view(world_from_camera, moment.time_s), moment, instances=True)
+        target = own[face.pixels]
+        hits.distance[target], hits.facing[target] = face.surface(planes.seen.depth.numpy())
+        hits.intensity[target] = 0.5 * hits.facing[target]
         hits.classes[target] = nearest(planes.seen.semantics.numpy(), face.uv)
         if planes.instances is not None:
             hits.instances[target] = nearest(planes.instances, face.uv)
@@ -303,9 +290,7 @@ def _carried(points: NDArray[np.float32], share: Floats, start: Instant, end: In
 
 
 # -- sweeps of a whole log: ``mudg render --lidar`` ---
-#
 # OUT/lidar/<sensor>_recorded/, OUT/lidar/<sensor>_shift+3.0/   see ``scene/observations.py``
-Place = tuple[BeamTable, Instant, Instant]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -371,7 +356,7 @@ def write_sweeps(config: RenderConfig, scene: Path, session: Session, out: Path)
                 file = folder / f"{number:06d}.safetensors"
                 if not file.is_file():
                     reply = session.render([LidarRequest(beams=beams, start=start, end=end, like=wanted.sensor)])[0]
-                    store.write_safetensors(file, _arrays(beams, reply))
+                    store.write_safetensors(file, reply.arrays(beams))
                 poses = (start.world_from_sensor, end.world_from_sensor, start.time_s, end.time_s)
                 records.append(SimulatedSweep(sweep.id, wanted.beams is None, *poses, file.name))
                 bar.advance()
@@ -381,37 +366,20 @@ def write_sweeps(config: RenderConfig, scene: Path, session: Session, out: Path)
     return names
 
 
-def _place(scene: Scene, sweep: Sweep, shift_m: float, table: BeamTable | None) -> Place:
+def _place(scene: Scene, sweep: Sweep, shift_m: float, table: BeamTable | None) -> tuple[BeamTable, Instant, Instant]:
     """Beams, start and end of a sweep that is taken where a recorded one was, moved to the left."""
-    own = beams_of(scene, sweep)
-    moved = np.zeros(3)
+    own, moved = beams_of(scene, sweep), np.zeros(3)
     if shift_m:
         first, last = float(scene.ego.times_s[0]), float(scene.ego.times_s[-1])
         ego = scene.ego.pose_at(min(max(sweep.time_s, first), last))
         moved = shift_m * ego_left_world(sweep.world_from_lidar if ego is None else ego)
-    poses = [pose.copy() for pose in (own.start, own.end)]
-    for pose in poses:
-        pose[:3, 3] += moved
-    table = own_table(own) if table is None else table
-    return table, Instant(own.start_s, poses[0]), Instant(own.end_s, poses[1])
+    start, end = own.start.copy(), own.end.copy()
+    start[:3, 3] += moved
+    end[:3, 3] += moved
+    return own_table(own) if table is None else table, Instant(own.start_s, start), Instant(own.end_s, end)
 
 
 def own_table(beams: Beams) -> BeamTable:
     """The beams of a recorded sweep, those that returned nothing included."""
     full, reach = with_silent(beams), float(beams.range_m.max(initial=100.0))
     return BeamTable(full.directions, np.zeros(len(full), np.uint16), full.share, (0.0, 1.05 * reach))
-
-
-def _arrays(beams: BeamTable, reply: LidarReply) -> dict[str, Any]:
-    return {
-        "xyz": reply.xyz,
-        "intensity": reply.intensity.astype(np.float32),
-        "dt_s": reply.dt_s,
-        "classes": reply.classes,
-        "ring": reply.ring,
-        "beam": reply.beam.astype(np.int64),
-        "directions": beams.directions.astype(np.float32),
-        "share": beams.share.astype(np.float32),
-        "range_m": reply.surface_m,
-        "facing": reply.facing,
-    }

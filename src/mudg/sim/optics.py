@@ -11,10 +11,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval
 from numpy.typing import NDArray
 
+from mudg.base import geometry
 from mudg.base.errors import UsageError
-from mudg.base.types import Camera
+from mudg.base.types import Camera, View
 
 Floats = NDArray[np.float64]
 MOST_PIXELS: Final = 8192 * 8192
@@ -23,22 +25,21 @@ NEWTON_STEPS: Final = 30
 CONVERGED: Final = 1e-9
 SAME_SURFACE: Final = 0.03
 """Relative difference of depth within which neighbouring pixels show one surface."""
-FACES: Final = {
-    "front": np.eye(3),
-    "right": np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
-    "left": np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]),
-    "down": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
-    "up": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
-    "back": np.array([[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]]),
-}
-"""Rotations camera-from-face of a cube's sides: each looks along the z axis of its own frame."""
+FACES: Final = (
+    np.eye(3),
+    np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
+    np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]),
+    np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    np.array([[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]]),
+)
+"""Rotations camera-from-face of a cube's sides (front, right, left, down, up, back): each looks along the z axis of its
+own frame."""
 
 
 @dataclass(frozen=True, slots=True)
-class Pinhole:
-    """A pinhole camera with the lens distortion of OpenCV. ``width``, ``height``: pixels. ``fx``, ``fy``, ``cx``,
-    ``cy``: pixels. ``radial``: k1 to k6 of the rational model, missing ones 0. ``tangential``: p1, p2. ``thin_prism``:
-    s1 to s4."""
+class _FocalLens:
+    """A lens with focal lengths. ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy``: pixels."""
 
     width: int
     height: int
@@ -47,6 +48,20 @@ class Pinhole:
     cx: float
     cy: float
     radial: tuple[float, ...] = ()
+
+    def plane(self) -> tuple[Floats, Floats]:
+        """Pixel centres in focal lengths from the principal point, to the right and down, each f64[H, W]."""
+        x, y = (np.arange(self.width) + 0.5 - self.cx) / self.fx, (np.arange(self.height) + 0.5 - self.cy) / self.fy
+        right, down = np.broadcast_arrays(x[None, :], y[:, None])
+        return right, down
+
+
+@dataclass(frozen=True, slots=True)
+class Pinhole(_FocalLens):
+    """A pinhole camera with the lens distortion of OpenCV. ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy``:
+    pixels. ``radial``: k1 to k6 of the rational model, missing ones 0. ``tangential``: p1, p2. ``thin_prism``: s1 to
+    s4."""
+
     tangential: tuple[float, ...] = ()
     thin_prism: tuple[float, ...] = ()
 
@@ -55,6 +70,11 @@ class Pinhole:
         for name, most in (("radial", 6), ("tangential", 2), ("thin_prism", 4)):
             if len(getattr(self, name)) > most:
                 raise UsageError(f"a pinhole lens has at most {most} {name} coefficients", got=str(getattr(self, name)))
+
+    @classmethod
+    def of(cls, camera: Camera) -> Pinhole:
+        """The lens of a rectified camera."""
+        return cls(camera.width, camera.height, *camera.intrinsics)
 
     @property
     def camera(self) -> Camera | None:
@@ -65,7 +85,7 @@ class Pinhole:
 
     def rays(self) -> Floats:
         """f64[H, W, 3]."""
-        distorted = np.stack(_plane(self), -1)
+        distorted = np.stack(self.plane(), -1)
         plain, step = distorted.copy(), np.full(distorted.shape[:2], np.inf)
         if self.camera is None:
             for _ in range(NEWTON_STEPS):  # fixed point of x = (distorted - tangential(x)) / radial(x)
@@ -91,18 +111,11 @@ class Pinhole:
 
 
 @dataclass(frozen=True, slots=True)
-class Fisheye:
+class Fisheye(_FocalLens):
     """The equidistant lens of OpenCV: a ray at angle a from the axis falls r = a (1 + k1 a^2 + k2 a^4 + ...) from the
-    centre. ``width``, ``height``: pixels. ``fx``, ``fy``, ``cx``, ``cy``: pixels. ``radial``: k1 to k4. ``max_angle``:
-    radians; beyond it nothing is seen."""
+    centre. ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy``: pixels. ``radial``: k1 to k4. ``max_angle``: radians;
+    beyond it nothing is seen."""
 
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    radial: tuple[float, ...] = ()
     max_angle: float = math.pi / 2
 
     def __post_init__(self) -> None:
@@ -110,7 +123,7 @@ class Fisheye:
 
     def rays(self) -> Floats:
         """f64[H, W, 3]."""
-        x, y = _plane(self)
+        x, y = self.plane()
         coefficients = [0.0, 1.0]
         for k in self.radial:
             coefficients += [0.0, k]
@@ -120,14 +133,10 @@ class Fisheye:
 @dataclass(frozen=True, slots=True)
 class FTheta:
     """NVIDIA's f-theta lens: polynomials between the distance from the principal point in pixels and the angle from the
-    axis in radians.
-
-    Args:
-        width, height, cx, cy: pixels.
-        pixels_to_angle, angle_to_pixels: coefficients by rising power; the second may be empty. reference: which of the
-            two is exact; the other one approximates its inverse.
-        max_angle: radians. linear: c, d, e of the matrix [[c, d], [e, 1]] that shears and stretches the image.
-    """
+    axis in radians. ``width``, ``height``, ``cx``, ``cy``: pixels. ``pixels_to_angle``, ``angle_to_pixels``:
+    coefficients by rising power; the second may be empty. ``reference``: which of the two is exact; the other one
+    approximates its inverse. ``max_angle``: radians. ``linear``: c, d, e of the matrix [[c, d], [e, 1]] that shears and
+    stretches the image."""
 
     width: int
     height: int
@@ -144,33 +153,24 @@ class FTheta:
         check_optics(self, (self.max_angle,), numbers)
         if self.reference not in ("pixels_to_angle", "angle_to_pixels") or not getattr(self, self.reference):
             what = "an f-theta lens needs the coefficients of its reference polynomial"
-            raise UsageError(
-                what, where=self.reference, expected="pixels_to_angle or angle_to_pixels, with coefficients"
-            )
+            expected = "pixels_to_angle or angle_to_pixels, with coefficients"
+            raise UsageError(what, where=self.reference, expected=expected)
 
     def rays(self) -> Floats:
         """f64[H, W, 3]."""
         c, d, e = self.linear
-        offsets = np.stack(
-            np.meshgrid(np.arange(self.width) + 0.5 - self.cx, np.arange(self.height) + 0.5 - self.cy), -1
-        )
+        across, down = np.arange(self.width) + 0.5 - self.cx, np.arange(self.height) + 0.5 - self.cy
+        offsets = np.stack(np.meshgrid(across, down), -1)
         x, y = np.moveaxis(offsets @ np.linalg.inv(np.array([[c, d], [e, 1.0]])).T, -1, 0)
         distance = np.hypot(x, y)
         if self.reference == "pixels_to_angle":
-            angle = np.polynomial.polynomial.polyval(distance, self.pixels_to_angle)
+            angle = polyval(distance, self.pixels_to_angle)
         else:
             angle = inverse(self.angle_to_pixels, distance, self.max_angle)
         return around_axis(x, y, angle, self.max_angle)
 
 
 Optics = Pinhole | Fisheye | FTheta
-
-
-def _plane(lens: Pinhole | Fisheye) -> tuple[Floats, Floats]:
-    """Pixel centres in focal lengths from the principal point, to the right and down, each f64[H, W]."""
-    x, y = (np.arange(lens.width) + 0.5 - lens.cx) / lens.fx, (np.arange(lens.height) + 0.5 - lens.cy) / lens.fy
-    right, down = np.broadcast_arrays(x[None, :], y[:, None])
-    return right, down
 
 
 def check_optics(optics: Optics, positive: Sequence[float], numbers: Sequence[float]) -> None:
@@ -201,21 +201,19 @@ def unit(vectors: Floats) -> Floats:
 def inverse(coefficients: Sequence[float], values: Floats, largest: float) -> Floats:
     """Arguments in [0, largest] at which a polynomial (coefficients by rising power) has the values, by Newton's method
     within the part in which it grows; NaN where there is none."""
-    slope = np.polynomial.polynomial.polyder(coefficients)
+    slope = polyder(coefficients)
     steps = np.linspace(0, largest, 1025)
-    falls = np.polynomial.polynomial.polyval(steps, slope) <= 0
+    falls = polyval(steps, slope) <= 0
     end = steps[falls.argmax()] if falls.any() else largest
-    known = np.polynomial.polynomial.polyval(steps, coefficients)
+    known = polyval(steps, coefficients)
     argument = np.interp(values, known[steps <= end], steps[steps <= end])
     for _ in range(NEWTON_STEPS):
         with np.errstate(all="ignore"):
-            step = (
-                np.polynomial.polynomial.polyval(argument, coefficients) - values
-            ) / np.polynomial.polynomial.polyval(argument, slope)
+            step = (polyval(argument, coefficients) - values) / polyval(argument, slope)
         argument = np.clip(argument - step, 0, end)
         if np.abs(step).max(initial=0) < CONVERGED:
             break
-    off = np.abs(np.polynomial.polynomial.polyval(argument, coefficients) - values)
+    off = np.abs(polyval(argument, coefficients) - values)
     return np.where(off <= 1e-6 * max(1.0, float(known.max())), argument, np.nan)
 
 
@@ -239,18 +237,30 @@ class Face:
     pixels: NDArray[np.int64]
     uv: Floats
 
+    def view(self, world_from_camera: Floats, time_s: float) -> View:
+        """The view of a camera that stands there."""
+        turned = geometry.from_rotation_translation(self.cam_from_face, (0.0, 0.0, 0.0))
+        return View(self.camera, world_from_camera @ turned, time_s)
 
-def faces_of(rays: Floats, focal_px: float) -> list[Face]:
+    def surface(self, depth: NDArray[np.float32]) -> tuple[Floats, NDArray[np.float32]]:
+        """Distance along every ray f64[n] to the surface of a depth f32[H, W], and how squarely that faces it."""
+        z, facing = surface(depth, self.uv, self.camera)
+        x, y = geometry.pinhole_ray(self.camera.intrinsics, *self.uv.T)
+        return z * np.sqrt(x * x + y * y + 1), facing
+
+
+def faces_of(rays: Floats, focal_px: float, name: str = "sim") -> list[Face]:
     """Pinhole views that together show all rays f64[..., 3], each cropped to what it must show. ``focal_px``: focal
-    length of the faces, pixels per radian on their axes; at most what keeps a face below ``MOST_FACE_PX``."""
+    length of the faces, pixels per radian on their axes; at most what keeps a face below ``MOST_FACE_PX``. ``name``: of
+    their cameras."""
     flat = rays.reshape(-1, 3)
     with np.errstate(invalid="ignore"):
-        along = np.stack([flat @ turn[:, 2] for turn in FACES.values()])
+        along = np.stack([flat @ turn[:, 2] for turn in FACES])
     seen = np.isfinite(flat).all(1)
     side = np.where(seen, along.argmax(0), -1)
     focal = min(focal_px, MOST_FACE_PX / 2)
     found = []
-    for index, (name, turn) in enumerate(FACES.items()):
+    for index, turn in enumerate(FACES):
         pixels = np.flatnonzero(side == index)
         if not len(pixels):
             continue
@@ -258,7 +268,7 @@ def faces_of(rays: Floats, focal_px: float) -> list[Face]:
         plane = np.stack([x / z, y / z], 1) * focal
         low, high = np.floor(plane.min(0)) - 1, np.ceil(plane.max(0)) + 1
         width, height = (int(v) for v in high - low)
-        camera = Camera(f"sim-{name}", width, height, focal, focal, -float(low[0]), -float(low[1]))
+        camera = Camera(name, width, height, focal, focal, -float(low[0]), -float(low[1]))
         found.append(Face(camera, turn, pixels, plane - low))
     return found
 
@@ -270,10 +280,7 @@ def rays_per_radian(rays: Floats) -> float:
     return 1.0 / float(np.median(steps)) if len(steps) else 100.0
 
 
-Corners = tuple[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]], Floats, Floats]
-
-
-def _corners(uv: Floats, height: int, width: int) -> Corners:
+def _corners(uv: Floats, height: int, width: int) -> tuple[tuple[NDArray[np.int64], ...], Floats, Floats]:
     """Rows and columns (top, below, left, right) of the four pixels around places f64[n, 2], and how far right and down
     of the first each lies; what is beyond the border counts as the border."""
     x, y = np.clip(uv[:, 0] - 0.5, 0, width - 1), np.clip(uv[:, 1] - 0.5, 0, height - 1)
@@ -304,9 +311,8 @@ def surface(depth: NDArray[np.float32], uv: Floats, camera: Camera) -> tuple[Flo
     exact on planes; at edges the nearest pixel counts, so that no beam hangs between two surfaces."""
     (top, below, left, right), u, v = _corners(uv, *depth.shape)
     with np.errstate(divide="ignore", invalid="ignore"):
-        corners = 1 / np.stack([depth[top, left], depth[top, right], depth[below, left], depth[below, right]]).astype(
-            float
-        )
+        at = [depth[top, left], depth[top, right], depth[below, left], depth[below, right]]
+        corners = 1 / np.stack(at).astype(float)
         weights = np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v])
         inverse = (weights * corners).sum(0)
         one = corners.max(0) - corners.min(0) <= SAME_SURFACE * corners.max(0)

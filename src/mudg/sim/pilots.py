@@ -37,14 +37,11 @@ EDGE_MARGIN_M: Final = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriverView:
-    """What a pilot sees at a step.
-
-    Args:
-        time_s, step_s: now, and how long its answer holds. speed_mps, steer_rad: of the vehicle.
-        route: the road ahead f64[N, 3] in the vehicle's frame, metres (x forward, y left, z up).
-        pose: world-from-vehicle f64[4, 4]. camera, vehicle_from_camera: of the pictures.
-        rgb: u8[H, W, 3]. depth: f32[H, W] camera z in metres, not finite where there is no surface. classes: u8[H, W].
-    """
+    """What a pilot sees at a step. ``time_s``, ``step_s``: now, and how long its answer holds. ``speed_mps``,
+    ``steer_rad``: of the vehicle. ``route``: the road ahead f64[N, 3] in the vehicle's frame, metres (x forward, y
+    left, z up). ``pose``: world-from-vehicle f64[4, 4]. ``camera``, ``vehicle_from_camera``: of the pictures. ``rgb``:
+    u8[H, W, 3]. ``depth``: f32[H, W] camera z in metres, not finite where there is no surface. ``classes``:
+    u8[H, W]."""
 
     time_s: float
     step_s: float
@@ -133,10 +130,8 @@ class RoutePilot:
 
 @dataclass(slots=True)
 class EdgePilot(RoutePilot):
-    """Pulls over: goes to the side of the route until the edge of the road that it sees, ``shift_m`` at most.
-
-    Depth and classes steer it, not the speed alone. Where they show no edge, it stays on the route.
-    """
+    """Pulls over: goes to the side of the route until the edge of the road that it sees, ``shift_m`` at most. Depth and
+    classes steer it, not the speed alone. Where they show no edge, it stays on the route."""
 
     def aim_m(self, sight: DriverView) -> float:
         """See ``RoutePilot``."""
@@ -184,7 +179,6 @@ class PlanPilot:
 
 
 # -- a driving policy behind AlpaSim's EgodriverService (``pip install 'mudg[sim]'``) ---
-#
 #     with Policy("localhost:50051", "front", camera, mount) as policy:
 #         controls = PlanPilot(policy).drive(sight)
 #
@@ -212,17 +206,8 @@ class Policy:
         self._name, self._id, self._first_s = name, str(uuid.uuid5(uuid.NAMESPACE_URL, f"{scene} {seed} {name}")), None
         types = self._types
         self.version: str = self._call("get_version", types.Empty()).version_id
-        lens = types.PinholeParam(
-            principal_point_x=camera.cx, principal_point_y=camera.cy, focal_length_x=camera.fx, focal_length_y=camera.fy
-        )
-        spec = types.CameraSpec(
-            opencv_pinhole_param=lens,
-            logical_id=name,
-            resolution_h=camera.height,
-            resolution_w=camera.width,
-            shutter_type=5,
-        )
-        shown = types.AvailableCamera(intrinsics=spec, rig_to_camera=wire.pose_of(mount), logical_id=name)
+        shown = wire.available_camera(camera, mount)
+        shown.logical_id = shown.intrinsics.logical_id = name
         vehicle = types.RolloutSpec(vehicle=types.VehicleDefinition(available_cameras=[shown]))
         request = types.DriveSessionRequest(
             session_uuid=self._id, random_seed=seed, debug_info=types.DriveScene(scene_id=scene), rollout_spec=vehicle

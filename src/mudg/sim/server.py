@@ -44,9 +44,9 @@ LIDARS: Final = {0: "pandar128", 1: "at128"}
 
 
 class Refused(Exception):
-    """A request that gets a status of gRPC instead of an answer: its name, and why."""
+    """A request that gets a status of gRPC instead of an answer: why, and its name."""
 
-    def __init__(self, status: str, why: str) -> None:
+    def __init__(self, why: str, status: str = "INVALID_ARGUMENT") -> None:
         super().__init__(why)
         self.status = status
 
@@ -84,16 +84,9 @@ class Renderer:
     def get_available_cameras(self, request: Any) -> Any:
         """The log's cameras and where they are mounted."""
         self._check_scene(request)
-        made = self.types.AvailableCamerasReturn()
-        for name, mount in self.session.mounts().items():
-            camera, one = self.session.cameras[name], made.available_cameras.add(logical_id=name)
-            one.rig_to_camera.CopyFrom(pose_of(mount))
-            spec = one.intrinsics
-            spec.logical_id, spec.shutter_type = name, 5
-            spec.resolution_h, spec.resolution_w = camera.height, camera.width
-            lens = spec.opencv_pinhole_param
-            lens.focal_length_x, lens.focal_length_y, lens.principal_point_x, lens.principal_point_y = camera.intrinsics
-        return made
+        mounts, cameras = self.session.mounts(), self.session.cameras
+        shown = [wire.available_camera(cameras[name], mount) for name, mount in mounts.items()]
+        return self.types.AvailableCamerasReturn(available_cameras=shown)
 
     def get_available_trajectories(self, request: Any) -> Any:
         """The recorded path of the vehicle."""
@@ -111,7 +104,7 @@ class Renderer:
         """One picture."""
         self._check_scene(request)
         if request.insert_ego_mask:
-            raise Refused("INVALID_ARGUMENT", "insert_ego_mask: this scene has no ego masks (get_available_ego_masks)")
+            raise Refused("insert_ego_mask: this scene has no ego masks (get_available_ego_masks)")
         spec = request.camera_intrinsics
         camera = CameraRequest(
             optics=self._optics(spec, request.resolution_w, request.resolution_h),
@@ -129,7 +122,7 @@ class Renderer:
         self._check_scene(request)
         kind = request.lidar_config.lidar_type
         if kind not in LIDARS:
-            raise Refused("INVALID_ARGUMENT", f"lidar_config.lidar_type: expected one of {list(LIDARS)}, got {kind}")
+            raise Refused(f"lidar_config.lidar_type: expected one of {list(LIDARS)}, got {kind}")
         beams = self._beams.setdefault(kind, TABLES[LIDARS[kind]]())
         sweep = LidarRequest(beams=beams, start=self._instant(request, "start"), end=self._instant(request, "end"))
         with self._drawing:
@@ -165,20 +158,16 @@ class Renderer:
     def _check_scene(self, request: Any) -> None:
         if request.scene_id != self.name:
             what = f"scene_id: there is no such scene; expected {self.name!r}, got {request.scene_id[:200]!r}"
-            raise Refused("NOT_FOUND", what)
+            raise Refused(what, "NOT_FOUND")
 
     def _instant(self, request: Any, end: str) -> Instant:
         """Sensor and objects at the start or the end of a request."""
         micros, pair = getattr(request, f"frame_{end}_us"), request.sensor_pose
         if micros > LATEST_US or request.frame_start_us > request.frame_end_us:
             got = f"{request.frame_start_us} to {request.frame_end_us}"
-            raise Refused(
-                "INVALID_ARGUMENT", f"frame_start_us, frame_end_us: not a span of time on the scene's clock: {got}"
-            )
+            raise Refused(f"frame_start_us, frame_end_us: not a span of time on the scene's clock: {got}")
         if len(request.dynamic_objects) > MOST_OBJECTS:
-            raise Refused(
-                "INVALID_ARGUMENT", f"dynamic_objects: at most {MOST_OBJECTS}, got {len(request.dynamic_objects)}"
-            )
+            raise Refused(f"dynamic_objects: at most {MOST_OBJECTS}, got {len(request.dynamic_objects)}")
         known, objects = self.session.sizes_m(), {}
         for one in request.dynamic_objects:
             if one.track_id in known:
@@ -192,7 +181,7 @@ class Renderer:
     def _optics(self, spec: Any, width: int, height: int) -> Optics:
         """The lens of a request; a picture of another size than the lens's is scaled."""
         if spec.HasField("bivariate_windshield_model_param"):
-            raise Refused("INVALID_ARGUMENT", "camera_intrinsics: lenses behind a bivariate windshield are not drawn")
+            raise Refused("camera_intrinsics: lenses behind a bivariate windshield are not drawn")
         width, height = width or spec.resolution_w, height or spec.resolution_h
         across, down = width / (spec.resolution_w or width or 1), height / (spec.resolution_h or height or 1)
         if spec.HasField("opencv_pinhole_param") or spec.HasField("opencv_fisheye_param"):
@@ -207,7 +196,7 @@ class Renderer:
             return Pinhole(*numbers, tuple(lens.tangential_coeffs), tuple(lens.thin_prism_coeffs))
         if spec.HasField("ftheta_param"):
             if (across, down) != (1.0, 1.0):
-                raise Refused("INVALID_ARGUMENT", "resolution: a picture through an f-theta lens has the lens's size")
+                raise Refused("resolution: a picture through an f-theta lens has the lens's size")
             lens = spec.ftheta_param
             linear = (lens.linear_cde.linear_c, lens.linear_cde.linear_d, lens.linear_cde.linear_e)
             return FTheta(
@@ -217,7 +206,7 @@ class Renderer:
                 lens.max_angle or math.pi / 2,
                 linear if lens.HasField("linear_cde") else (1.0, 0.0, 0.0),
             )
-        raise Refused("INVALID_ARGUMENT", "camera_intrinsics: expected a pinhole, fisheye or f-theta lens")
+        raise Refused("camera_intrinsics: expected a pinhole, fisheye or f-theta lens")
 
 
 def encoded(rgb: NDArray[np.uint8], image_format: int, quality: float) -> bytes:
@@ -226,9 +215,9 @@ def encoded(rgb: NDArray[np.uint8], image_format: int, quality: float) -> bytes:
     if image_format == wire.RGB_PLANAR:
         return np.ascontiguousarray(rgb.transpose(2, 0, 1)).tobytes()
     if image_format not in (wire.PNG, wire.JPEG):
-        raise Refused("INVALID_ARGUMENT", f"image_format: expected PNG (1), JPEG (2) or planes (4), got {image_format}")
+        raise Refused(f"image_format: expected PNG (1), JPEG (2) or planes (4), got {image_format}")
     if image_format == wire.JPEG and not 0 <= quality <= 100:
-        raise Refused("INVALID_ARGUMENT", f"image_quality: expected 1 to 100, got {quality}")
+        raise Refused(f"image_quality: expected 1 to 100, got {quality}")
     file = io.BytesIO()
     if image_format == wire.PNG:
         Image.fromarray(rgb).save(file, "PNG", compress_level=1)
@@ -271,16 +260,13 @@ def handlers(renderer: Renderer, metrics: Metrics, token: str) -> list[Any]:
             try:
                 sent = dict(context.invocation_metadata()).get("authorization", "")
                 if token and not hmac.compare_digest(str(sent), f"Bearer {token}"):
-                    raise Refused("UNAUTHENTICATED", "the metadata authorization: Bearer TOKEN is missing or wrong")
+                    raise Refused("the metadata authorization: Bearer TOKEN is missing or wrong", "UNAUTHENTICATED")
                 if not context.is_active():
-                    raise Refused("CANCELLED", "the client has gone")
+                    raise Refused("the client has gone", "CANCELLED")
                 return work(request)
-            except Refused as error:
-                status, why = error.status, str(error)
-            except ResourceError as error:
-                status, why = "RESOURCE_EXHAUSTED", " ".join(str(error).split())
-            except MudgError as error:
-                status, why = "INVALID_ARGUMENT", " ".join(str(error).split())
+            except (Refused, MudgError) as error:
+                status, why = getattr(error, "status", "INVALID_ARGUMENT"), " ".join(str(error).split())
+                status = "RESOURCE_EXHAUSTED" if isinstance(error, ResourceError) else status
             finally:
                 metrics.add(name, status, time.perf_counter() - began)
             context.abort(grpc.StatusCode[status], why[:1000])
@@ -300,28 +286,16 @@ def handlers(renderer: Renderer, metrics: Metrics, token: str) -> list[Any]:
 
 @contextlib.contextmanager
 def serving(session: Session, name: str, config: ServeConfig) -> Iterator[tuple[str, str]]:
-    """A running server, and its stop: what is being drawn is finished, for at most ``GRACE_S``.
-
-    Yields:
-        Addresses ``host:port`` of the service and of its metrics (empty: none).
-
-    Raises:
-        UsageError: another address than loopback without a token. ResourceError: the address is taken, or grpcio is not
-            installed.
-    """
+    """A running server, and its stop: what is being drawn is finished, for at most ``GRACE_S``. Yields addresses
+    ``host:port`` of the service and of its metrics (empty: none). UsageError: another address than loopback without a
+    token. ResourceError: the address is taken, or grpcio is not installed."""
     grpc, metrics = wire.package(), Metrics()
     token = token_for(config.host, config.token) if config.token or not is_loopback(config.host) else ""
     most = MESSAGE_MB * 2**20
-    server = grpc.server(
-        ThreadPoolExecutor(THREADS, "serve"),
-        handlers=handlers(Renderer(session, name), metrics, token),
-        maximum_concurrent_rpcs=WAITING,
-        options=[
-            ("grpc.max_receive_message_length", most),
-            ("grpc.max_send_message_length", most),
-            ("grpc.so_reuseport", 0),
-        ],
-    )
+    options = [(f"grpc.max_{way}_message_length", most) for way in ("receive", "send")] + [("grpc.so_reuseport", 0)]
+    answers = handlers(Renderer(session, name), metrics, token)
+    pool = ThreadPoolExecutor(THREADS, "serve")
+    server = grpc.server(pool, handlers=answers, maximum_concurrent_rpcs=WAITING, options=options)
     try:
         port = server.add_insecure_port(f"{config.host}:{config.port}")
     except RuntimeError as error:
@@ -356,10 +330,8 @@ def _metrics_pages(metrics: Metrics, port: int) -> ThreadingHTTPServer:
     try:
         pages = ThreadingHTTPServer(("127.0.0.1", port), Page)
     except OSError as error:
-        where = f"127.0.0.1:{port}"
-        raise ResourceError(
-            "cannot listen on this address", where=where, remedy="choose another --metrics-port"
-        ) from error
+        what, where = "cannot listen on this address", f"127.0.0.1:{port}"
+        raise ResourceError(what, where=where, remedy="choose another --metrics-port") from error
     threading.Thread(target=pages.serve_forever, name="metrics", daemon=True).start()
     return pages
 

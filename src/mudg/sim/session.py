@@ -5,7 +5,7 @@ Gaussians of; parked vehicles belong to the background unless an edit script tak
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal, Protocol, Self, TypeVar, get_args
 
@@ -29,7 +29,7 @@ from mudg.gaussians.nodes import NodeRows, RigidNode, StaticNode
 from mudg.gaussians.rendering import COVERED, RenderedCondition, raster_of, render_condition, rows_of
 from mudg.gaussians.storage import load_model
 from mudg.scene.read import read_scene
-from mudg.sim.optics import Face, Optics, Pinhole, bilinear, faces_of, nearest, rays_of, rays_per_radian, surface
+from mudg.sim.optics import Face, Optics, Pinhole, bilinear, faces_of, nearest, rays_of, rays_per_radian
 from mudg.sim.returns import LogReturns, learn_returns, places_gone
 
 Layer = Literal["rgb", "depth", "distance", "classes", "instances", "normals", "confidence", "motion"]
@@ -83,14 +83,10 @@ class Instant:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class CameraRequest:
-    """A picture that a camera would take.
-
-    Args:
-        optics: lens and size. start, end: of the exposure; ``end`` None: the same moment.
-        shutter: ``global`` draws the middle of the exposure; else the direction in which rows or columns are read.
-        layers: of ``LAYERS``. colors_of: a camera of the log whose colours the picture has; empty: the first one.
-        motion_to: the later moment that the layer ``motion`` leads to.
-    """
+    """A picture that a camera would take. ``optics``: lens and size. ``start``, ``end``: of the exposure; ``end`` None:
+    the same moment. ``shutter``: ``global`` draws the middle of the exposure; else the direction in which rows or
+    columns are read. ``layers``: of ``LAYERS``. ``colors_of``: a camera of the log whose colours the picture has;
+    empty: the first one. ``motion_to``: the later moment that the layer ``motion`` leads to."""
 
     optics: Optics
     start: Instant
@@ -116,36 +112,40 @@ class CameraRequest:
 
 @dataclass(frozen=True, slots=True)
 class Trust:
-    """How far the recording supports a view.
-
-    Args:
-        determined: share of the pixels, [0, 1], that photographs and LiDAR determine; sky above the horizon is left
-            out, and what shows no surface below the horizon counts as undetermined.
-        distance_m, angle_deg: to the recorded camera whose place and direction are nearest (10 m count as 90 degrees);
-            NaN without a log.
-    """
+    """How far the recording supports a view. ``determined``: share of the pixels, [0, 1], that photographs and LiDAR
+    determine; sky above the horizon is left out, and what shows no surface below the horizon counts as undetermined.
+    ``distance_m``, ``angle_deg``: to the recorded camera whose place and direction are nearest (10 m count as 90
+    degrees); NaN without a log."""
 
     determined: float
     distance_m: float
     angle_deg: float
 
+    def record(self) -> dict[str, float | None]:
+        """As JSON values."""
+        return {name: None if np.isnan(value) else round(value, 4) for name, value in asdict(self).items()}
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraReply:
-    """A simulated picture.
-
-    Args:
-        layers: by name. ``rgb`` u8[H, W, 3]; ``depth`` f32[H, W] camera z and ``distance`` f32[H, W] along the ray,
-            metres, NaN where there is no surface; ``classes`` u8[H, W] train ids, 255 = none; ``instances`` u16[H, W],
-            1 + index into ``objects``, 0 = none; ``normals`` f32[H, W, 3] in the camera's frame, towards the camera,
-            NaN where there is no surface; ``confidence`` f32[H, W] in [0, 1]; ``motion`` f32[H, W, 2], pixels to the
-            right and down to where the surface is at ``motion_to``, NaN where there is none or it leaves the lens.
-        objects: names for ``instances``. trust: see ``Trust``.
-    """
+    """A simulated picture. ``layers`` by name: ``rgb`` u8[H, W, 3]; ``depth`` f32[H, W] camera z and ``distance``
+    f32[H, W] along the ray, metres, NaN where there is no surface; ``classes`` u8[H, W] train ids, 255 = none;
+    ``instances`` u16[H, W], 1 + index into ``objects``, 0 = none; ``normals`` f32[H, W, 3] in the camera's frame,
+    towards the camera, NaN where there is no surface; ``confidence`` f32[H, W] in [0, 1]; ``motion`` f32[H, W, 2],
+    pixels to the right and down to where the surface is at ``motion_to``, NaN where there is none or it leaves the
+    lens. ``objects``: names for ``instances``."""
 
     layers: Mapping[str, NDArray[Any]]
     objects: tuple[str, ...]
     trust: Trust
+
+    def finite(self) -> dict[str, NDArray[Any]]:
+        """The layers without NaN: 0 in normals, else infinity."""
+        found = dict(self.layers)
+        for name in (name for name, layer in found.items() if layer.dtype.kind == "f"):
+            missing = np.float32(0.0 if name == "normals" else np.inf)
+            found[name] = np.where(np.isnan(found[name]), missing, found[name])
+        return found
 
 
 class Posed(StaticNode):
@@ -184,20 +184,15 @@ class Planes:
 
 
 class Session:
-    """A fitted scene that answers sensor requests.
+    """A fitted scene that answers sensor requests. ``run``: folder of ``mudg run``, ``mudg demo`` or ``mudg fit``, or a
+    model in memory. ``edits``: an edit script, or its file, to carry out before. ``scene``: the log that the fit
+    belongs to; a folder of a run has its own. ``device``: where pictures are drawn: ``auto``, ``cpu``, ``cuda``,
+    ``cuda:N``. ``repair``: let the diffusion model make every picture once more, and mix both by its confidence, as
+    ``mudg render --repair`` (about half a second a picture). Needs the folder of a run, and requests with a pinhole,
+    one moment, and the objects as recorded.
 
-    Args:
-        run: folder of ``mudg run``, ``mudg demo`` or ``mudg fit``, or a model in memory.
-        edits: an edit script, or its file, to carry out before. scene: the log that the fit belongs to; a folder of a
-            run has its own. device: where pictures are drawn: ``auto``, ``cpu``, ``cuda``, ``cuda:N``.
-        repair: let the diffusion model make every picture once more, and mix both by its confidence, as
-            ``mudg render --repair`` (about half a second a picture). Needs the folder of a run, and requests with a
-            pinhole, one moment, and the objects as recorded.
-
-    Raises:
-        InputError: no fitted scene, or edits that cannot be carried out. ResourceError: no such device. UsageError:
-            repairs without the clouds of a run, or of an edited one.
-    """
+    InputError: no fitted scene, or edits that cannot be carried out. ResourceError: no such device. UsageError: repairs
+    without the clouds of a run, or of an edited one."""
 
     def __init__(
         self,
@@ -289,23 +284,17 @@ class Session:
         the scene does not have."""
         if moment.objects is None:
             return self.model
-        unknown = sorted(set(moment.objects) - set(self._nodes))
-        if unknown:
-            raise UsageError(
-                "the reconstruction has no such object",
-                where="objects",
-                expected=", ".join(sorted(self._nodes)) or "none: nothing moves in this scene",
-                got=", ".join(unknown)[:200],
-            )
-        nodes = tuple(self._placed(node, moment) for node in self.model.nodes)
-        return self.model.with_nodes(nodes)
-
-    @staticmethod
-    def _placed(node: StaticNode | RigidNode, moment: Instant) -> StaticNode | RigidNode:
-        if not isinstance(node, RigidNode) or moment.objects is None:
-            return node
-        pose = moment.objects.get(node.name)
-        return Absent(node.name) if pose is None else Posed(node, pose, moment.time_s)
+        if unknown := sorted(set(moment.objects) - set(self._nodes)):
+            expected = ", ".join(sorted(self._nodes)) or "none: nothing moves in this scene"
+            what, got = "the reconstruction has no such object", ", ".join(unknown)[:200]
+            raise UsageError(what, where="objects", expected=expected, got=got)
+        nodes = list[StaticNode | RigidNode]()
+        for node in self.model.nodes:
+            pose = moment.objects.get(node.name)
+            if isinstance(node, RigidNode):
+                node = Absent(node.name) if pose is None else Posed(node, pose, moment.time_s)
+            nodes.append(node)
+        return self.model.with_nodes(tuple(nodes))
 
     def _composed_at(self, moment: Instant) -> tuple[SceneModel, Gaussians]:
         """The scene at a moment and its Gaussians in the world; the last ones are kept for other sensors of it."""
@@ -363,9 +352,8 @@ class Session:
         pose = self.poses(moment).get(name)
         if pose is None:
             return False
-        corners = geometry.transform_points(
-            view.cam_from_world @ pose, geometry.box_corners(1.2 * np.asarray(self._nodes[name].size_m))
-        )
+        box = geometry.box_corners(1.2 * np.asarray(self._nodes[name].size_m))
+        corners = geometry.transform_points(view.cam_from_world @ pose, box)
         if (corners[:, 2] <= 0.1).any():
             return bool((corners[:, 2] > 0).any())
         u, v = geometry.pinhole(view.camera.intrinsics, *corners.T)
@@ -397,16 +385,13 @@ class Session:
                     planes = replace(planes, seen=_repaired(self._mixer, view, planes.seen))
                 canvas.take((rows, columns), planes, part)
                 continue
-            for face in faces_of(part, rays_per_radian(rays)):
-                turned = geometry.from_rotation_translation(face.cam_from_face, (0.0, 0.0, 0.0))
-                camera = replace(face.camera, name=name)
-                planes = self.pinhole(View(camera, pose @ turned, moment.time_s), moment, wants_instances)
+            for face in faces_of(part, rays_per_radian(rays), name):
+                planes = self.pinhole(face.view(pose, moment.time_s), moment, wants_instances)
                 canvas.sample((rows, columns), planes, face)
         middle = request.start if request.end is None else request.start.towards(request.end, 0.5)
         layers = {layer: self._layer(layer, canvas, request, rays, middle) for layer in request.layers}
-        return CameraReply(
-            layers, tuple(sorted(self._nodes)), self._trust(canvas, middle, rays @ middle.world_from_sensor[2, :3])
-        )
+        trust = self._trust(canvas, middle, rays @ middle.world_from_sensor[2, :3])
+        return CameraReply(layers, tuple(sorted(self._nodes)), trust)
 
     def _layer(
         self, layer: Layer, canvas: Canvas, request: CameraRequest, rays: Matrix, middle: Instant
@@ -483,7 +468,7 @@ class Canvas:
         self.rgb[:, *where] = seen.rgb.numpy()
         self.distance[where] = seen.depth.numpy() / rays[..., 2]
         self.classes[where] = seen.semantics.numpy()
-        self.certainty[where] = _certainty(seen)
+        self.certainty[where] = seen.sure().numpy()
         if planes.instances is not None:
             self.instances[where] = planes.instances
 
@@ -492,10 +477,9 @@ class Canvas:
         rows, columns = np.divmod(face.pixels, where[1].stop - where[1].start)
         place, seen = (rows + where[0].start, columns + where[1].start), planes.seen
         self.rgb[:, *place] = bilinear(seen.rgb.numpy(), face.uv)
-        x, y = geometry.pinhole_ray(face.camera.intrinsics, *face.uv.T)
-        self.distance[place] = surface(seen.depth.numpy(), face.uv, face.camera)[0] * np.sqrt(x * x + y * y + 1)
+        self.distance[place] = face.surface(seen.depth.numpy())[0]
         self.classes[place] = nearest(seen.semantics.numpy(), face.uv)
-        self.certainty[place] = nearest(_certainty(seen), face.uv)
+        self.certainty[place] = nearest(seen.sure().numpy(), face.uv)
         if planes.instances is not None:
             self.instances[place] = nearest(planes.instances, face.uv)
 
@@ -503,10 +487,8 @@ class Canvas:
 def _repaired(mixer: RenderMixer, view: View, rendered: RenderedCondition) -> RenderedCondition:
     """A rendered view with colour and depth mixed with what the diffusion model makes of it."""
     everywhere = torch.ones_like(rendered.depth, dtype=torch.bool)[None]
-    render = Observation(
-        view, rendered.rgb, rendered.depth[None], None, everywhere.float(), everywhere, "virtual", "mudg_s"
-    )
-    mixed = mixer(view, render)
+    shown = view, rendered.rgb, rendered.depth[None], None
+    mixed = mixer(view, Observation(*shown, everywhere.float(), everywhere, "virtual", "mudg_s"))
     depth = rendered.depth if mixed.depth is None else mixed.depth[0]
     return replace(rendered, rgb=mixed.rgb, depth=depth)
 
@@ -514,12 +496,6 @@ def _repaired(mixer: RenderMixer, view: View, rendered: RenderedCondition) -> Re
 def _background(model: SceneModel) -> Matrix:
     """Places f64[N, 3] of the Gaussians that stand still."""
     return model.table["means"].detach()[: model.counts()[0]].cpu().numpy().astype(np.float64)
-
-
-def _certainty(seen: RenderedCondition) -> NDArray[np.float32]:
-    """Certainty f32[H, W]; half the coverage for scenes that measured none."""
-    certainty = 0.5 * seen.alpha if seen.certainty is None else seen.certainty
-    return np.where(np.isfinite(seen.depth.numpy()), certainty.numpy(), 0.0).astype(np.float32)
 
 
 def _pose(value: ArrayLike, where: str) -> Matrix:

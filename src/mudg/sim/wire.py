@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mudg.base import geometry
 from mudg.base.errors import ResourceError, UsageError
+from mudg.base.types import Camera
 
 SERVICES: Final = (
     "nre.grpc.protos.sensorsim.SensorsimService",
@@ -162,6 +163,15 @@ def pose_of(matrix: NDArray[np.float64]) -> Any:
     types, (w, x, y, z) = messages(), geometry.quaternion_from_matrix(matrix)
     place = types.Vec3(x=matrix[0, 3], y=matrix[1, 3], z=matrix[2, 3])
     return types.Pose(vec=place, quat=types.Quat(w=w, x=x, y=y, z=z))
+
+
+def available_camera(camera: Camera, mount: NDArray[np.float64]) -> Any:
+    """The message ``AvailableCamera`` of a rectified camera; ``mount``: vehicle-from-camera f64[4, 4]."""
+    types, (fx, fy, cx, cy) = messages(), camera.intrinsics
+    lens = types.PinholeParam(focal_length_x=fx, focal_length_y=fy, principal_point_x=cx, principal_point_y=cy)
+    size = {"resolution_h": camera.height, "resolution_w": camera.width}
+    spec = types.CameraSpec(opencv_pinhole_param=lens, logical_id=camera.name, shutter_type=5, **size)
+    return types.AvailableCamera(intrinsics=spec, rig_to_camera=pose_of(mount), logical_id=camera.name)
 
 
 def matrix_of(pose: Any, where: str) -> NDArray[np.float64]:

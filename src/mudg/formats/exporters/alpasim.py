@@ -46,14 +46,9 @@ Spans = Mapping[str, list[list[int]]]
 def to_alpasim(
     scene: SplatScene, log: Scene | None, ground: HeightMap | None, surface: NDArray[np.floating] | None = None
 ) -> bytes:
-    """A scene with its motion, the drive and the ground.
-
-    Args:
-        log: the recorded drive. ground, surface: its height, and points f[N, 3] of the road, in our axes.
-
-    Raises:
-        InputError: no drive or no ground is known, or a camera has no place on the vehicle.
-    """
+    """A scene with its motion, the recorded drive and the ground. ``ground``, ``surface``: its height, and points
+    f[N, 3] of the road, in our axes. Raises InputError: no drive or no ground is known, or a camera has no place on the
+    vehicle."""
     if log is None or not len(log.ego.times_s):
         what = "AlpaSim replays a drive, and none is known here"
         raise InputError(what, where=scene.name, remedy="give --scene SCENE, or a folder made by `mudg run`")
@@ -163,15 +158,13 @@ def _tracks(scene: SplatScene, us: Callable[[float], int]) -> dict[str, Any]:
     tracks = [node for node in scene.nodes if node.moves and len(node.times_s) > 1]
     poses = [scene.file_from_world @ node.world_from_node for node in tracks]
     moved_m = [np.linalg.norm(np.ptp(node.world_from_node[:, :3, 3], axis=0)) for node in tracks]
-    turns = [[geometry.quaternion_from_matrix(pose)[[1, 2, 3, 0]].tolist() for pose in keys] for keys in poses]
+    place_and_turn = lambda pose: [*pose[:3, 3].tolist(), *geometry.quaternion_from_matrix(pose)[[1, 2, 3, 0]].tolist()]
     data = {
         "tracks_id": [node.name for node in tracks],
         "tracks_label_class": [NVIDIA_CLASSES.get(node.label, node.label) for node in tracks],
         "tracks_flags": ["CONTROLLABLE" if metres > MOVES_M else "NONE" for metres in moved_m],
         "tracks_timestamps_us": [[us(time_s) for time_s in node.times_s] for node in tracks],
-        "tracks_poses": [
-            [[*pose[:3, 3].tolist(), *turn] for pose, turn in zip(keys, quats)] for keys, quats in zip(poses, turns)
-        ],
+        "tracks_poses": [[place_and_turn(pose) for pose in keys] for keys in poses],
     }
     sizes = {"cuboids_dims": [list(map(float, node.size_m)) for node in tracks]}
     return {scene.name: {"tracks_data": data, "cuboidtracks_data": sizes}}
@@ -195,7 +188,6 @@ def ground_mesh(ground: HeightMap, file_from_world: NDArray[np.float64]) -> byte
 
 
 # OpenDRIVE ----------------------------------------------------------------------------------------
-#
 # The driven corridor as a minimal map of version 1.6: one road along the recorded path in cubic pieces, the driven lane
 # centred on it, and as many lanes of one width beside it as its surface is wide.
 
@@ -212,12 +204,8 @@ FEWEST: Final = 20
 
 
 def opendrive(road: Road, surface: NDArray[np.floating], name: str) -> bytes:
-    """The map as XML.
-
-    Args:
-        road: the path, metres, z up. surface: f[N, 3] points of the road's surface in the same frame; none: one lane.
-        name: of the map.
-    """
+    """The map as XML. ``road``: the path, metres, z up. ``surface``: f[N, 3] points of the road's surface in the same
+    frame; none: one lane. ``name``: of the map."""
     count = max(1, round(road.length_m / PIECE_M))
     stations = np.linspace(0.0, road.length_m, count + 1)
     poses = np.stack([road.recorded(float(station)) for station in stations])
@@ -226,25 +214,23 @@ def opendrive(road: Road, surface: NDArray[np.floating], name: str) -> bytes:
     root = ElementTree.Element("OpenDRIVE")
     low, high = poses[:, :2, 3].min(0) - WIDEST_M, poses[:, :2, 3].max(0) + WIDEST_M
     header = {"revMajor": "1", "revMinor": "6", "name": name, "version": "1.00", "date": "1970-01-01T00:00:00"}
-    edges = {"north": high[1], "south": low[1], "east": high[0], "west": low[0]}
-    header |= {key: _number(value) for key, value in edges.items()}
+    header |= _numbers(north=high[1], south=low[1], east=high[0], west=low[0])
     ElementTree.SubElement(root, "header", {**header, "vendor": "mudg"})
-    whole = {"name": name, "length": _number(starts[-1]), "id": "1", "junction": "-1", "rule": "RHT"}
+    whole = {"name": name, **_numbers(length=starts[-1]), "id": "1", "junction": "-1", "rule": "RHT"}
     element = ElementTree.SubElement(root, "road", whole)
     kind = ElementTree.SubElement(element, "type", {"s": "0", "type": "town"})
     ElementTree.SubElement(kind, "speed", {"max": "50", "unit": "km/h"})
     line, heights = ElementTree.SubElement(element, "planView"), ElementTree.SubElement(element, "elevationProfile")
     for start, pose, after, (length, numbers) in zip(starts, poses, poses[1:], pieces, strict=False):
         heading = math.atan2(pose[1, 0], pose[0, 0])
-        at = {"s": start, "x": pose[0, 3], "y": pose[1, 3], "hdg": heading, "length": length}
-        piece = ElementTree.SubElement(line, "geometry", {key: _number(value) for key, value in at.items()})
+        at = _numbers(s=start, x=pose[0, 3], y=pose[1, 3], hdg=heading, length=length)
+        piece = ElementTree.SubElement(line, "geometry", at)
         ElementTree.SubElement(piece, "paramPoly3", {**numbers, "pRange": "normalized"})
         rise = [one[2, 0] / math.hypot(one[0, 0], one[1, 0]) * length for one in (pose, after)]
         climb = after[2, 3] - pose[2, 3]
-        a, b = pose[2, 3], rise[0] / length
         c, d = (3 * climb - 2 * rise[0] - rise[1]) / length**2, (rise[0] + rise[1] - 2 * climb) / length**3
-        terms = {"s": start, "a": a, "b": b, "c": c, "d": d}
-        ElementTree.SubElement(heights, "elevation", {key: _number(value) for key, value in terms.items()})
+        terms = _numbers(s=start, a=pose[2, 3], b=rise[0] / length, c=c, d=d)
+        ElementTree.SubElement(heights, "elevation", terms)
     _lanes(element, *lanes_beside(road, surface))
     ElementTree.indent(root, " ")
     return b'<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root) + b"\n"
@@ -262,8 +248,8 @@ def _piece(before: NDArray[np.float64], after: NDArray[np.float64]) -> tuple[flo
     d = np.array([chord, 0.0]) + end - 2 * np.array([u, v])
     p = np.linspace(0, 1, 201)[:, None]
     speed = np.linalg.norm(np.array([chord, 0.0]) + 2 * c * p + 3 * d * p**2, axis=1)
-    names = {"aU": 0.0, "bU": chord, "cU": c[0], "dU": d[0], "aV": 0.0, "bV": 0.0, "cV": c[1], "dV": d[1]}
-    return float(np.trapezoid(speed, p[:, 0])), {key: _number(value) for key, value in names.items()}
+    numbers = _numbers(aU=0.0, bU=chord, cU=c[0], dU=d[0], aV=0.0, bV=0.0, cV=c[1], dV=d[1])
+    return float(np.trapezoid(speed, p[:, 0])), numbers
 
 
 def lanes_beside(road: Road, surface: NDArray[np.floating]) -> tuple[int, int]:
@@ -279,8 +265,7 @@ def lanes_beside(road: Road, surface: NDArray[np.floating]) -> tuple[int, int]:
 
 def _lanes(element: ElementTree.Element, left: int, right: int) -> None:
     lanes = ElementTree.SubElement(element, "lanes")
-    zero = {"a": "0", "b": "0", "c": "0", "d": "0"}
-    ElementTree.SubElement(lanes, "laneOffset", {"s": "0", **zero, "a": _number(LANE_M / 2)})
+    ElementTree.SubElement(lanes, "laneOffset", _numbers(s=0, a=LANE_M / 2, b=0, c=0, d=0))
     section = ElementTree.SubElement(lanes, "laneSection", {"s": "0"})
     sides = {"left": range(left, 0, -1), "center": (0,), "right": range(-1, -right - 2, -1)}
     for side, ids in sides.items():
@@ -291,8 +276,8 @@ def _lanes(element: ElementTree.Element, left: int, right: int) -> None:
             kind = "driving" if number else "none"
             lane = ElementTree.SubElement(group, "lane", {"id": str(number), "type": kind, "level": "false"})
             if number:
-                ElementTree.SubElement(lane, "width", {"sOffset": "0", **zero, "a": _number(LANE_M)})
+                ElementTree.SubElement(lane, "width", _numbers(sOffset=0, a=LANE_M, b=0, c=0, d=0))
 
 
-def _number(value: float) -> str:
-    return f"{value:.9g}" if abs(value) > 1e-12 else "0"
+def _numbers(**values: float) -> dict[str, str]:
+    return {name: f"{value:.9g}" if abs(value) > 1e-12 else "0" for name, value in values.items()}

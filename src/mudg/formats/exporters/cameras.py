@@ -35,7 +35,6 @@ def pictures(scene: Scene) -> Iterator[tuple[str, bytes]]:
 
 # nerfstudio ---------------------------------------------------------------------------------------
 
-
 FLIP: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 POINTS: Final = "points.ply"
 
@@ -70,7 +69,6 @@ def points_ply(points: PointCloud) -> bytes:
 
 
 # colmap -------------------------------------------------------------------------------------------
-
 
 PINHOLE: Final = 1
 CAMERA: Final = 0

@@ -19,6 +19,7 @@ from mudg.base.palette import CLASSES, DISPLAY_COLORS, ID
 from mudg.base.types import Frame, PointCloud, Scene, Sweep, SweepPoints, Track, View
 from mudg.base.versions import version
 from mudg.formats.splats.cloud import each_once
+from mudg.scene.read import open_files, read_points
 
 NANO: Final = 1_000_000_000
 CHUNK_BYTES: Final = 4 << 20
@@ -32,23 +33,24 @@ Matrix = NDArray[np.float64]
 
 
 class LogRecords:
-    """The records of a log.
+    """The records of a log; pictures and points are read when they are asked for. ``fused``: a cloud that is sent
+    once, or None."""
 
-    Args:
-        picture: bytes of a frame's image. points: of a sweep. fused: a cloud that is sent once, or None.
-    """
-
-    def __init__(
-        self,
-        scene: Scene,
-        picture: Callable[[Frame], bytes],
-        points: Callable[[Sweep], SweepPoints],
-        fused: PointCloud | None = None,
-    ) -> None:
-        self.scene, self.picture, self.points = scene, picture, points
-        self.fused = fused if fused is not None and len(fused) else None
+    def __init__(self, scene: Scene, fused: PointCloud | None = None) -> None:
+        self.scene, self.fused = scene, fused if fused is not None and len(fused) else None
         times = [f.view.time_s for f in scene.frames] + [s.time_s for s in scene.sweeps] + scene.ego.times_s.tolist()
         self.start_s = min(times, default=0.0)
+
+    def __str__(self) -> str:
+        return f"{len(self.scene.frames)} pictures, {len(self.scene.sweeps)} sweeps"
+
+    def picture(self, frame: Frame) -> bytes:
+        """The file of an image."""
+        return open_files(self.scene.root).read(frame.image.path)
+
+    def points(self, sweep: Sweep) -> SweepPoints:
+        """The points of a sweep."""
+        return read_points(self.scene, sweep)
 
     def nanoseconds(self, time_s: float) -> int:
         """Since the first record."""
@@ -64,10 +66,8 @@ class LogRecords:
         return [(track, pose) for track, pose in found if pose is not None]
 
     def mounts(self, tolerance_m: float = MOUNT_M) -> dict[str, Matrix]:
-        """Ego-from-sensor f64[4, 4] of the sensors that do not move on the vehicle: ``camera/NAME``, ``lidar/NAME``.
-
-        A sensor whose recorded poses the vehicle's path does not explain to ``tolerance_m`` is left out.
-        """
+        """Ego-from-sensor f64[4, 4] of the sensors that do not move on the vehicle (``camera/NAME``, ``lidar/NAME``).
+        One whose recorded poses the vehicle's path does not explain to ``tolerance_m`` is left out."""
         first: dict[str, Matrix] = {}
         moving: set[str] = set()
         for name, time_s, pose in self.sensor_poses():
@@ -138,11 +138,8 @@ class McapStream(list[bytes]):
 
 
 def write_mcap(path: Path, messages: Ros2Messages) -> tuple[dict[str, tuple[str, int]], tuple[int, int]]:
-    """Write an MCAP file, completely or not at all; no more than one chunk is in memory.
-
-    Returns:
-        Schema and number of messages of every topic, and the nanoseconds of the first and the last message.
-    """
+    """Write an MCAP file, completely or not at all; no more than one chunk is in memory. Returns schema and number of
+    messages of every topic, and the nanoseconds of the first and the last message."""
     package, schemas, channels, stream = mcap_writer(), dict[str, int](), dict[str, int](), McapStream()
     topics, stamps = dict[str, tuple[str, int]](), [0]
     writer = package.Writer(stream, CHUNK_BYTES, package.CompressionType.NONE)
@@ -170,7 +167,6 @@ def write_mcap(path: Path, messages: Ros2Messages) -> tuple[dict[str, tuple[str,
 
 
 # ros2 ----------------------------------------------------------------------------------------------
-#
 # Frames (REP 103, REP 105): ``map``, ``base_link`` (the vehicle), ``camera_NAME_optical`` (x right, y down, z forward),
 # ``lidar_NAME``. Principal points count from the centre of the first pixel: half a pixel less than in this program.
 # rosbags' own writer begins with bags of version 8, which Humble does not read.
@@ -257,9 +253,9 @@ class Ros2Messages:
         self._names = {f"camera/{name}": plain for name, plain in ros_names(self._scene.cameras).items()}
         self._names |= {f"lidar/{name}": plain for name, plain in ros_names(lidars).items()}
         self._mounts = records.mounts()
-        for text in (text for track in self._scene.tracks for text in (track.id, track.label)):
-            if "\0" in text:
-                raise InputError("a name holds a zero byte, which ROS cannot carry", got=repr(text))
+        for track in self._scene.tracks:
+            if "\0" in track.id + track.label:
+                raise InputError("a name holds a zero byte, which ROS cannot carry", got=repr(track.id + track.label))
 
     def __iter__(self) -> Iterator[LogMessage]:
         messages = [*self._once(), *self._transforms(), *self._of_sensors(), *self._of_objects()]
@@ -365,25 +361,20 @@ class Ros2Messages:
 
     def _sweep(self, sweep: Sweep) -> Any:
         points = self._log.points(sweep)
-        rows = np.zeros(len(points.xyz), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
-        rows["x"], rows["y"], rows["z"], rows["intensity"] = *points.xyz.T, points.intensity
-        return self._cloud(sweep.time_s, self._frame(f"lidar/{sweep.sensor}"), rows)
+        return self._cloud(sweep.time_s, self._frame(f"lidar/{sweep.sensor}"), points.xyz, intensity=points.intensity)
 
     def _fused(self, cloud: PointCloud) -> Any:
         """Fused points; colours as programs of ROS expect them: 0x00RRGGBB in the bits of a float."""
-        rows = np.zeros(len(cloud), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<f4")])
         red, green, blue = cloud.rgb.T.astype("<u4")
-        rows["x"], rows["y"], rows["z"] = cloud.xyz.T
-        rows["rgb"] = (red << 16 | green << 8 | blue).astype("<u4").view("<f4")
-        return self._cloud(self._log.start_s, MAP, rows)
+        colors = (red << 16 | green << 8 | blue).astype("<u4").view("<f4")
+        return self._cloud(self._log.start_s, MAP, cloud.xyz, rgb=colors)
 
-    def _cloud(self, time_s: float, frame: str, rows: NDArray[Any]) -> Any:
-        names, size = rows.dtype.names or (), rows.dtype.itemsize
-        fields = [self._ros.PointField(name, 4 * index, FLOAT32, 1) for index, name in enumerate(names)]
-        content = np.frombuffer(rows.tobytes(), np.uint8)
-        return self._ros.PointCloud2(
-            self._header(time_s, frame), 1, len(rows), fields, False, size, len(content), content, is_dense=True
-        )
+    def _cloud(self, time_s: float, frame: str, xyz: NDArray[np.float32], **more: NDArray[np.float32]) -> Any:
+        fields = [self._ros.PointField(name, 4 * at, FLOAT32, 1) for at, name in enumerate(("x", "y", "z", *more))]
+        rows = np.frombuffer(np.column_stack([xyz, *more.values()]).astype("<f4").tobytes(), np.uint8)
+        sizes = 4 * len(fields), len(rows)
+        header = self._header(time_s, frame)
+        return self._ros.PointCloud2(header, 1, len(xyz), fields, False, *sizes, rows, is_dense=True)
 
     def _of_objects(self) -> Iterator[LogMessage]:
         for time_s in self._log.moments():
@@ -397,8 +388,8 @@ class Ros2Messages:
         picture = ros.CompressedImage(ros.Header(ros.Time(0, 0), ""), "", np.zeros(0, np.uint8))
         rest = {"action": 0, "lifetime": ros.Duration(0, round(BOX_LIFE_S * NANO)), "frame_locked": False}
         rest |= {"points": [], "colors": [], "texture_resource": "", "texture": picture, "uv_coordinates": []}
-        rest |= {"mesh_resource": "", "mesh_file": ros.MeshFile("", np.zeros(0, np.uint8))}
-        rest |= {"mesh_use_embedded_materials": False}
+        mesh = ros.MeshFile("", np.zeros(0, np.uint8))
+        rest |= {"mesh_resource": "", "mesh_file": mesh, "mesh_use_embedded_materials": False}
         markers = []
         for track, pose in self._log.boxes(time_s):
             color, name = ros.ColorRGBA(*box_color(track.label), 0.4), f"{track.id} ({track.label})"

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -93,6 +93,12 @@ class PoseKeys:
     times_us: Times
     poses: Matrix
 
+    @classmethod
+    def of(cls, poses: Mapping[int, Matrix]) -> PoseKeys:
+        """Poses by microsecond, in order."""
+        order = sorted(poses)
+        return cls(np.array(order, np.int64), np.stack([poses[at] for at in order]))
+
     def at(self, times_us: Times) -> Matrix:
         """Poses f64[N, 4, 4] at times i64[N] from the first to the last key."""
         turned = Slerp(self.times_us, Rotation.from_matrix(self.poses[:, :3, :3]))(times_us)
@@ -107,19 +113,18 @@ class PoseKeys:
     def covering(self, start_us: int, end_us: int) -> PoseKeys:
         """With keys at both ends of a span of time, where it reaches beyond: the frame goes on as it did between its
         two nearest keys, for no longer than these lie apart, and then stands."""
-        times, poses = [*self.times_us.tolist()], [*self.poses]
-        for at, end, near, far in ((0, start_us, 0, 1), (len(times) + 1, end_us, -1, -2)):
-            if not times[0] <= end <= times[-1]:
-                pose = poses[near]
-                if len(times) > 1:
-                    share = min(abs((end - times[near]) / (times[near] - times[far])), 1.0)
-                    here, before = (Rotation.from_matrix(poses[n][:3, :3]) for n in (near, far))
+        keys, found = self.times_us.tolist(), dict(zip(self.times_us.tolist(), self.poses, strict=True))
+        for end, near, far in ((min(start_us, keys[0]), 0, 1), (max(end_us, keys[-1]), -1, -2)):
+            if end != keys[near]:
+                pose = self.poses[near]
+                if len(keys) > 1:
+                    share = min(abs((end - keys[near]) / (keys[near] - keys[far])), 1.0)
+                    here, before = (Rotation.from_matrix(self.poses[n][:3, :3]) for n in (near, far))
                     turn = Rotation.from_rotvec(share * (here * before.inv()).as_rotvec()) * here
-                    place = pose[:3, 3] + share * (pose[:3, 3] - poses[far][:3, 3])
+                    place = pose[:3, 3] + share * (pose[:3, 3] - self.poses[far][:3, 3])
                     pose = from_rotation_translation(turn.as_matrix(), place)
-                times.insert(at, end)
-                poses.insert(at, pose)
-        return PoseKeys(np.array(times, np.int64), np.stack(poses))
+                found[end] = pose
+        return PoseKeys.of(found)
 
 
 def unknown_shutter(camera: Camera) -> bool:
@@ -188,31 +193,29 @@ class _WrittenLog:
         origin: dict[str, Any] = {"version": version(), "dataset": source.dataset, "licence": source.licence}
         origin["clock_zero_us"] = self._zero_us
         writer = self._package.v4.SequenceComponentGroupsWriter(folder, name, self._scene.id, interval, {ABOUT: origin})
-        self._poses(writer)
-        intrinsics = writer.register_component_writer(self._package.v4.IntrinsicsComponent.Writer, INSTANCE)
-        masks = writer.register_component_writer(self._package.v4.MasksComponent.Writer, INSTANCE)
+
+        def component(kind: str, instance: str = INSTANCE) -> Any:
+            return writer.register_component_writer(getattr(self._package.v4, f"{kind}Component").Writer, instance)
+
+        self._poses(component("Poses"))
+        intrinsics, masks = component("Intrinsics"), component("Masks")
         for camera, recorded in self._scene.cameras.items():
-            intrinsics.store_camera_intrinsics(
-                self._ids[f"camera/{camera}"], camera_model(self._package.data, recorded)
-            )
-            masks.store_camera_masks(self._ids[f"camera/{camera}"], _masks(self._scene, self._frames[camera]))
+            sensor = self._ids[f"camera/{camera}"]
+            intrinsics.store_camera_intrinsics(sensor, camera_model(self._package.data, recorded))
+            masks.store_camera_masks(sensor, _masks(self._scene, self._frames[camera]))
         with log.task("export", len(self._scene.frames) + len(self._scene.sweeps)) as bar:
             for camera, frames in self._frames.items():
-                component = writer.register_component_writer(
-                    self._package.v4.CameraSensorComponent.Writer, self._ids[f"camera/{camera}"]
-                )
+                pictures = component("CameraSensor", self._ids[f"camera/{camera}"])
                 for frame in _in_order(frames, self._shutter, camera):
                     content, kind = self._log.picture(frame), picture_format(frame)
-                    component.store_frame(content, kind, _unsigned(self._shutter(frame)), {}, {})
+                    pictures.store_frame(content, kind, _unsigned(self._shutter(frame)), {}, {})
                     bar.advance()
             for lidar, sweeps in self._sweeps.items():
-                component = writer.register_component_writer(
-                    self._package.v4.LidarSensorComponent.Writer, self._ids[f"lidar/{lidar}"]
-                )
+                rays = component("LidarSensor", self._ids[f"lidar/{lidar}"])
                 for sweep in _in_order(sweeps, lambda sweep: self._spans[sweep.id], lidar):
-                    self._sweep(component, sweep)
+                    self._sweep(rays, sweep)
                     bar.advance()
-        self._boxes(writer)
+        component("Cuboids").store_observations(list(self._boxes()))
         stores = [Path(str(path)) for path in writer.finalize()]
         about = folder / f"{name}{MARK}.json"
         reader = self._package.v4.SequenceComponentGroupsReader(stores)
@@ -244,25 +247,20 @@ class _WrittenLog:
     def _keys(self, times_s: Iterable[float], pose_at: Any) -> PoseKeys:
         """Poses at whole microseconds, each once."""
         keys: dict[int, Matrix] = {}
-        for time_s in times_s:
-            pose = pose_at(float(time_s))
-            keys.setdefault(self._us(float(time_s)), pose)
-        order = sorted(keys)
-        return PoseKeys(np.array(order, np.int64), np.stack([keys[at] for at in order]))
+        for time_s in map(float, times_s):
+            keys.setdefault(self._us(time_s), pose_at(time_s))
+        return PoseKeys.of(keys)
 
     def _path(self, sensor: str) -> PoseKeys:
         """The path in the world of a sensor that is not fixed; beyond its records it keeps its place on the vehicle."""
         found = {self._us(time_s): pose for name, time_s, pose in self._log.sensor_poses() if name == sensor}
-        order = sorted(found)
-        for end, near in ((self._start_us, order[0]), (self._end_us, order[-1])):
+        for end, near in ((self._start_us, min(found)), (self._end_us, max(found))):
             if end not in found:
                 there, here = self._rig.at(np.array([end, near]))
                 found[end] = there @ invert(here) @ found[near]
-        order = sorted(found)
-        return PoseKeys(np.array(order, np.int64), np.stack([found[at] for at in order]))
+        return PoseKeys.of(found)
 
-    def _poses(self, writer: Any) -> None:
-        component = writer.register_component_writer(self._package.v4.PosesComponent.Writer, INSTANCE)
+    def _poses(self, component: Any) -> None:
         component.store_dynamic_pose(RIG, WORLD, self._rig.poses, self._rig.times_us.astype(np.uint64))
         for sensor, name in self._ids.items():
             if sensor in self._mounts:
@@ -287,30 +285,20 @@ class _WrittenLog:
             raw = np.einsum("nij,nj->ni", moved[which, :3, :3], raw) + moved[which, :3, 3]
         distance = np.linalg.norm(raw, axis=1)
         ray = np.where(distance[:, None] > 0, raw / np.maximum(distance, 1e-12)[:, None], [1.0, 0.0, 0.0])
-        component.store_frame(
-            ray.astype(np.float32),
-            times.astype(np.uint64),
-            None,
-            distance.astype(np.float32)[None],
-            points.intensity.clip(0, 1)[None],
-            _unsigned(self._spans[sweep.id]),
-            {},
-            {SWEEP_TIME: at},
-        )
+        measured = distance.astype(np.float32)[None], points.intensity.clip(0, 1)[None]
+        span, about = _unsigned(self._spans[sweep.id]), {SWEEP_TIME: at}
+        component.store_frame(ray.astype(np.float32), times.astype(np.uint64), None, *measured, span, {}, about)
 
     # -- objects
 
-    def _boxes(self, writer: Any) -> None:
-        source = self._package.data.LabelSource
-        kind = source.EXTERNAL if self._scene.source.recipe is None else source.GT_SYNTHETIC
-        data, found = self._package.data, []
+    def _boxes(self) -> Iterator[Any]:
+        data = self._package.data
+        kind = data.LabelSource.EXTERNAL if self._scene.source.recipe is None else data.LabelSource.GT_SYNTHETIC
         for track in self._scene.tracks:
-            length, width, height = track.size_m.tolist()
             for at, pose in self._keys_of(track):
-                (x, y, z), angles = pose[:3, 3].tolist(), Rotation.from_matrix(pose[:3, :3]).as_euler(EULER).tolist()
-                box = data.BBox3((x, y, z), (length, width, height), tuple(angles))
-                found.append(data.CuboidTrackObservation(track.id, track.label, at, WORLD, at, box, kind))
-        writer.register_component_writer(self._package.v4.CuboidsComponent.Writer, INSTANCE).store_observations(found)
+                angles = Rotation.from_matrix(pose[:3, :3]).as_euler(EULER).tolist()
+                box = data.BBox3(*map(tuple, (pose[:3, 3].tolist(), track.size_m.tolist(), angles)))
+                yield data.CuboidTrackObservation(track.id, track.label, at, WORLD, at, box, kind)
 
     def _keys_of(self, track: Track) -> Iterator[tuple[int, Matrix]]:
         """Poses of an object at its keys within the recording, at its ends where it reaches beyond, and where keys lie

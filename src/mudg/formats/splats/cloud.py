@@ -14,9 +14,7 @@ from mudg.base.errors import InputError
 from mudg.core import harmonics
 
 # axes ---------------------------------------------------------------------------------------------
-#
 # Where x, y and z of a file point: three letters of Left, Right, Up, Down, Forward and Back, as seen along the road.
-#
 # ``RDF`` is x right, y down, z forward. The axes of this program are ``FLU``.
 
 
@@ -53,7 +51,6 @@ def in_words(axes: str) -> str:
 
 # cloud --------------------------------------------------------------------------------------------
 
-
 MAX_GAUSSIANS: Final = 50_000_000
 LARGEST_M: Final = 1e8
 """Places and sizes beyond this are damage."""
@@ -69,14 +66,10 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SplatCloud:
-    """Gaussians of one frame.
-
-    Args:
-        means: f32[n, 3] metres; f64 from a reader, until an origin near them is taken away.
-        quats: f32[n, 4] (w, x, y, z) of length 1. log_scales: f32[n, 3], natural logarithm of metres.
-        logits: f32[n], opacity = sigmoid. sh: f32[n, K, 3], K = 1, 4, 9 or 16 harmonics of directions of this frame.
-        class_ids: u8[n] train ids (255 = unknown), or None. antialias: they are to be drawn antialiased.
-    """
+    """Gaussians of one frame. ``means``: f32[n, 3] metres; f64 from a reader, until an origin near them is taken away.
+    ``quats``: f32[n, 4] (w, x, y, z) of length 1. ``log_scales``: f32[n, 3], natural logarithm of metres. ``logits``:
+    f32[n], opacity = sigmoid. ``sh``: f32[n, K, 3], K = 1, 4, 9 or 16 harmonics of directions of this frame.
+    ``class_ids``: u8[n] train ids (255 = unknown), or None. ``antialias``: they are to be drawn antialiased."""
 
     means: Floats | Matrix
     quats: Floats
@@ -115,8 +108,7 @@ class SplatCloud:
     def mirrored(self) -> SplatCloud:
         """The same Gaussians with y turned round: from left-handed axes to right-handed ones."""
         flip = np.array([1.0, -1.0, 1.0])
-        # an axis of rotation changes its sign once more than a place
-        quats = self.quats * np.array([1, -1, 1, -1], np.float32)
+        quats = self.quats * np.array([1, -1, 1, -1], np.float32)  # an axis of rotation changes its sign once more
         sh = self.sh if self.degree == 0 else harmonics.rotated(self.sh, np.diag(flip))
         return replace(self, means=(self.means * flip).astype(self.means.dtype), quats=quats, sh=sh)
 
@@ -149,34 +141,26 @@ def joined(clouds: Sequence[SplatCloud]) -> SplatCloud:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SplatFile:
-    """What the reader of a format finds in a file.
-
-    Args:
-        cloud: Gaussians in the axes of the file, ``means`` f64. axes: where x, y and z of the file point, a letter
-            each, as ``axes_by`` states them; empty: nothing does.
-        step_m: distance of neighbouring numbers in which most places are stored; 0 = not worth a word.
-        notes: what a person may want to know. warnings: what may have come in otherwise than its program meant it.
-    """
+    """What the reader of a format finds in a file: Gaussians in its axes, ``means`` f64. ``axes``: where x, y and z of
+    the file point, a letter each, as ``axes_by`` states them; empty: nothing does. ``step_m``: distance of neighbouring
+    numbers in which most places are stored; 0 = not worth a word. ``notes``: what a person may want to know.
+    ``warnings``: what may have come in otherwise than its program meant it."""
 
     cloud: SplatCloud
     axes: str = ""
     axes_by: str = ""
     step_m: float = 0.0
-    notes: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    notes: Sequence[str] = ()
+    warnings: Sequence[str] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SplatNode:
-    """Gaussians that move together.
-
-    Args:
-        name: of the object; the first node of a scene is what stands. label: its class, empty for what stands.
-        size_m: length, width, height of its box. cloud: Gaussians in the node's own frame.
-        times_s, world_from_node: keys of its path, f64[K] and f64[K, 4, 4]; before the first and after the last it does
-            not exist, between keys are straight lines and slerp. No keys: it is always there, in the world.
-        displacement: f32[K, n, 3] metres in the node's frame, what its Gaussians are moved by at every key; or None.
-    """
+    """Gaussians that move together, in the node's own frame. ``name``: of the object; the first node of a scene is what
+    stands. ``label``: its class, empty for what stands. ``size_m``: length, width, height of its box. ``times_s``,
+    ``world_from_node``: keys of its path, f64[K] and f64[K, 4, 4]; before the first and after the last it does not
+    exist, between keys are straight lines and slerp. No keys: it is always there, in the world. ``displacement``:
+    f32[K, n, 3] metres in the node's frame, what its Gaussians are moved by at every key; or None."""
 
     name: str
     cloud: SplatCloud
@@ -211,14 +195,10 @@ class SplatNode:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SplatScene:
-    """What is written to a file of a whole scene.
-
-    Args:
-        name: of the scene. nodes: in world axes; what stands first.
-        file_from_world: rigid f64[4, 4]: from the axes of this program to those of the file.
-        sky: u8[H, 2 H, 3] panorama: zenith in row 0, columns from longitude -pi to pi (growing to the left as one
-            looks), or None. facts: JSON values for people (method, times, versions).
-    """
+    """What is written to a file of a whole scene. ``nodes``: in world axes; what stands first. ``file_from_world``:
+    rigid f64[4, 4], from the axes of this program to those of the file. ``sky``: u8[H, 2 H, 3] panorama, zenith in row
+    0, columns from longitude -pi to pi (growing to the left as one looks), or None. ``facts``: JSON values for people
+    (method, times, versions)."""
 
     name: str
     nodes: tuple[SplatNode, ...]
@@ -258,6 +238,22 @@ def logit(opacity: NDArray[np.floating]) -> Floats:
     return np.log(o / (1 - o)).clip(-MOST_LOGIT, MOST_LOGIT).astype(np.float32)
 
 
+def logarithms(sizes: Matrix, where: str) -> Matrix:
+    """Natural logarithms of sizes in metres [n, 3], of 0 the smallest. Raises InputError: a negative one."""
+    what, remedy = "the size of a Gaussian is negative", "they look like logarithms: write exp(scale) into the file"
+    refuse_rows((sizes < 0).any(1), what, where, sizes, "metres", remedy)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.maximum(np.log(sizes), LEAST_LOG)
+
+
+def refuse_rows(bad: Any, what: str, where: str, values: NDArray[Any], expected: str = "", remedy: str = "") -> None:
+    """InputError for the first Gaussian that is ``bad`` (bool[n]), if one is, with its ``values`` [n, c]."""
+    if bad.any():
+        row = int(bad.argmax())
+        got = f"{values[row].tolist()[:6]}; {int(bad.sum())} of {len(bad)} are damaged"
+        raise InputError(what, where=f"{where}: Gaussian {row}", expected=expected, got=got, remedy=remedy)
+
+
 def turned(turn: NDArray[np.floating], quats: Floats) -> Floats:
     """Hamilton product of a quaternion [4] and quaternions [n, 4] (w, x, y, z)."""
     w, x, y, z = (float(value) for value in turn)
@@ -271,11 +267,8 @@ def unit(quats: NDArray[np.floating], where: str) -> Floats:
     with np.errstate(over="ignore", invalid="ignore"):
         length = np.sqrt((q * q).sum(1, keepdims=True))
     bad = ~(np.isfinite(length[:, 0]) & (length[:, 0] > 1e-12))
-    if bad.any():
-        row = int(bad.argmax())
-        what, where = "a rotation is no quaternion", f"{where}: Gaussian {row}"
-        expected, got = "four finite numbers, not all 0", f"{q[row].tolist()}; {int(bad.sum())} of {len(q)} are damaged"
-        raise InputError(what, where=where, expected=expected, got=got, remedy="take them out, or write 1, 0, 0, 0")
+    expected, remedy = "four finite numbers, not all 0", "take them out, or write 1, 0, 0, 0"
+    refuse_rows(bad, "a rotation is no quaternion", where, q, expected, remedy)
     return (q / length).astype(np.float32)
 
 
@@ -290,21 +283,14 @@ def checked(cloud: SplatCloud, where: str) -> SplatCloud:
     cloud = replace(cloud, logits=logits, log_scales=logs)
     columns = {"position": cloud.means, "scale": cloud.log_scales, "opacity": cloud.logits[:, None]}
     columns["color"] = cloud.sh.reshape(len(cloud), -1)
+    remedy = "take them out, for example with splat-transform --filter-nan"
     for name, values in columns.items():
         bad = ~np.isfinite(values).all(1)
-        if bad.any():
-            row = int(bad.argmax())
-            what = f"the {name} of a Gaussian is not finite"
-            got = f"{values[row].tolist()[:4]}; {int(bad.sum())} of {len(cloud)} are damaged"
-            remedy = "take them out, for example with splat-transform --filter-nan"
-            raise InputError(what, where=f"{where}: Gaussian {row}", got=got, remedy=remedy)
+        refuse_rows(bad, f"the {name} of a Gaussian is not finite", where, values, remedy=remedy)
     far = (np.abs(cloud.means) > LARGEST_M).any(1) | (cloud.log_scales > MOST_LOG).any(1)
-    if far.any():
-        row = int(far.argmax())
-        what = "a Gaussian lies or reaches too far away"
-        expected = f"positions within {LARGEST_M:g} m, logarithms of sizes below {MOST_LOG:g}"
-        got = f"{cloud.means[row].tolist()}, {cloud.log_scales[row].tolist()}"
-        raise InputError(what, where=f"{where}: Gaussian {row}", expected=expected, got=got)
+    expected = f"positions within {LARGEST_M:g} m, logarithms of sizes below {MOST_LOG:g}"
+    values = np.concatenate([cloud.means, cloud.log_scales], 1)
+    refuse_rows(far, "a Gaussian lies or reaches too far away", where, values, expected)
     return replace(cloud, quats=unit(cloud.quats, where), log_scales=cloud.log_scales.clip(LEAST_LOG))
 
 

@@ -20,13 +20,13 @@ from mudg.formats.exporters.alpasim import to_alpasim
 from mudg.formats.splats import binary, gltf, ply, sog, spz, usd
 from mudg.formats.splats import cloud as axes
 from mudg.formats.splats.cloud import (
-    LEAST_LOG,
     SplatCloud,
     SplatFile,
     SplatNode,
     SplatScene,
     checked,
     doubtful_values,
+    logarithms,
     logit,
     spacing_m,
 )
@@ -56,19 +56,10 @@ def splat_from_bytes(content: bytes, where: str) -> SplatFile:
         raise InputError(what, where=where, got=got, remedy="it was cut off, or is another kind of file")
     binary.refuse_count(len(content) // _SPLAT_ROW.itemsize, where)
     rows = np.frombuffer(content, _SPLAT_ROW)
-    scales = rows["scales"].astype(np.float64)
-    if (scales < 0).any():
-        what = "the size of a Gaussian is negative"
-        remedy = "a .splat file holds sizes in metres, not their logarithms: write exp(scale)"
-        raise InputError(what, where=f"{where}: Gaussian {int((scales < 0).any(1).argmax())}", remedy=remedy)
-    with np.errstate(divide="ignore"):
-        logs = np.maximum(np.log(scales), LEAST_LOG)
-    rgba = rows["rgba"] / 255
-    sh = ((rgba[:, None, :3] - 0.5) / C0).astype(np.float32)
-    quats = (rows["quats"] / 255 * 2 - 1).astype(np.float32)
-    cloud = checked(
-        SplatCloud(rows["means"].astype(np.float64), quats, logs.astype(np.float32), logit(rgba[:, 3]), sh), where
-    )
+    logs, rgba = logarithms(rows["scales"].astype(np.float64), where), rows["rgba"] / 255
+    stated = (rows["quats"] / 255 * 2 - 1, logs, logit(rgba[:, 3]), (rgba[:, None, :3] - 0.5) / C0)
+    quats, logs, logits, sh = (values.astype(np.float32) for values in stated)
+    cloud = checked(SplatCloud(rows["means"].astype(np.float64), quats, logs, logits, sh), where)
     return SplatFile(cloud, step_m=spacing_m(rows["means"]))
 
 
@@ -77,13 +68,9 @@ def splat_from_bytes(content: bytes, where: str) -> SplatFile:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WriteRequest:
-    """What is to be written.
-
-    Args:
-        scene: with the axes of the file. time_s: the moment, or None = all of the motion. log: whose cameras are
-            listed, where a format can. ground: where a format needs it. road: points f[N, 3] of the road's surface,
-            where a format holds a map.
-    """
+    """What is to be written. ``scene``: with the axes of the file. ``time_s``: the moment, or None = all of the motion.
+    ``log``: whose cameras are listed, where a format can. ``ground``: where a format needs it. ``road``: points f[N, 3]
+    of the road's surface, where a format holds a map."""
 
     scene: SplatScene
     time_s: float | None
@@ -115,13 +102,9 @@ class WriteRequest:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SplatFormat:
-    """One format.
-
-    Args:
-        suffixes: of its files, the usual one first. axes: of ``cloud.py``, what its readers expect. write: bytes of a
-            request. read: Gaussians of bytes, or None: not read.
-        carries: of ``motion``, ``deformation``, ``classes``, ``sky``, ``harmonics``, ``antialias``.
-    """
+    """One format. ``suffixes``: of its files, the usual one first. ``axes``: of ``cloud.py``, what its readers expect.
+    ``write``: bytes of a request. ``read``: Gaussians of bytes, or None: not read. ``carries``: of ``motion``,
+    ``deformation``, ``classes``, ``sky``, ``harmonics``, ``antialias``."""
 
     suffixes: tuple[str, ...]
     axes: str
@@ -199,16 +182,10 @@ def format_of(content: bytes, name: str) -> str:
 
 def read_cloud(content: bytes, name: str, choice: str = "file") -> tuple[SplatCloud, str]:
     """The Gaussians of a file in the axes of this program (z up), and the name of its format; ``means`` f64: take an
-    origin near them away before they become f32. Says on stderr what was passed over or taken with doubt.
-
-    Args:
-        name: of the file, for messages and for formats without a mark. choice: of axes. ``file``: what the file says,
-            else those that viewers of its format expect; ``viewer``: these; ``world``: those of this program; or
-            letters of ``cloud.py``.
-
-    Raises:
-        InputError: another or a damaged file. ResourceError: a package that this file needs is not installed.
-    """
+    origin near them away before they become f32. Says on stderr what was passed over or taken with doubt. ``name``: of
+    the file, for messages and for formats without a mark. ``choice``: of axes. ``file``: what the file says, else those
+    that viewers of its format expect; ``viewer``: these; ``world``: those of this program; or letters of ``cloud.py``.
+    Raises InputError: another or a damaged file. ResourceError: a package that this file needs is not installed."""
     found = format_of(content, name)
     with np.errstate(over="ignore", invalid="ignore"):  # readers check what comes of numbers that overflow or are none
         file = _READERS[found](content, name)

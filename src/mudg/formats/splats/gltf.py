@@ -21,7 +21,6 @@ from mudg.base.records import ForeignRecord, Number, parse_record
 from mudg.core.harmonics import C0
 from mudg.formats.splats import binary
 from mudg.formats.splats.cloud import (
-    LEAST_LOG,
     SplatCloud,
     SplatFile,
     SplatNode,
@@ -29,7 +28,9 @@ from mudg.formats.splats.cloud import (
     checked,
     in_words,
     joined,
+    logarithms,
     logit,
+    refuse_rows,
     spacing_m,
     unit,
 )
@@ -45,30 +46,33 @@ _SHAPES: Final = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 class _Buffer:
-    """The binary chunk and the accessors into it."""
+    """The binary chunk, the accessors into it, and the animation of nodes."""
 
     def __init__(self) -> None:
-        self.parts: list[bytes] = []
-        self.size = 0
-        self.views: list[dict[str, Any]] = []
-        self.accessors: list[dict[str, Any]] = []
+        self.content = bytearray()
+        self.views, self.accessors = list[dict[str, Any]](), list[dict[str, Any]]()
+        self.channels, self.samplers = list[dict[str, Any]](), list[dict[str, Any]]()
 
     def add(self, values: NDArray[np.floating], bounds: bool = False, vertices: bool = True) -> int:
         """Values f32[n] or f32[n, c] as an accessor; returns its index."""
-        rows = np.ascontiguousarray(values, "<f4")
-        width = 1 if rows.ndim == 1 else rows.shape[1]
-        content = rows.tobytes()
-        view = {"buffer": 0, "byteOffset": self.size, "byteLength": len(content)}
+        rows = np.ascontiguousarray(values, "<f4").reshape(len(values), -1)
+        view = {"buffer": 0, "byteOffset": len(self.content), "byteLength": rows.nbytes}
         self.views.append(view | ({"target": 34962} if vertices else {}))
         accessor: dict[str, Any] = {"bufferView": len(self.views) - 1, "componentType": FLOAT, "count": len(rows)}
-        accessor["type"] = _SHAPES[width]
+        accessor["type"] = _SHAPES[rows.shape[1]]
         if bounds:
-            low, high = rows.reshape(len(rows), -1).min(0), rows.reshape(len(rows), -1).max(0)
-            accessor |= {"min": low.astype(float).tolist(), "max": high.astype(float).tolist()}
+            accessor |= {"min": rows.min(0).astype(float).tolist(), "max": rows.max(0).astype(float).tolist()}
         self.accessors.append(accessor)
-        self.parts.append(content)
-        self.size += len(content)
+        self.content += rows.tobytes()
         return len(self.accessors) - 1
+
+    def animate(
+        self, node: int, path: str, moments: NDArray[np.float32], values: NDArray[np.floating], how: str = "LINEAR"
+    ) -> None:
+        """Let ``path`` of a node (rotation, ...) take values at moments."""
+        given, made = self.add(moments, True, False), self.add(values, False, False)
+        self.samplers.append({"input": given, "output": made, "interpolation": how})
+        self.channels.append({"sampler": len(self.samplers) - 1, "target": {"node": node, "path": path}})
 
 
 def to_bytes(scene: SplatScene, time_s: float | None = None) -> bytes:
@@ -83,7 +87,6 @@ def to_bytes(scene: SplatScene, time_s: float | None = None) -> bytes:
         "nodes": [],
         "meshes": [],
     }
-    channels, samplers = list[dict[str, Any]](), list[dict[str, Any]]()
     nodes = scene.nodes if time_s is None else (SplatNode("scene", scene.at(time_s)),)
     for node in nodes:
         cloud = middle_shape(node) if node.moves or time_s is not None else node.cloud.moved(scene.file_from_world)
@@ -91,13 +94,13 @@ def to_bytes(scene: SplatScene, time_s: float | None = None) -> bytes:
             continue
         document["meshes"].append({"name": node.name, "primitives": [_primitive(buffer, cloud)]})
         index = len(document["nodes"])
-        place = _placed(scene, node, index, (buffer, channels, samplers))
+        place = _placed(buffer, scene, node, index) if node.moves else {}
         document["nodes"].append({"name": node.name, "mesh": len(document["meshes"]) - 1, **place})
         document["scenes"][0]["nodes"].append(index)
-    if channels:
-        document["animations"] = [{"name": "drive", "channels": channels, "samplers": samplers}]
-    document |= {"accessors": buffer.accessors, "bufferViews": buffer.views, "buffers": [{"byteLength": buffer.size}]}
-    return glb(document, b"".join(buffer.parts))
+    if buffer.channels:
+        document["animations"] = [{"name": "drive", "channels": buffer.channels, "samplers": buffer.samplers}]
+    document |= {"accessors": buffer.accessors, "bufferViews": buffer.views}
+    return glb(document | {"buffers": [{"byteLength": len(buffer.content)}]}, bytes(buffer.content))
 
 
 def glb(document: dict[str, Any], content: bytes) -> bytes:
@@ -128,37 +131,25 @@ def _primitive(buffer: _Buffer, cloud: SplatCloud) -> dict[str, Any]:
     return {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: kind}}
 
 
-def _placed(
-    scene: SplatScene, node: SplatNode, index: int, into: tuple[_Buffer, list[dict[str, Any]], list[dict[str, Any]]]
-) -> dict[str, Any]:
-    """The pose of a node at its first key, and its animation."""
-    if not node.moves:
-        return {}
-    buffer, channels, samplers = into
+def _placed(buffer: _Buffer, scene: SplatScene, node: SplatNode, index: int) -> dict[str, Any]:
+    """The pose of a node that moves at its first key, and its animation."""
     start_s = scene.span_s[0]
     poses = scene.file_from_world @ node.world_from_node
     quats = np.stack([geometry.quaternion_from_matrix(pose) for pose in poses])[:, [1, 2, 3, 0]]
     times = rising(node.times_s - start_s)
-
-    def animate(path: str, moments: NDArray[np.float32], values: NDArray[np.floating], how: str = "LINEAR") -> None:
-        given, made = buffer.add(moments, True, False), buffer.add(values, False, False)
-        samplers.append({"input": given, "output": made, "interpolation": how})
-        channels.append({"sampler": len(samplers) - 1, "target": {"node": index, "path": path}})
-
-    animate("translation", times, poses[:, :3, 3])
-    animate("rotation", times, quats)
+    buffer.animate(index, "translation", times, poses[:, :3, 3])
+    buffer.animate(index, "rotation", times, quats)
     first, last = float(times[0]), float(times[-1])
     shown = [(0.0, HIDDEN), (first, 1.0)] if first > 0 else [(0.0, 1.0)]
     if last < scene.span_s[1] - start_s - 1e-4:
         shown.append((float(np.nextafter(np.float32(last), np.float32(np.inf))), HIDDEN))
     if len(shown) > 1:
         scales = np.repeat([[size] for _, size in shown], 3, 1)
-        animate("scale", np.array([moment for moment, _ in shown], np.float32), scales, "STEP")
+        buffer.animate(index, "scale", np.array([moment for moment, _ in shown], np.float32), scales, "STEP")
     found: dict[str, Any] = {"translation": poses[0, :3, 3].tolist(), "rotation": quats[0].tolist()}
     if shown[0][1] != 1.0:
         found["scale"] = [HIDDEN] * 3
-    facts: dict[str, Any] = {"label": node.label, "size_m": list(node.size_m)}
-    return found | {"extras": facts}
+    return found | {"extras": {"label": node.label, "size_m": list(node.size_m)}}
 
 
 def middle_shape(node: SplatNode) -> SplatCloud:
@@ -178,10 +169,7 @@ def rising(times: NDArray[np.float64]) -> NDArray[np.float32]:
     return made
 
 
-# gltf read ----------------------------------------------------------------------------------------
-#
-# Gaussians of GLB files with KHR_gaussian_splatting, in the axes and the place that the file's scene gives them.
-
+# reading ------------------------------------------------------------------------------------------
 
 _KINDS: Final = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _READ: Final = (EXTENSION, "KHR_mesh_quantization", "KHR_node_visibility", "KHR_materials_unlit")
@@ -288,7 +276,7 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
         file.warnings.append(f"{triangles} meshes without Gaussians were passed over")
     if file.document.animations:
         file.warnings.append("its animations are not read: everything is where the nodes put it at rest")
-    notes = (sentence(sorted(file.passed), "the document"),) if file.passed else ()
+    notes = [sentence(sorted(file.passed), "the document")] if file.passed else []
     axes = "RDF" if file.of_old_transform(2) else ""
     if axes:
         reads = f"{file.generator} wrote {in_words(axes)}, where glTF has y up: read so"
@@ -296,9 +284,8 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     extras = file.document.asset.get("extras")
     drawing = extras.get("drawing") if isinstance(extras, dict) else None
     antialias = isinstance(drawing, dict) and drawing.get("antialias") is True
-    cloud = replace(joined(clouds), antialias=antialias)
-    by, warnings = f"its program {file.generator}", tuple(dict.fromkeys(file.warnings))
-    return SplatFile(cloud, axes, by, file.step_m, notes, warnings)
+    cloud, warnings = replace(joined(clouds), antialias=antialias), list(dict.fromkeys(file.warnings))
+    return SplatFile(cloud, axes, f"its program {file.generator}", file.step_m, notes, warnings)
 
 
 def _moved(cloud: SplatCloud, matrix: Array, where: str) -> SplatCloud:
@@ -357,10 +344,9 @@ class _GlbFile:
         generator = str(self.document.asset.get("generator", ""))[:60]
         self.generator = "".join(letter for letter in generator if letter.isprintable())
         self.note("", self.document)
-        for node in self.document.nodes:
-            self.note("nodes.", node)
-        for accessor in self.document.accessors:
-            self.note("accessors.", accessor)
+        for name in ("nodes", "accessors"):
+            for record in getattr(self.document, name):
+                self.note(f"{name}.", record)
 
     def note(self, within: str, record: ForeignRecord) -> None:
         """Note the fields of a record that glTF does not have."""
@@ -446,7 +432,11 @@ class _GlbFile:
             self.warnings.append(f"{self.generator} {words}")
             logits, logs = opacity, scale
         else:
-            logits, logs = self._logits(opacity), self._logarithms(scale)
+            bad = ~((opacity >= -_ROUNDING) & (opacity <= 1 + _ROUNDING))
+            what, remedy = "the opacity of a Gaussian is not between 0 and 1", "they look like logits: write"
+            remedy = f"{remedy} 1 / (1 + exp(-logit)) into the file"
+            refuse_rows(bad, what, self.where, opacity[:, None], "0 to 1", remedy)
+            logits, logs = logit(opacity), logarithms(scale, self.where)
         degrees = [d for d in range(4) if f"{PREFIX}SH_DEGREE_{d}_COEF_0" in attributes]
         if degrees != list(range(len(degrees))) or not degrees:
             what = "the harmonics of a primitive leave a degree out"
@@ -458,27 +448,10 @@ class _GlbFile:
         if any(name.startswith(f"{PREFIX}SH_DEGREE_") and name not in bands for name in attributes):
             self.warnings.append("harmonics beyond degree 3 were dropped")
         self.step_m = max(self.step_m, spacing_m(means))
-        columns = [values.astype(np.float32) for values in (rotation[:, [3, 0, 1, 2]], logs, logits, sh)]
-        return checked(SplatCloud(means, *columns), self.where)
-
-    def _logits(self, opacity: Array) -> NDArray[np.floating]:
-        bad = ~((opacity >= -_ROUNDING) & (opacity <= 1 + _ROUNDING))
-        if bad.any():
-            row = int(bad.argmax())
-            what, expected = "the opacity of a Gaussian is not between 0 and 1", "0 to 1"
-            got = f"{opacity[row]:.4g}; {int(bad.sum())} of {len(opacity)}: they look like logits"
-            remedy = "write 1 / (1 + exp(-logit)) into the file"
-            raise InputError(what, where=f"{self.where}: Gaussian {row}", expected=expected, got=got, remedy=remedy)
-        return logit(opacity)
-
-    def _logarithms(self, scale: Array) -> Array:
-        if (scale < 0).any():
-            row = int((scale < 0).any(1).argmax())
-            what, where = "the size of a Gaussian is negative", f"{self.where}: Gaussian {row}"
-            got = f"{scale[row].tolist()}: they look like logarithms"
-            raise InputError(what, where=where, expected="metres", got=got, remedy="write exp(scale) into the file")
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.maximum(np.log(scale), LEAST_LOG)
+        quats, logs, logits, sh = (
+            values.astype(np.float32) for values in (rotation[:, [3, 0, 1, 2]], logs, logits, sh)
+        )
+        return checked(SplatCloud(means, quats, logs, logits, sh), self.where)
 
     def values(self, attributes: Mapping[str, int], name: str, width: int, count: int | None = None) -> Array:
         """An attribute as f64[count, width], normalised integers as numbers."""

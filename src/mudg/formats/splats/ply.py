@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mudg.base.errors import InputError
 from mudg.core.harmonics import C0
 from mudg.formats.splats import binary
-from mudg.formats.splats.cloud import VERTICAL, SplatCloud, SplatFile, checked, known, logit, spacing_m
+from mudg.formats.splats.cloud import VERTICAL, SplatCloud, SplatFile, checked, known, logit, refuse_rows, spacing_m
 from mudg.formats.unknown_fields import listed, sentence
 
 MAX_HEADER: Final = 1 << 16
@@ -36,6 +36,8 @@ _TYPES: Final = dict(zip(_NAMES.split(), 2 * "i1 u1 i2 u2 i4 u4 f4 f8".split(), 
 _ORDERS: Final = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 _REST: Final = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
 """Number of ``f_rest`` columns: degree."""
+_Element = tuple[str, int, list[tuple[str, str]], list[str]]
+"""An element of the header: name, number of rows, columns (name, numpy type), names of those that are lists."""
 
 
 def to_bytes(cloud: SplatCloud, classes: bool = False, marks: Sequence[str] = ()) -> bytes:
@@ -53,7 +55,7 @@ def to_bytes(cloud: SplatCloud, classes: bool = False, marks: Sequence[str] = ()
 def from_bytes(content: bytes, where: str) -> SplatFile:
     """The Gaussians of a PLY file; columns and elements that it does not know are passed over. Raises InputError:
     another kind of PLY, or a damaged one."""
-    file = read_elements(content, where, ("vertex",))
+    file = PlyFile(content, where, ("vertex",))
     table = file.tables.get("vertex")
     if table is None:
         raise InputError("the PLY file has no vertices", where=where)
@@ -76,27 +78,25 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
             classes = np.where((ids >= 0) & (ids <= 255), ids, 255).astype(np.uint8)
     means = np.stack([table[name].astype(np.float64) for name in "xyz"], 1)
     logs = columns_of(table, sizes)
-    notes = list(file.notes)
     if flat:
         logs = np.column_stack([logs, np.full(len(logs), FLAT_LOG, np.float32)])
-        notes.append("it has no scale_2: read as flat Gaussians (2DGS)")
+        file.notes.append("it has no scale_2: read as flat Gaussians (2DGS)")
     quats, logits = columns_of(table, _indexed("rot", 4)), np.asarray(table["opacity"], np.float32)
     cloud = checked(SplatCloud(means, quats, logs, logits, sh, classes, file.antialias), where)
     filters = [name for name in names if name.lower() == "filter_3d"]
     if filters:
         cloud = _filtered(cloud, np.asarray(table[filters[0]], np.float64), where)
-        notes.append("the column filter_3D (Mip-Splatting) went into sizes and opacities")
+        file.notes.append("the column filter_3D (Mip-Splatting) went into sizes and opacities")
     used = {*wanted, *_indexed("f_rest", rest), *_UNREAD, *filters, *(["class"] if ours else [])}
-    passed = [name for name in names if name not in used]
-    moving = [name for name in passed if name.lower().startswith(_MOTION)]
-    if rest_of := [name for name in passed if name not in moving]:
-        notes.append(sentence(rest_of, "element vertex"))
-    warnings = [*file.warnings, *(["harmonics beyond degree 3 were dropped"] if _REST[rest] > 3 else [])]
+    moving = [name for name in names if name not in used and name.lower().startswith(_MOTION)]
+    file.pass_over([name for name in names if name not in used and name not in moving], "element vertex")
+    if _REST[rest] > 3:
+        file.warnings.append("harmonics beyond degree 3 were dropped")
     if moving:
-        warnings.append(f"columns of motion over time are not read: {listed(moving)}; the Gaussians are as they rest")
+        words = f"columns of motion over time are not read: {listed(moving)}; the Gaussians are as they rest"
+        file.warnings.append(words)
     single = [axis for axis, name in enumerate("xyz") if table.dtype[name] == np.float32]
-    step = spacing_m(means[:, single]) if single else 0.0
-    return SplatFile(cloud, file.axes, file.axes_by, step, tuple(notes), tuple(warnings))
+    return file.of(cloud, spacing_m(means[:, single]) if single else 0.0)
 
 
 def _refuse_columns(table: NDArray[Any], wanted: tuple[str, ...], where: str) -> None:
@@ -120,9 +120,7 @@ def _refuse_columns(table: NDArray[Any], wanted: tuple[str, ...], where: str) ->
 def _filtered(cloud: SplatCloud, filter_m: NDArray[np.float64], where: str) -> SplatCloud:
     """Gaussians blurred by a filter f64[n] in metres (Mip-Splatting, eq. 7): sizes grow, opacities fall with the
     volume."""
-    if not np.isfinite(filter_m).all():
-        what = "a filter_3D is not finite"
-        raise InputError(what, where=f"{where}: Gaussian {int((~np.isfinite(filter_m)).argmax())}")
+    refuse_rows(~np.isfinite(filter_m), "a filter_3D is not finite", where, filter_m[:, None])
     variance = np.exp(2 * cloud.log_scales.astype(np.float64))
     grown = variance + (filter_m**2)[:, None]
     share = np.exp(0.5 * (np.log(variance) - np.log(grown)).sum(1))
@@ -141,67 +139,92 @@ def header(elements: list[tuple[str, int, list[tuple[str, str]]]], comments: Seq
     return ("\n".join([*lines, "end_header"]) + "\n").encode()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class PlyFile:
-    """Tables of a PLY, and what its comments say: the rest as in ``SplatFile``."""
+    """The wanted elements of a PLY as structured arrays (``tables``; those of a binary one look into ``content``), and
+    what its comments say: the rest as in ``SplatFile``. Raises InputError: no PLY, a malformed header, lists in or
+    before wanted elements, or content that is too short."""
 
-    tables: dict[str, NDArray[Any]]
-    antialias: bool
-    axes: str
-    axes_by: str
-    notes: tuple[str, ...]
-    warnings: tuple[str, ...]
+    def __init__(self, content: bytes, where: str, wanted: tuple[str, ...]) -> None:
+        self.tables, self.notes, self.warnings = dict[str, NDArray[Any]](), list[str](), list[str]()
+        elements, comments, place, order = _parsed_header(content, where)
+        last = max((index for index, (name, *_) in enumerate(elements) if name in wanted), default=-1)
+        for name, count, columns, lists in elements[: last + 1]:
+            here = f"{where}: element {name!r}"
+            if lists and (count or name in wanted):
+                what, got = "a PLY file has lists in its vertices, or before them", f"property list {lists[0]!r}"
+                raise InputError(what, where=here, got=got, remedy="write vertices first, one property for each number")
+            try:
+                dtype = np.dtype([(column, (order or "<") + kind) for column, kind in columns])
+            except ValueError as error:
+                what = "two properties of a PLY element have one name"
+                raise InputError(what, where=where, got=str(error)[:200]) from error
+            size = count * dtype.itemsize
+            if not order:
+                rows = b"\n".join(content[place:].split(b"\n", count)[:count])
+                dtype = np.dtype([(column, "<f8") for column, _ in columns])
+                table, size = binary.text_table(rows, len(columns), count, here), len(rows) + 1
+            else:
+                table = binary.part(content, place, size, f"element {name!r}", where)
+            if dtype.itemsize and name in wanted:
+                self.tables[name] = np.frombuffer(table, dtype)
+            place += size
+        self.pass_over(
+            [name for name, count, *_ in elements if name not in (*wanted, *_ELEMENTS) and count], "the header"
+        )
+        self.antialias = self._antialias(comments)
+        self.axes, self.axes_by = self._axes(comments)
+        if colors := [name for name, *_ in elements if "color" in name.lower() and name not in wanted]:
+            words = f"the colour space in element {listed(colors)} is not read: colours are taken as sRGB"
+            self.warnings.append(words)
+        for line in comments:
+            if re.search(r"(?i)\b(offset|shift|epsg|utm|georef\w*|crs)\b", line):
+                places = "places are as the file has them (--origin-m chooses the origin)"
+                self.warnings.append(f"the comment {line[:80]!r} is not used: {places}")
 
+    def pass_over(self, names: list[str], within: str) -> None:
+        """Note names, if there are any, that are not read."""
+        if names:
+            self.notes.append(sentence(names, within))
 
-@dataclass
-class _Element:
-    """An element of the header: its columns (name, numpy type), and the first of its columns that is a list."""
+    def of(self, cloud: SplatCloud, step_m: float) -> SplatFile:
+        """The file with the Gaussians in it."""
+        return SplatFile(cloud, self.axes, self.axes_by, step_m, self.notes, self.warnings)
 
-    name: str
-    count: int
-    columns: list[tuple[str, str]]
-    has_list: str = ""
+    def _antialias(self, comments: list[str]) -> bool:
+        """Whether the last comment on it says that the Gaussians are drawn antialiased."""
+        found = False
+        for line in comments:
+            mode = re.search(r"(?i)\b(?:splat|raster\w*|render)[ _-]?(?:render)?[ _-]?mode\W*(\w+)", line)
+            mark = re.search(r"(?i)(\bnot? )?\banti[ _-]?alias(?:ed|ing)?\b\W*(\w*)", line)
+            if mode and mode[1].lower() in _MODES:
+                found = _MODES[mode[1].lower()]
+            elif mode:
+                words = f"the comment {line[:80]!r} names a way of drawing that is not known: drawn as usual"
+                self.warnings.append(words)
+            elif mark:
+                found = not mark[1] and mark[2].lower() not in ("0", "false", "no", "off", "none", "disabled")
+        return found
 
-
-def read_elements(content: bytes, where: str, wanted: tuple[str, ...]) -> PlyFile:
-    """The wanted elements of a PLY as structured arrays; those of a binary one look into ``content``. Raises
-    InputError: no PLY, a malformed header, lists in or before wanted elements, or content that is too short."""
-    elements, comments, place, order = _parsed_header(content, where)
-    tables: dict[str, NDArray[Any]] = {}
-    last = max((index for index, element in enumerate(elements) if element.name in wanted), default=-1)
-    for element in elements[: last + 1]:
-        here = f"{where}: element {element.name!r}"
-        if element.has_list and (element.count or element.name in wanted):
-            what, got = "a PLY file has lists in its vertices, or before them", f"property list {element.has_list!r}"
-            raise InputError(what, where=here, got=got, remedy="write vertices first, one property for each number")
-        try:
-            dtype = np.dtype([(name, (order or "<") + kind) for name, kind in element.columns])
-        except ValueError as error:
-            what = "two properties of a PLY element have one name"
-            raise InputError(what, where=where, got=str(error)[:200]) from error
-        size = element.count * dtype.itemsize
-        if not order:
-            lines = content[place:].split(b"\n", element.count)
-            rows = b"\n".join(lines[: element.count])
-            dtype = np.dtype([(name, "<f8") for name, _ in element.columns])
-            table = binary.text_table(rows, len(element.columns), element.count, here)
-            size = len(rows) + 1
-        else:
-            table = binary.part(content, place, size, f"element {element.name!r}", where)
-        if dtype.itemsize and element.name in wanted:
-            tables[element.name] = np.frombuffer(table, dtype)
-        place += size
-    others = [one.name for one in elements if one.name not in (*wanted, *_ELEMENTS) and one.count]
-    warnings = list[str]()
-    antialias = _antialias(comments, warnings)
-    axes, by = _axes(comments, warnings)
-    if colors := [one.name for one in elements if "color" in one.name.lower() and one.name not in wanted]:
-        warnings.append(f"the colour space in element {listed(colors)} is not read: colours are taken as sRGB")
-    for line in comments:
-        if re.search(r"(?i)\b(offset|shift|epsg|utm|georef\w*|crs)\b", line):
-            places = "places are as the file has them (--origin-m chooses the origin)"
-            warnings.append(f"the comment {line[:80]!r} is not used: {places}")
-    return PlyFile(tables, antialias, axes, by, (sentence(others, "the header"),) if others else (), tuple(warnings))
+    def _axes(self, comments: list[str]) -> tuple[str, str]:
+        """Axes that a comment states, and the comment."""
+        for line in comments:
+            by = f"the comment {line[:80]!r}"
+            system = re.search(r"(?i)\bcoordinate[ _-]?(?:system|frame)\W*\b([LRUDFB]{3})\b", line)
+            if system and known(system[1].upper()):
+                return system[1].upper(), by
+            up = re.search(r"(?i)\b(vertical|up)[ _-]?(?:axis)?\s*[:=]?\s*([+-]?[xyz])\b", line)
+            after = re.search(r"(?i)(?<![\w+-])([+-]?[xyz])[ _-]?(?:axis )?(?:is )?up\b", line)
+            if up is None and after is None:
+                continue
+            axis = (up[2] if up else after[1] if after else "").lower().removeprefix("+")
+            if axis == "y" and (up is None or up[1].lower() == "up"):
+                return "RUB", by
+            if axis in VERTICAL:
+                return VERTICAL[axis], by
+            if not any("brush" in other.lower() for other in comments):  # which writes it into every file
+                words = "does not tell whether y points up or down: read with y down, as usual"
+                self.warnings.append(f"{by} {words}; if it stands on its head, add --axes RUB")
+        return "", ""
 
 
 def _parsed_header(content: bytes, where: str) -> tuple[list[_Element], list[str], int, str]:
@@ -223,62 +246,21 @@ def _parsed_header(content: bytes, where: str) -> tuple[list[_Element], list[str
             case ["format", kind, _] if kind in _ORDERS:
                 order = _ORDERS[kind]
             case ["element", name, count] if count.isdecimal() and len(count) < 12:
-                elements.append(_Element(name, int(count), []))
+                elements.append((name, int(count), [], []))
             case ["property", kind, name] if kind in _TYPES and elements:
-                elements[-1].columns.append((name, _TYPES[kind]))
+                elements[-1][2].append((name, _TYPES[kind]))
             case ["property", "list", length, kind, name] if {length, kind} <= _TYPES.keys() and elements:
-                elements[-1].has_list = elements[-1].has_list or name
+                elements[-1][3].append(name)
             case _:
                 what = "a line in the header of the PLY file is not understood"
                 expected = f"format {' or '.join(_ORDERS)}, element NAME COUNT, property TYPE NAME, or property list"
                 raise InputError(what, where=where, got=repr(line[:80]), expected=expected)
     if order is None or not elements:
         raise InputError("the header of the PLY file names no format or no elements", where=where)
-    for element in elements:
-        if element.name in ("vertex", "chunk", "sh"):
-            binary.refuse_count(element.count, f"{where}: element {element.name}")
+    for name, count, *_ in elements:
+        if name in ("vertex", "chunk", "sh"):
+            binary.refuse_count(count, f"{where}: element {name}")
     return elements, comments, line_end + 1, order
-
-
-# -- comments --------------------------------------------------------------------------------------
-
-
-def _antialias(comments: list[str], warnings: list[str]) -> bool:
-    """Whether the last comment on it says that the Gaussians are drawn antialiased."""
-    found = False
-    for line in comments:
-        mode = re.search(r"(?i)\b(?:splat|raster\w*|render)[ _-]?(?:render)?[ _-]?mode\W*(\w+)", line)
-        mark = re.search(r"(?i)(\bnot? )?\banti[ _-]?alias(?:ed|ing)?\b\W*(\w*)", line)
-        if mode and mode[1].lower() in _MODES:
-            found = _MODES[mode[1].lower()]
-        elif mode:
-            warnings.append(f"the comment {line[:80]!r} names a way of drawing that is not known: drawn as usual")
-        elif mark:
-            found = not mark[1] and mark[2].lower() not in ("0", "false", "no", "off", "none", "disabled")
-    return found
-
-
-def _axes(comments: list[str], warnings: list[str]) -> tuple[str, str]:
-    """Axes that a comment states, and the comment."""
-    for line in comments:
-        system = re.search(r"(?i)\bcoordinate[ _-]?(?:system|frame)\W*\b([LRUDFB]{3})\b", line)
-        if system and known(system[1].upper()):
-            return system[1].upper(), f"the comment {line[:80]!r}"
-        up = re.search(r"(?i)\b(vertical|up)[ _-]?(?:axis)?\s*[:=]?\s*([+-]?[xyz])\b", line)
-        after = re.search(r"(?i)(?<![\w+-])([+-]?[xyz])[ _-]?(?:axis )?(?:is )?up\b", line)
-        if up is None and after is None:
-            continue
-        axis = (up[2] if up else after[1] if after else "").lower().removeprefix("+")
-        if axis == "y" and (up is None or up[1].lower() == "up"):
-            return "RUB", f"the comment {line[:80]!r}"
-        if axis in VERTICAL:
-            return VERTICAL[axis], f"the comment {line[:80]!r}"
-        if not any("brush" in other.lower() for other in comments):  # which writes it into every file
-            warnings.append(
-                f"the comment {line[:80]!r} does not tell whether y points up or down: read with y down, as usual; "
-                "if it stands on its head, add --axes RUB"
-            )
-    return "", ""
 
 
 # -- columns ---------------------------------------------------------------------------------------
@@ -314,12 +296,9 @@ def coefficient_major(rest: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 # compressed ply ------------------------------------------------------------------------------------
-#
 # Of SuperSplat and PlayCanvas: 16 bytes a Gaussian, values within the f32 bounds of chunks of 256; harmonics as u8.
-#
 # Positions and scales (natural logarithm): 11, 10, 11 bits from the top. Rotation: 2 bits index of the largest of (w,
 # x, y, z), the others in order, 10 bits each, ``v / sqrt 2 + 0.5``. Colour of degree 0 and opacity: 8 bits each.
-
 
 CHUNK: Final = 256
 _BOUNDS: Final = tuple(
@@ -330,6 +309,8 @@ _BOUNDS: Final = tuple(
 )
 _PACKED: Final = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _COMPRESSED_REST: Final = {9: 1, 24: 2, 45: 3}
+_PLACE, _TURN, _RGBA = (11, 10, 11), (2, 10, 10, 10), (8, 8, 8, 8)
+"""Bits of the numbers in a word."""
 _LOG_RANGE: Final = 20.0
 
 Array = NDArray[np.float64]
@@ -342,22 +323,18 @@ def compressed_to_bytes(cloud: SplatCloud, marks: Sequence[str] = ()) -> bytes:
     of_chunk = np.arange(len(cloud)) // CHUNK
     bounds, shares = [], []
     for values in (cloud.means, cloud.log_scales.clip(-_LOG_RANGE, _LOG_RANGE), cloud.sh[:, 0] * C0 + 0.5):
-        padded = np.concatenate([values, np.repeat(values[-1:], chunks * CHUNK - len(cloud), 0)]).reshape(
-            chunks, CHUNK, 3
-        )
-        low, high = padded.min(1).astype("<f4"), padded.max(1).astype("<f4")
+        padded = np.concatenate([values, np.repeat(values[-1:], chunks * CHUNK - len(cloud), 0)])
+        low, high = (bound(padded.reshape(chunks, CHUNK, 3), 1).astype("<f4") for bound in (np.min, np.max))
         bounds += [low, high]
         span = (high - low).astype(np.float64)
         inside = (values - low[of_chunk]) / np.where(span > 1e-5, span, 1)[of_chunk]
         shares.append(np.where(span[of_chunk] > 1e-5, inside, 0.0))
     place, scale, color = shares
     largest, three = binary.smallest_three(cloud.quats)
-    turn = _unorm(three / np.sqrt(2) + 0.5, 10)
-    packed = np.empty((len(cloud), 4), "<u4")
-    packed[:, 0], packed[:, 2] = _pack_11_10_11(place), _pack_11_10_11(scale)
-    packed[:, 1] = largest.astype(np.uint32) << 30 | turn[:, 0] << 20 | turn[:, 1] << 10 | turn[:, 2]
-    rgba = _unorm(np.concatenate([color, cloud.opacity[:, None]], 1), 8)
-    packed[:, 3] = rgba[:, 0] << 24 | rgba[:, 1] << 16 | rgba[:, 2] << 8 | rgba[:, 3]
+    turn = np.column_stack([largest / 3, three / np.sqrt(2) + 0.5])
+    rgba = np.concatenate([color, cloud.opacity[:, None]], 1)
+    words = (_packed(place, _PLACE), _packed(turn, _TURN), _packed(scale, _PLACE), _packed(rgba, _RGBA))
+    packed = np.stack(words, 1).astype("<u4")
     elements = [
         ("chunk", chunks, [("float", name) for name in _BOUNDS]),
         ("vertex", len(cloud), [("uint", name) for name in _PACKED]),
@@ -378,7 +355,7 @@ def is_compressed(content: bytes) -> bool:
 def compressed_from_bytes(content: bytes, where: str) -> SplatFile:
     """The Gaussians of a compressed PLY file; columns and elements that it does not know are passed over. Raises
     InputError: another kind of PLY, or a damaged one."""
-    file = read_elements(content, where, ("chunk", "vertex", "sh"))
+    file = PlyFile(content, where, ("chunk", "vertex", "sh"))
     chunk, vertex = file.tables.get("chunk"), file.tables.get("vertex")
     if chunk is None or vertex is None or any(name not in (vertex.dtype.names or ()) for name in _PACKED):
         what = "not a compressed PLY of Gaussians"
@@ -403,23 +380,20 @@ def compressed_from_bytes(content: bytes, where: str) -> SplatFile:
         with np.errstate(over="ignore", invalid="ignore"):
             return low[of_chunk] + shares * (high - low)[of_chunk]
 
-    means = between(_unpack_11_10_11(words["packed_position"]), 0)
-    scales = between(_unpack_11_10_11(words["packed_scale"]), 1)
-    rgba = np.stack([words["packed_color"] >> shift & 255 for shift in (24, 16, 8, 0)], 1) / 255
+    means, scales = (
+        between(_unpacked(words[f"packed_{name}"], _PLACE), n) for n, name in enumerate(("position", "scale"))
+    )
+    rgba, turn = _unpacked(words["packed_color"], _RGBA), _unpacked(words["packed_rotation"], _TURN)
     color = between(rgba[:, :3], 2) if tinted else rgba[:, :3]
-    word = words["packed_rotation"]
-    three = (np.stack([word >> shift & 1023 for shift in (20, 10, 0)], 1) / 1023 - 0.5) * np.sqrt(2)
-    quats = binary.from_smallest_three(word >> 30, three)
+    quats = binary.from_smallest_three(words["packed_rotation"] >> 30, (turn[:, 1:] - 0.5) * np.sqrt(2))
     sh = np.concatenate([((color - 0.5) / C0)[:, None], _rest(file.tables.get("sh"), len(vertex), where)], 1)
-    columns = [values.astype(np.float32) for values in (quats, scales, logit(rgba[:, 3]), sh)]
-    cloud = checked(SplatCloud(means, *columns, antialias=file.antialias), where)
+    quats, logs, logits, sh = (values.astype(np.float32) for values in (quats, scales, logit(rgba[:, 3]), sh))
+    cloud = checked(SplatCloud(means, quats, logs, logits, sh, antialias=file.antialias), where)
     step = spacing_m(bounds[:, 0].reshape(-1, 3)) if chunk.dtype["min_x"].itemsize == 4 else 0.0
     known = {"chunk": _BOUNDS, "vertex": _PACKED, "sh": _indexed("f_rest", max(_COMPRESSED_REST))}
-    notes = list(file.notes)
     for element, table in file.tables.items():
-        if unknown := [name for name in table.dtype.names or () if name not in known[element]]:
-            notes.append(sentence(unknown, f"element {element}"))
-    return SplatFile(cloud, file.axes, file.axes_by, step, tuple(notes), file.warnings)
+        file.pass_over([name for name in table.dtype.names or () if name not in known[element]], f"element {element}")
+    return file.of(cloud, step)
 
 
 def _rest(table: NDArray[np.void] | None, count: int, where: str) -> Array:
@@ -440,14 +414,15 @@ def _rest(table: NDArray[np.void] | None, count: int, where: str) -> Array:
     return coefficient_major(((values - 0.5) * 8).astype(np.float32)).astype(np.float64)
 
 
-def _unorm(values: Array, bits: int) -> NDArray[np.uint32]:
-    most = (1 << bits) - 1
-    return np.floor(values * most + 0.5).clip(0, most).astype(np.uint32)
+def _packed(shares: NDArray[np.floating], bits: Sequence[int]) -> NDArray[np.uint32]:
+    """Shares [n, c] as whole numbers of so many bits each, from the top of a word."""
+    words = np.zeros(len(shares), np.uint32)
+    for share, width in zip(shares.T, bits, strict=True):
+        words = words << width | np.floor(share * ((1 << width) - 1) + 0.5).clip(0, (1 << width) - 1).astype(np.uint32)
+    return words
 
 
-def _pack_11_10_11(values: Array) -> NDArray[np.uint32]:
-    return _unorm(values[:, 0], 11) << 21 | _unorm(values[:, 1], 10) << 11 | _unorm(values[:, 2], 11)
-
-
-def _unpack_11_10_11(words: NDArray[np.uint32]) -> Array:
-    return np.stack([(words >> 21) / 2047, (words >> 11 & 1023) / 1023, (words & 2047) / 2047], 1)
+def _unpacked(words: NDArray[np.uint32], bits: Sequence[int]) -> Array:
+    """Inverse of ``_packed``: shares f64[n, c]."""
+    shifts = [sum(bits[n + 1 :]) for n in range(len(bits))]
+    return np.stack([(words >> at & (1 << width) - 1) / ((1 << width) - 1) for at, width in zip(shifts, bits)], 1)

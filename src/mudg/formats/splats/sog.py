@@ -29,7 +29,7 @@ from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.records import ForeignRecord, Number, parse_record
 from mudg.formats.splats import binary
-from mudg.formats.splats.cloud import SplatCloud, SplatFile, checked, logit
+from mudg.formats.splats.cloud import SplatCloud, SplatFile, checked, logit, refuse_rows
 from mudg.formats.unknown_fields import listed, sentence
 
 CODES: Final = 256
@@ -224,24 +224,22 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
         means = np.sign(place) * np.expm1(np.abs(place))
     turn = pixels.rows(meta.quats.files[0])
     largest = turn[:, 3].astype(np.int64) - 252
-    if (largest < 0).any():
-        what, where = "a rotation names no component", f"{where}: {meta.quats.files[0]}"
-        raise InputError(what, where=where, expected="alpha from 252 to 255", got=str(int(turn[:, 3].min())))
+    at = f"{where}: {meta.quats.files[0]}"
+    refuse_rows(largest < 0, "a rotation names no component", at, turn, "alpha from 252 to 255")
     quats = binary.from_smallest_three(largest, (turn[:, :3] / 255.0 * 2 - 1) / np.sqrt(2))
     scales = np.array(meta.scales.codebook)[pixels.rows(meta.scales.files[0])[:, :3]]
     first = pixels.rows(meta.sh0.files[0])
     sh = np.array(meta.sh0.codebook)[first[:, :3]][:, None]
     if meta.shN is not None:
         sh = np.concatenate([sh, _harmonics(meta.shN, pixels, where)], 1)
-    columns = [values.astype(np.float32) for values in (quats, scales, logit(first[:, 3] / 255.0), sh)]
+    quats, logs, logits, sh = (values.astype(np.float32) for values in (quats, scales, logit(first[:, 3] / 255.0), sh))
     antialias = meta.model == "antialiased" if meta.model is not None else bool(meta.antialias)
-    cloud = checked(SplatCloud(means, *columns, antialias=antialias), where)
-    unknown = meta.unknown()
-    notes = (sentence(unknown, "meta.json"),) if unknown else ()
+    cloud = checked(SplatCloud(means, quats, logs, logits, sh, antialias=antialias), where)
+    notes = [sentence(unknown, "meta.json")] if (unknown := meta.unknown()) else []
     warnings = [] if meta.model in _MODELS else [f"its model {str(meta.model)[:40]!r} is not known: drawn as usual"]
     if pixels.lossy:
         warnings.append("its pictures are compressed with loss, so that values are wrong: write them without")
-    return SplatFile(cloud, notes=notes, warnings=tuple(warnings))
+    return SplatFile(cloud, notes=notes, warnings=warnings)
 
 
 def _harmonics(stated: SogHarmonics, pixels: _Pictures, where: str) -> Array:

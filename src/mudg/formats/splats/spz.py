@@ -177,9 +177,8 @@ def _file(planes: list[bytes], head: _Header, extensions: dict[int, bytes], wher
         doubt = "splat-transform from 3 on writes y down: " if newer else ""
         words = f"it does not state its axes: read with y up, as the format says; {doubt}{remedy}"
         (warnings if newer else notes).append(words)
-    others = [(kind, part) for kind, part in extensions.items() if kind != _AXES and kind not in _HARMLESS]
-    unknown = [f"{kind:#010x} ({len(part)} bytes)" for kind, part in others]
-    if unknown:
+    known = {_AXES, *_HARMLESS}
+    if unknown := [f"{kind:#010x} ({len(part)} bytes)" for kind, part in extensions.items() if kind not in known]:
         warnings.append(f"extensions that are not known were passed over: {listed(unknown)}")
     if head.flags & ~(_ANTIALIAS | _EXTENSIONS):
         warnings.append(f"flags that are not known were passed over: {head.flags:#x}")
@@ -187,7 +186,7 @@ def _file(planes: list[bytes], head: _Header, extensions: dict[int, bytes], wher
         warnings.append("harmonics beyond degree 3 were dropped")
     cloud = _cloud(planes, head, where)
     step = spacing_m(cloud.means, np.float16) if head.version == 1 else 2.0**-head.bits
-    return SplatFile(cloud, axes, f"extension {_AXES:#010x}", step, tuple(notes), tuple(warnings))
+    return SplatFile(cloud, axes, f"extension {_AXES:#010x}", step, notes, warnings)
 
 
 # -- values ----------------------------------------------------------------------------------------
@@ -237,5 +236,5 @@ def _cloud(planes: list[bytes], head: _Header, where: str) -> SplatCloud:
     sh = np.concatenate([dc, (rest.reshape(count, -1, 3)[:, :15].astype(np.float64) - 128) / 128], 1)
     opacity = opacities.astype(np.float64).clip(0.5, 254.5) / 255
     stated = (xyzw[:, [3, 0, 1, 2]], scales.reshape(-1, 3) / 16 - 10, logit(opacity), sh)
-    columns = [values.astype(np.float32) for values in stated]
-    return checked(SplatCloud(means, *columns, antialias=bool(head.flags & _ANTIALIAS)), where)
+    quats, logs, logits, sh = (values.astype(np.float32) for values in stated)
+    return checked(SplatCloud(means, quats, logs, logits, sh, antialias=bool(head.flags & _ANTIALIAS)), where)
