@@ -327,8 +327,8 @@ def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "def
         _refuse_unknown(methods, known, some=False)
         changes = {} if model_files.uses_renders(config.model) else {REPAIRED: {"model": ""}}
         titles = {LONGER: LONGER_TITLE, **{name: method.title for name, method in METHODS.items()}}
-        method = lambda name: OTHER_METHODS.get(name, name)
-        rows = [Row(n, f"{titles[n]} ({n})", method(n), changes=changes.get(n, {})) for n in methods]
+        named = [(name, OTHER_METHODS.get(name, name)) for name in methods]
+        rows = [Row(name, f"{titles[name]} ({name})", of, changes=changes.get(name, {})) for name, of in named]
     complete = []
     for row in rows:
         if METHODS[row.method].made_by == "render" and not row.left_out:

@@ -154,7 +154,7 @@ def against(logs: Sequence[Facts], a: str, b: str, place: str, metrics: str) -> 
         known = [None if any(isinstance(value, str) for value in pair) else tuple(map(float, pair)) for pair in pairs]
         both = [pair for pair in known if pair is not None]
 
-        def of(pairs: Sequence[tuple[float, float]], ratio: bool = metric in RATIOS) -> float | None:
+        def of(pairs: Sequence[tuple[float, ...]], ratio: bool = metric in RATIOS) -> float | None:
             first, second = (mean(side) for side in zip(*pairs, strict=True))
             if not ratio:
                 return first - second

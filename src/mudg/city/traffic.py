@@ -164,7 +164,7 @@ class TrafficPlanner(Draws):
             return posed(rec.TRUCK, (self.uniform(7.0, 15.0), 2.5, self.uniform(3.6, 4.0)), seed, paint, box)
         if kind < 0.65:
             steel, size = self.uniform(0.3, 0.6), (self.uniform(8.0, 13.0), 2.5, self.uniform(3.3, 3.7))
-            return posed(rec.TANKER, size, seed, paint, (steel,) * 3 if self.chance(0.6) else box)
+            return posed(rec.TANKER, size, seed, paint, (steel, steel, steel) if self.chance(0.6) else box)
         body = BUS_COLORS[int(self.rng.integers(5))]
         height = self.uniform(4.1, 4.4) if self.chance(0.35) else self.uniform(3.1, 3.5)
         return posed(rec.BUS, (self.uniform(10.5, 12), 2.5, height), seed, body, BUS_TRIM)
