@@ -33,7 +33,7 @@ from mudg.gaussians import fit
 from mudg.gaussians.densify import DensifyStats
 from mudg.gaussians.schedule import FiniteCheck
 from mudg.gaussians.settings import DensifyConfig, FitConfig
-from mudg.gaussians.views import StoredView, ViewSet
+from mudg.gaussians.views import TrainView, ViewSet
 from mudg.scene.settings import FuseConfig
 from mudg.steps.fit import Fit
 from mudg.steps.ingest import Fuse, Ingest
@@ -110,7 +110,7 @@ def instrument(clock: Clock) -> None:
     fit.rasterize = timed_rasterize
     torch.Tensor.backward = timed_backward
     ViewSet.choose = clock.wrapped("view loading", ViewSet.choose)
-    StoredView.as_tensors = clock.wrapped("view loading", StoredView.as_tensors)
+    TrainView.of = clock.wrapped("view loading", TrainView.of)
     DensifyStats.observe = clock.wrapped("densify", DensifyStats.observe)
 
 

@@ -38,7 +38,7 @@ from mudg.formats.settings import IngestConfig
 from mudg.gaussians import fit, views
 from mudg.gaussians import views as kept
 from mudg.gaussians.settings import FitConfig, VirtualConfig
-from mudg.gaussians.views import StoredView, ViewSet
+from mudg.gaussians.views import TrainView, ViewSet
 from mudg.scene.clouds import read_fused
 from mudg.scene.observations import ObservationSet, ObservationWriter, read_observations
 from mudg.scene.read import read_scene
@@ -151,7 +151,7 @@ def loaded(
 def step_times(first: int, last: int) -> Iterator[dict[str, list[float]]]:
     """Clocks in the loop: choosing views and making tensors of them (processor time of the thread), whole steps."""
     found: dict[str, list[float]] = {"choosing": [], "tensors": [], "step": []}
-    due, choose, tensors = fit.densify_if_due, ViewSet.choose, StoredView.as_tensors
+    due, choose, tensors = fit.densify_if_due, ViewSet.choose, TrainView.of
     began = [time.perf_counter()]
 
     def count(*given: Any) -> dict[str, Any]:
@@ -163,12 +163,12 @@ def step_times(first: int, last: int) -> Iterator[dict[str, list[float]]]:
 
     fit.densify_if_due = count
     ViewSet.choose = timed(choose, found["choosing"], time.thread_time)
-    StoredView.as_tensors = timed(tensors, found["tensors"], time.thread_time)
+    TrainView.of = timed(tensors, found["tensors"], time.thread_time)
     try:
         yield found
     finally:
         fit.densify_if_due = due
-        ViewSet.choose, StoredView.as_tensors = choose, tensors
+        ViewSet.choose, TrainView.of = choose, tensors
     for name in found:
         found[name] = found[name][first:]
 

@@ -37,7 +37,7 @@ from mudg.base.weather_settings import (
 from mudg.city.config import CityConfig
 from mudg.city.world import CityTruth, CityWorld
 from mudg.core import weather
-from mudg.core.weather import air, ground
+from mudg.core.weather import air
 from mudg.core.weather import light as relight
 from mudg.core.weather.gbuffer import (
     GBuffer,
@@ -217,7 +217,7 @@ def score_wet(case: Case) -> Result:
     config = replace(case.world.config, wet=1.0, puddles=0.35)
     truth = CityWorld(config).render(case.view)
     where = np.isin(truth.semantics, WET_IDS)
-    light = ground.wet_ground(case.gbuffer(), case.view, case.light.surroundings, 1.0, 0.35, config.seed)
+    light = relight.wet_ground(case.gbuffer(), case.view, case.light.surroundings, 1.0, 0.35, config.seed)
     shown = case.light.response.encode(light)
     lines = [
         f"{name} {psnr(rgb, truth.rgb, where):.1f}" for name, rgb in (("unedited", case.truth.rgb), ("wet", shown))
@@ -237,10 +237,10 @@ def score_snow(case: Case, cover: float = 0.7) -> Result:
     estimated = replace(estimated, sunlit=sun_visibility(estimated, case.view, heights, around.sun_direction))
     lines = [f"unedited {psnr(case.truth.rgb, truth.rgb, solid):.1f}", f"covered {lies.mean():.2f}"]
     for label, gbuffer in (("exact surfaces", case.exact()), ("height map", estimated)):
-        found = ground.snow_cover(gbuffer, case.view, cover, config.seed)
+        found = relight.snow_cover(gbuffer, case.view, cover, config.seed)
         iou = ((found > 0.5) & lies).sum() / max(((found > 0.5) | lies).sum(), 1)
         sunlit = relight.sunlit_of(gbuffer, around)
-        light = gbuffer.color + (ground.snow_light(gbuffer, around, sunlit) - gbuffer.color) * found[..., None]
+        light = gbuffer.color + (relight.snow_light(gbuffer, around, sunlit) - gbuffer.color) * found[..., None]
         shown = own.encode(light)
         lines.append(f"{label}: IoU {iou:.3f}, PSNR {psnr(shown, truth.rgb, solid):.1f}")
     return Result(lines, shown, truth.rgb)

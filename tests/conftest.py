@@ -85,6 +85,32 @@ def street_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.fixture(params=["avx512", "avx2", "portable"])
+def isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Every instruction set of the native library that can run here, one after the other."""
+    from mudg import native
+    from mudg.base.errors import ResourceError, UsageError
+
+    try:
+        native.set_isa(request.param)
+    except (UsageError, ResourceError) as error:
+        pytest.skip(str(error))
+    yield request.param
+    native.set_isa("")
+
+
+@pytest.fixture
+def set_threads() -> Iterator[Callable[[int], None]]:
+    """Sets the threads of the native library, until the test ends; skips the test where there is no library."""
+    from mudg import native
+
+    if native.library() is None:
+        pytest.skip(native.status())
+    before = native.threads()
+    yield native.set_threads
+    native.set_threads(before)
+
+
 @pytest.fixture(autouse=True, scope="session")
 def _no_network() -> Iterator[None]:
     """Refuse every connection except to this machine."""

@@ -5,18 +5,21 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import signal
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from mudg.base import store
+from mudg.base.errors import MudgError
 
 Act = Callable[[int, str], None]
 """What happens at a point: it gets the point's number, from 1 on, and its name."""
@@ -71,24 +74,19 @@ def failing(number: int, code: int = errno.ENOSPC) -> Act:
     return act
 
 
-def killed(number: int) -> Act:
-    """The process is killed before the operation of this number."""
+def killed(number: int, how: int = signal.SIGKILL) -> Act:
+    """The process is killed before the operation of this number (or gets another signal)."""
 
     def act(count: int, _name: str) -> None:
         if count == number:
-            os.kill(os.getpid(), signal.SIGKILL)
+            os.kill(os.getpid(), how)
 
     return act
 
 
 def terminated(number: int) -> Act:
     """The process is asked to stop (SIGTERM) before the operation of this number."""
-
-    def act(count: int, _name: str) -> None:
-        if count == number:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    return act
+    return killed(number, signal.SIGTERM)
 
 
 def in_child(work: Callable[[], Any], act: Act, root: Path) -> int:
@@ -105,14 +103,54 @@ def in_child(work: Callable[[], Any], act: Act, root: Path) -> int:
             with points(act, root):
                 work()
             code = 0
-        except OSError:
-            code = 3
         finally:
             if code == 1:
                 traceback.print_exc()  # pytest does not see what ended the child
             os._exit(code)
     _, status = os.waitpid(child, 0)
     return os.waitstatus_to_exitcode(status)
+
+
+def counted(work: Callable[[Path], Any], place: Path) -> list[str]:
+    """Do the work in a new folder; returns its operations on the disk."""
+    place.mkdir(exist_ok=True)
+    with points(lambda *_: None, place) as found:
+        work(place)
+    return found
+
+
+def sweep(
+    work: Callable[[Path], Any],
+    root: Path,
+    stop: Callable[[int], Act],
+    chosen: Callable[[list[str]], Iterable[int]],
+    begun: Callable[[Path], object] = Path.mkdir,
+) -> Iterator[tuple[Path, Any, str]]:
+    """Stop the work in a folder, each time a new one that ``begun`` makes, at the chosen numbers of its operations on
+    the disk. Yields the folder, for the work to be repeated there, its exit status (of a full disk, its error or what
+    it returned), and the operation. Nothing temporary may be in the folder then, and it goes."""
+    begun(root / "counted")
+    operations = counted(work, root / "counted")
+    for number in chosen(operations):
+        place, act = root / f"stop{number}", stop(number)
+        begun(place)
+        if stop in (killed, terminated):
+            end: Any = in_child(partial(work, place), act, place)
+            assert end == -9 if stop is killed else end in (0, 1), number  # asked at the very end, it finishes
+        else:
+            try:
+                with points(act, place):
+                    end = work(place)
+            except (MudgError, OSError) as error:
+                end = error
+        yield place, end, operations[number - 1]
+        assert not [path for path in place.rglob("*") if ".part" in path.name], operations[number - 1]
+        shutil.rmtree(place)
+
+
+def every(step: int) -> Callable[[list[str]], Iterable[int]]:
+    """Each so many-th operation."""
+    return lambda operations: range(1, len(operations) + 1, step)
 
 
 def contents(folder: Path) -> dict[str, bytes]:

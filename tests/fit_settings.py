@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -10,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from toy_world import fused_cloud, truth, write_scene
+from toy_world import camera, fused_cloud, truth, view_at, write_scene
 
 from mudg.base import config as configuration
 from mudg.base.types import FusedCloud, Scene
-from mudg.core import trajectory
+from mudg.core import metrics, trajectory
+from mudg.core.raster.rasterize import RasterConfig
 from mudg.gaussians import fit
 from mudg.gaussians.settings import FitConfig
 from mudg.scene.clouds import write_fused
@@ -63,6 +65,19 @@ def written_clouds_and_views(
             for view in path.views:
                 writer.add(truth(view.resized(30, 20)))
     return {name: root / name for name in ("scene", "fuse", "virtual")}
+
+
+def mean_psnr(folder: Path, size: tuple[int, int], left_m: float = 0.0) -> float:
+    """How near the renders of a fitted street are to the exact pictures, on its path or beside it."""
+    model, cam = fit.load_model(folder), camera(width=size[0], height=size[1])
+    views = [view_at(time_s, cam, left_m=left_m) for time_s in (0.3, 0.9)]
+    drawn = [(fit.render_view(model, view, RasterConfig()).rgb, truth(view).rgb) for view in views]
+    return sum(metrics.psnr(*pair) for pair in drawn) / len(views)
+
+
+def log_lines(folder: Path) -> list[dict[str, Any]]:
+    """What a run noted of its steps."""
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
 
 
 def fitted_bytes(folder: Path) -> dict[str, bytes]:

@@ -12,6 +12,7 @@ import traceback
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import torch
 from torch.utils import _pytree as pytree
@@ -26,41 +27,20 @@ PACKAGE = f"{Path(devices.__file__).parents[1]}{os.sep}"
 _LIBRARIES: list[torch.library.Library] = []
 
 
-class _Backend:
-    """What `torch.pretend` is asked for."""
-
-    def is_available(self) -> bool:
-        return True
-
-    def is_initialized(self) -> bool:
-        return True
-
-    def _lazy_init(self) -> None:
-        pass
-
-    def device_count(self) -> int:
-        return 1
-
-    def current_device(self) -> int:
-        return 0
-
-    def synchronize(self, device: object = None) -> None:
-        pass
-
-    def manual_seed_all(self, seed: int) -> None:
-        pass
-
-    def get_rng_state(self, device: object = None) -> torch.Tensor:
-        return torch.zeros(0, dtype=torch.uint8)
-
-    def set_rng_state(self, state: torch.Tensor, device: object = None) -> None:
-        pass
-
-    def _is_in_bad_fork(self) -> bool:
-        return False
-
-    def get_amp_supported_dtype(self) -> list[torch.dtype]:
-        return [torch.bfloat16, torch.float16]
+_BACKEND = SimpleNamespace(
+    is_available=lambda: True,
+    is_initialized=lambda: True,
+    _lazy_init=lambda: None,
+    device_count=lambda: 1,
+    current_device=lambda: 0,
+    synchronize=lambda device=None: None,
+    manual_seed_all=lambda seed: None,
+    get_rng_state=lambda device=None: torch.zeros(0, dtype=torch.uint8),
+    set_rng_state=lambda state, device=None: None,
+    _is_in_bad_fork=lambda: False,
+    get_amp_supported_dtype=lambda: [torch.bfloat16, torch.float16],
+)
+"""What `torch.pretend` is asked for."""
 
 
 def _register() -> None:
@@ -68,7 +48,7 @@ def _register() -> None:
     from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
 
     if torch._C._get_privateuse1_backend_name() != NAME:
-        _setup_privateuseone_for_python_backend(NAME, backend_module=_Backend())
+        _setup_privateuseone_for_python_backend(NAME, backend_module=_BACKEND)
         _LIBRARIES.append(torch.library.Library("_", "IMPL", "AutocastPrivateUse1"))
         _LIBRARIES[-1].fallback(torch.library.fallthrough_kernel)
 
@@ -182,12 +162,8 @@ def run(func, args, kwargs):
         _note_transfer("back", 1)
     elif there and (name in WAITS or (name == "aten::index" and any(x.dtype == torch.bool for x in leaves[1:]))):
         _note_transfer("wait", 0)
-    if (
-        "generator" in kwargs
-        and kwargs["generator"] is not None
-        and to_there
-        and kwargs["generator"].device.type == "cpu"
-    ):
+    generator = kwargs.get("generator")
+    if to_there and generator is not None and generator.device.type == "cpu":
         raise RuntimeError(f"{name}: expected a generator of {DEVICE}, found one of cpu")
     if kwargs.get("pin_memory"):
         kwargs = {**kwargs, "pin_memory": False}

@@ -95,7 +95,7 @@ KITTI: dict[str, tuple[str, str, Callable[[Path], object]]] = {
         rewriting("calib.txt", lambda t: t[: t.index("Tr_velo")]),
     ),
     "zero focal length": (
-        "focal length",
+        "pinhole camera",
         "P2",
         rewriting("calib.txt", lambda t: t.replace(FIRST_P2, "0 " + FIRST_P2.split(" ", 1)[1])),
     ),
@@ -104,7 +104,7 @@ KITTI: dict[str, tuple[str, str, Callable[[Path], object]]] = {
         "R0_rect",
         rewriting("calib.txt", lambda t: t.replace(made.numbers(np.eye(3)), made.numbers(2 * np.eye(3)))),
     ),
-    "label columns": ("number of columns", "label_02.txt: line 3", third_line(LABELS, lambda w: w[:-3])),
+    "label columns": ("number of values", "label_02.txt: line 3", third_line(LABELS, lambda w: w[:-3])),
     "label text": ("not a number", "label_02.txt: line 3", third_line(LABELS, lambda w: [*w[:-1], "left"])),
     "label NaN": ("not finite", "label_02.txt: line 3", third_line(LABELS, lambda w: [*w[:-1], "nan"])),
     "flat box": ("makes no sense", "label_02.txt: line 3", third_line(LABELS, lambda w: [*w[:10], "0", *w[11:]])),

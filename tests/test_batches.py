@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import socket
@@ -21,7 +22,7 @@ from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.fleet import engines, work
 from mudg.fleet import records as status
 from mudg.fleet.engines import LocalRun
-from mudg.fleet.plan import Entry, command_of, parse_shard, plan_of, read_list, shard_of
+from mudg.fleet.plan import Entry, parse_shard, plan_of, read_list, shard_of
 from mudg.fleet.records import BatchFolder, Ended, this_host
 from mudg.fleet.settings import BatchConfig
 from mudg.fleet.work import Job, Stop, last_words, run_step
@@ -42,10 +43,10 @@ LINES = stage_lines()
 class Scenes:
     """A list of scenes, a step, and what is to happen to single ones."""
 
-    def __init__(self, folder: Path, count: int = 3) -> None:
+    def __init__(self, folder: Path, count: int = 3, step: str = STEP) -> None:
         self.folder, self.tally = folder, folder / "tally"
         self.tally.mkdir(parents=True, exist_ok=True)
-        (folder / "step.sh").write_text(STEP)
+        (folder / "step.sh").write_text(step)
         self.entries = [Entry(f"s{number}", f"/logs/{number}") for number in range(count)]
         self.command = ("sh", str(folder / "step.sh"), "{name}", "{out}", str(self.tally))
         self.plan = plan_of((), {}, {}, self.command)
@@ -74,6 +75,10 @@ class Scenes:
     def words(self, *more: str) -> list[str]:
         first = f"batch run --list {self.folder}/list.txt --out {self.batch.out} --quiet".split()
         return [*first, *more, "--command", *self.command]
+
+    def start(self, *more: str, **environment: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "mudg", *self.words(*more)]
+        return subprocess.Popen(command, env={**os.environ, **environment})
 
 
 @pytest.fixture(autouse=True)
@@ -131,7 +136,7 @@ def test_settings_of_a_line_are_those_of_ingest_also_in_the_chain() -> None:
     ingest, fuse = plan_of(("ingest", "fuse"), LINES, values).units(entry)
     (chain,) = plan_of(("run",), LINES, values).units(entry)
     places = {"source": "city", "ingest": "i"}
-    flags = {unit.stage.name: command_of(unit, places, "o", "") for unit in (ingest, fuse, chain)}
+    flags = {unit.stage.name: unit.command(places, "o", "") for unit in (ingest, fuse, chain)}
     assert flags["ingest"][-5:] == ["--frames=0:5", "--cameras", "front", "left", "--city.seed=7"]
     assert flags["run"][-5:] == ["--ingest.frames=0:5", "--ingest.cameras", "front", "left", "--ingest.city.seed=7"]
     assert flags["fuse"][-1] == "--quiet"
@@ -381,7 +386,7 @@ open(os.path.join(out, "whole"), "w").write("whole")
 def start(made: Scenes) -> subprocess.Popen[bytes]:
     made.command = (sys.executable, str(made.folder / "step.py"), "{out}", str(made.folder / "up"))
     (made.folder / "step.py").write_text(CHECKPOINTS)
-    process = subprocess.Popen([sys.executable, "-m", "mudg", *made.words("--jobs", "1")])
+    process = made.start("--jobs", "1")
     wait_for((made.folder / "up").exists)
     return process
 

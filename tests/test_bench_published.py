@@ -19,10 +19,10 @@ from mudg.benchmarks.rows import LONGER, RECORDED, TABLES, method_fit, method_ro
 from mudg.benchmarks.settings import BenchConfig, bench_preset
 from mudg.city.config import CityConfig
 from mudg.diffusion import model_files
-from mudg.diffusion.condition import ConditionRules
+from mudg.diffusion.condition import ConditionRules, DriveInputs
 from mudg.diffusion.published_network import VideoUNet
 from mudg.diffusion.settings import SynthesizeConfig
-from mudg.diffusion.views import ConditionSources, conditions_of, recorded_images
+from mudg.diffusion.views import conditions_of, recorded_images
 from mudg.formats import ingest
 from mudg.formats.settings import IngestConfig
 from mudg.gaussians.settings import FitConfig
@@ -225,7 +225,7 @@ def sources(scene, tmp_path_factory):
     loaded = read_scene(scene)
     cloud = read_fused(Fuse(scene=scene, out=tmp_path_factory.mktemp("cloud") / "fuse", settings=FuseConfig()).run())
     photos = recorded_images(loaded, SynthesizeConfig())
-    given = ConditionSources(cloud, loaded.tracks, photos, ConditionRules(32, 32, 64, 48, published=True))
+    given = DriveInputs(cloud, loaded.tracks, photos)
     dark = dataclasses.replace(cloud.static, rgb=255 - np.asarray(cloud.static.rgb), xyz=cloud.static.xyz * 1.1)
     other_points = dataclasses.replace(given, cloud=dataclasses.replace(cloud, static=dark))
     negatives = [dataclasses.replace(photo, rgb=255 - photo.rgb) for photo in photos]
@@ -248,7 +248,7 @@ def test_a_part_that_is_switched_off_does_not_reach_a_published_type_network(
     views, *all_sources = sources
 
     def latents(given):
-        condition = conditions_of(given, parts, views, {})[0]
+        condition = conditions_of(given, parts, views, ConditionRules(32, 32, 64, 48, published=True), {})[0]
         return model.encode_condition(condition, torch.Generator().manual_seed(0))
 
     usual, other_points, other_images = map(latents, all_sources)

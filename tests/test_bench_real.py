@@ -10,9 +10,8 @@ import write_custom
 from tiny_networks import saved_mdm
 
 from mudg.base import store
-from mudg.base.camera_colors import ColorMap
 from mudg.base.errors import InputError, UsageError
-from mudg.base.types import Camera, Observation, SweepPoints, View
+from mudg.base.types import Camera, ColorMap, Observation, SweepPoints, View
 from mudg.benchmarks import columns, places, real
 from mudg.benchmarks.chain import FillViews
 from mudg.benchmarks.places import PROTOCOLS, SPLITS

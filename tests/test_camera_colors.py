@@ -9,11 +9,10 @@ import torch
 from fit_settings import fit_config
 
 from mudg.base import config as configuration
-from mudg.base.camera_colors import SAME_COLORS, CameraColors, ColorMap
-from mudg.base.types import Photo
+from mudg.base.types import SAME_COLORS, CameraColors, ColorMap, Photo
 from mudg.core.calibration import match_cameras
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.diffusion.condition import ConditionRules, build_conditions
+from mudg.diffusion.condition import ConditionRules, DriveInputs, build_conditions
 from mudg.formats.settings import IngestConfig
 from mudg.gaussians import fit
 from mudg.gaussians.rendering import render_view
@@ -138,7 +137,7 @@ def test_images_warped_from_another_camera_take_the_colors_of_the_view(city):
         (scenes[1], fused_of(city[1], "unmatched")),
     ):
         photos = [Photo(f.view, read_image(scene, f)) for f in scene.frames_of("front_left")]
-        condition, _ = build_conditions(cloud, scene.tracks, [view], photos, ConditionRules(80, 48))
+        condition, _ = build_conditions(DriveInputs(cloud, scene.tracks, photos), [view], ConditionRules(80, 48))
         assert condition.warped.float().mean() > 0.05
         shown.append(condition)
     off = [float((c.color - shown[0].color)[0][:, shown[0].warped[0, 0]].abs().mean()) for c in shown[1:]]

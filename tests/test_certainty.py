@@ -21,7 +21,7 @@ from mudg.gaussians.model import SceneModel, compose
 from mudg.gaussians.nodes import RigidNode, SkyNode, StaticNode
 from mudg.gaussians.rendering import render_condition
 from mudg.gaussians.trust import COLOR_ERROR, DEPTH_ERROR, certainty_of, difference_images, weight_sums
-from mudg.gaussians.views import LidarPixels, StoredView
+from mudg.gaussians.views import LidarPixels, StoredView, TrainView
 from mudg.scene.clouds import write_fused
 from mudg.steps.fit import Fit
 
@@ -79,7 +79,7 @@ def in_double(gaussians: Gaussians) -> Gaussians:
 def test_sums_are_those_of_every_gaussians_weight_in_double_precision():
     """With one feature per Gaussian that is 1 for itself and 0 else, a rendered feature is a Gaussian's weight at every
     pixel."""
-    model, view = tiny_model(), photograph().as_tensors()
+    model, view = tiny_model(), TrainView.of(photograph(), torch.device("cpu"))
     gaussians = compose(model, view.view.time_s, semantics=False)
     alone = replace(in_double(gaussians), extra=torch.eye(ROWS, dtype=torch.float64))
     weights = rasterize(alone, view.view, RasterConfig(backend="torch", near_m=0.2)).extra
@@ -93,7 +93,7 @@ def test_sums_are_those_of_every_gaussians_weight_in_double_precision():
 
 
 def test_images_of_differences():
-    model, view = tiny_model(), photograph().as_tensors()
+    model, view = tiny_model(), TrainView.of(photograph(), torch.device("cpu"))
     with torch.no_grad():
         render = rasterize(compose(model, 0.0, semantics=False), view.view, RASTER)
     used, color, lidar, depth = difference_images(model, render, view, UNCORRECTED)

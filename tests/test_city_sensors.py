@@ -197,14 +197,14 @@ def test_the_image_of_a_view_fits_it_and_the_truth_is_exact(small: CityConfig) -
     )
     log = record_with_faults(small, sensors, range(4), 77)
     view = log.world.frame_views("front")[2]
-    claimed = log.claimed(view)
+    claimed = city_clips.claimed_view(log.world, log.errors, view)
     moved = np.linalg.norm(claimed.center_world - view.center_world)
     assert 0.001 < moved < 0.5
     assert np.allclose(log.recorded[2].view.world_from_cam, claimed.world_from_cam)
     assert np.array_equal(log.truth(view).rgb_u8, log.recorded[2].rgb)  # no noise or blur was asked for
     assert np.array_equal(log.truth(view).depth, log.world.render(view).depth)
     sideways = city_clips.shifted_view(log.world, view, 1.0)
-    step = log.claimed(sideways).center_world - claimed.center_world
+    step = city_clips.claimed_view(log.world, log.errors, sideways).center_world - claimed.center_world
     assert np.linalg.norm(step) == pytest.approx(1.0, abs=1e-9)
 
 

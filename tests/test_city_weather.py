@@ -16,7 +16,7 @@ from mudg.city.config import CityConfig
 from mudg.city.light import LAMP_POWER, weather_numbers
 from mudg.city.world import CityWorld
 from mudg.core.weather import air as fog
-from mudg.core.weather import ground
+from mudg.core.weather import light as relight
 from mudg.core.weather.gbuffer import euclidean_range, world_points
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="the city needs the native library")
@@ -72,14 +72,14 @@ def test_snow_lies_where_the_rule_says() -> None:
     at = world.frame_views("front")[1]
     truth, surfaces = world.render(at), city_camera.surfaces(world, at)
     solid = ~truth.sky & ~np.isin(truth.semantics, (ID["person"], ID["rider"], ID["vegetation"]))
-    expected = ground.snow_weight(
+    expected = relight.snow_weight(
         world_points(at, truth.depth)[solid], surfaces.normal[solid], surfaces.openness[solid], 0.6, CLEAR.seed
     )
     assert (np.abs(surfaces.snow[solid] - expected) < 0.02).mean() > 0.99
     road = (truth.semantics == ID["road"]) & (surfaces.openness == 1)
     assert 0.2 < (surfaces.snow[road] > 0.5).mean() < 1
     white = road & (surfaces.snow > 0.99)
-    np.testing.assert_allclose(surfaces.albedo[white], np.broadcast_to(ground.SNOW_COLOR, (white.sum(), 3)), atol=0.01)
+    np.testing.assert_allclose(surfaces.albedo[white], np.broadcast_to(relight.SNOW_COLOR, (white.sum(), 3)), atol=0.01)
 
 
 def test_wet_ground_is_where_the_rule_says_and_nothing_else_changes(clear: CityWorld, view: View) -> None:
@@ -89,11 +89,11 @@ def test_wet_ground_is_where_the_rule_says_and_nothing_else_changes(clear: CityW
     elsewhere = ~np.isin(dry.semantics, WET_IDS)
     np.testing.assert_array_equal(dry.rgb[elsewhere], wet.rgb[elsewhere])
     level = np.isin(dry.semantics, WET_IDS) & (surfaces.normal[..., 2] > 0.8)
-    expected = ground.puddle_mask(world_points(view, dry.depth)[level][:, :2], 0.4, CLEAR.seed)
+    expected = relight.puddle_mask(world_points(view, dry.depth)[level][:, :2], 0.4, CLEAR.seed)
     assert (np.abs(surfaces.water[level] - expected) < 0.1).mean() > 0.98
     film = level & (surfaces.water == 0)
     np.testing.assert_allclose(
-        surfaces.albedo[film], ground.WET_DARKENING * city_camera.surfaces(clear, view).albedo[film], rtol=1e-4
+        surfaces.albedo[film], relight.WET_DARKENING * city_camera.surfaces(clear, view).albedo[film], rtol=1e-4
     )
 
 

@@ -5,16 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from toy_clips import some_clip
 
 from mudg import native
 from mudg.base.errors import InputError
-from mudg.base.types import Camera, Clip, Condition, FusedCloud, Photo, PointCloud, Track, View
+from mudg.base.types import Camera, FusedCloud, Photo, PointCloud, Track, View
 from mudg.core import project as visible
 from mudg.diffusion import city_clips, clips
 from mudg.diffusion import condition as conditions
 from mudg.diffusion.city_clips import HELD_OUT, CityClipRules, shifts_of
-from mudg.diffusion.condition import ConditionRules, WarpSource, build_conditions
-from mudg.diffusion.views import ConditionSources, conditions_of
+from mudg.diffusion.condition import ConditionRules, DriveInputs, WarpSource, build_conditions
+from mudg.diffusion.views import conditions_of
 
 CAMERA = Camera("front", 48, 32, 40.0, 40.0, 24.0, 16.0)
 RULES = ConditionRules(48, 32, occluder_m=0.0)
@@ -54,7 +55,7 @@ def test_warp_of_a_plane_is_exact_and_moves_left_when_the_camera_does():
     recorded, target = view_at(), view_at(y=1.5)
     image, depth = conditions.image_tensor(image_of_wall(recorded, 10.0)), torch.full((32, 48), 10.0)
     source = WarpSource(recorded, image, depth, depth < 0, torch.zeros(32, 48, dtype=torch.uint8))
-    rgb, _, found = conditions.warp(target, torch.full((32, 48), 10.0), source, source.depth, 0.08)
+    rgb, _, found = source.warped(target, torch.full((32, 48), 10.0), source.depth, 0.08)
     truth = conditions.image_tensor(image_of_wall(target, 10.0))
     assert float(found.float().mean()) > 0.85
     assert float((rgb - truth).abs()[:, found].max()) < 0.01
@@ -65,11 +66,10 @@ def test_warp_of_a_plane_is_exact_and_moves_left_when_the_camera_does():
 
 def test_hidden_pixels_are_not_taken():
     recorded, target = view_at(), view_at(y=1.0)
-    rgb = torch.zeros(3, 32, 48)
     surface = torch.full((32, 48), 10.0)
     surface[:, 20:28] = 4.0  # something near stands there in the recorded image
-    source = WarpSource(recorded, rgb, surface, surface < 0, torch.zeros(32, 48, dtype=torch.uint8))
-    _, _, found = conditions.warp(target, torch.full((32, 48), 10.0), source, surface, 0.08)
+    source = WarpSource(recorded, torch.zeros(3, 32, 48), surface, surface < 0, torch.zeros(32, 48, dtype=torch.uint8))
+    _, _, found = source.warped(target, torch.full((32, 48), 10.0), surface, 0.08)
     x, _, _ = conditions.carry(target, torch.full((1, 32, 48), 10.0), recorded)
     behind = (x[0] > 20.5) & (x[0] < 27.5)
     assert bool(behind.any())
@@ -77,8 +77,7 @@ def test_hidden_pixels_are_not_taken():
 
 
 def test_shine_through_is_removed_and_edges_stay():
-    depth = np.full((20, 20), 5.0, np.float32)
-    valid = np.ones((20, 20), bool)
+    depth, valid = np.full((20, 20), 5.0, np.float32), np.ones((20, 20), bool)
     depth[10, 10] = 30.0  # a far point seen through a near wall
     depth[:, :6] = 30.0  # an ordinary edge: far on one side only
     kept = visible.seen_pixels(depth, valid, visible.RULES["condition"])
@@ -91,7 +90,7 @@ def test_condition_of_a_wall():
     cloud = FusedCloud(wall(12.0, stripes, z_range=(-9, 1)), {})
     recorded = [Photo(view_at(time_s=t), image_of_wall(view_at(), 12.0)) for t in (0.0, 0.1)]
     target = view_at(y=2.0, time_s=0.1)
-    condition = build_conditions(cloud, [], [target], recorded, RULES)[0]
+    condition = build_conditions(DriveInputs(cloud, [], recorded), [target], RULES)[0]
     valid = condition.valid[0, 0]
     assert condition.color.shape == (1, 3, 32, 48)
     assert bool(valid[-8:].all())
@@ -108,10 +107,10 @@ def test_condition_of_a_wall():
 def test_the_backdrop_and_the_published_condition():
     cloud = FusedCloud(wall(12.0, stripes), {})
     recorded = [Photo(view_at(), image_of_wall(view_at(), 12.0))]
-    condition = build_conditions(cloud, [], [view_at()], recorded, RULES)[0]
+    condition = build_conditions(DriveInputs(cloud, [], recorded), [view_at()], RULES)[0]
     assert torch.allclose(condition.backdrop[0], conditions.image_tensor(recorded[0].rgb), atol=1e-5)
     cloud = FusedCloud(wall(12.0, stripes, z_range=(-9, 1)), {})
-    condition = build_conditions(cloud, [], [view_at(y=1.0)], recorded, replace(RULES, published=True))[0]
+    condition = build_conditions(DriveInputs(cloud, [], recorded), [view_at(y=1.0)], replace(RULES, published=True))[0]
     hole = ~condition.valid
     assert bool(hole.any())
     assert float(condition.depth[hole].abs().max()) == 0
@@ -125,9 +124,9 @@ def test_parts_of_a_condition_are_switched_off(fine):
     recorded = [Photo(view_at(time_s=t), image_of_wall(view_at(), 12.0)) for t in (0.0, 0.1)]
     rules = replace(RULES, fine_width=48 * fine, fine_height=32 * fine)
     views = [view_at(y=2.0, time_s=0.1)]
-    given = ConditionSources(cloud, (), recorded, rules)
+    given = DriveInputs(cloud, (), recorded)
     full, points, reference, concat = (
-        conditions_of(given, parts, views, {}) for parts in ("full", "points", "reference", "concat")
+        conditions_of(given, parts, views, rules, {}) for parts in ("full", "points", "reference", "concat")
     )
     for grid in (0, 1):
         whole, bare, image, both = full[grid], points[grid], reference[grid], concat[grid]
@@ -137,7 +136,7 @@ def test_parts_of_a_condition_are_switched_off(fine):
         assert torch.equal(both.color, bare.color) and torch.equal(both.depth, bare.depth)
         assert torch.equal(both.backdrop, whole.backdrop) and torch.equal(image.color, whole.backdrop)
         assert not bool(image.valid.any()) and bool((image.depth == conditions.FAR_M).all())
-    assert torch.equal(full[0].color, build_conditions(cloud, [], views, recorded, rules)[0].color)
+    assert torch.equal(full[0].color, build_conditions(DriveInputs(cloud, [], recorded), views, rules)[0].color)
 
 
 def test_moving_things_take_no_colour_from_another_time():
@@ -154,65 +153,36 @@ def test_moving_things_take_no_colour_from_another_time():
     old, fresh = Photo(view_at(time_s=0.0), red), Photo(view_at(time_s=1.0), red)
     target = view_at(time_s=1.0)
     car = (slice(14, 18), slice(22, 26))
-    held = build_conditions(cloud, [track], [target], [old], RULES)[0]
+    held = build_conditions(DriveInputs(cloud, [track], [old]), [target], RULES)[0]
     assert torch.equal(held.color[0][:, car[0], car[1]].amax((1, 2)), torch.tensor([0.0, 1.0, 0.0]))
     assert not bool(held.warped[0, 0][car].any())
-    now = build_conditions(cloud, [track], [target], [fresh], RULES)[0]
+    now = build_conditions(DriveInputs(cloud, [track], [fresh]), [target], RULES)[0]
     assert torch.allclose(now.color[0][:, car[0], car[1]].amax((1, 2)), torch.tensor([1.0, 0.0, 0.0]), atol=1e-5)
-
-
-def test_nothing_in_view_gives_a_far_grey_nothing_not_an_error():
-    cloud = FusedCloud(PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), "world"), {})
-    condition = build_conditions(cloud, [], [view_at()], [], RULES)[0]
-    assert not bool(condition.valid.any())
-    assert float(condition.depth.min()) == conditions.FAR_M
-    with pytest.raises(InputError):
-        build_conditions(cloud, [], [], [], RULES)[0]
 
 
 def test_sizes_follow_the_rules_and_a_fine_grid_gives_cleaner_colour():
     cloud = FusedCloud(wall(12.0, stripes), {})
     big = Camera("front", 96, 64, 80.0, 80.0, 48.0, 32.0)
     recorded = [Photo(view_at(camera=big), image_of_wall(view_at(camera=big), 12.0))]
-    condition = build_conditions(cloud, [], [view_at(y=0.5, camera=big)], recorded, RULES)[0]
+    condition = build_conditions(DriveInputs(cloud, [], recorded), [view_at(y=0.5, camera=big)], RULES)[0]
     assert condition.views[0].camera.width == 48
     truth = conditions.image_tensor(image_of_wall(view_at(y=0.5), 12.0))
     warped = condition.warped[0, 0]
     assert float((condition.color[0] - truth).abs()[:, warped].mean()) < 0.02
-    target = view_at(y=0.5, camera=big)
-    plain = build_conditions(cloud, [], [target], recorded, RULES)[0]
-    small, fine = build_conditions(cloud, [], [target], recorded, replace(RULES, fine_width=96, fine_height=64))
+    drive, target, plain = DriveInputs(cloud, [], recorded), view_at(y=0.5, camera=big), condition
+    small, fine = build_conditions(drive, [target], replace(RULES, fine_width=96, fine_height=64))
     assert fine.color.shape[-2:] == (64, 96)
     assert small.color.shape == plain.color.shape
     assert torch.equal(small.depth, plain.depth)
     assert torch.equal(small.valid, plain.valid)
-    truth = conditions.image_tensor(image_of_wall(target, 12.0))
-    truth = torch.nn.functional.interpolate(truth[None], size=(32, 48), mode="area")[0]
+    large = conditions.image_tensor(image_of_wall(target, 12.0))
+    truth = torch.nn.functional.interpolate(large[None], size=(32, 48), mode="area")[0]
     both = plain.warped[0, 0] & small.warped[0, 0]
     error = [float((c.color[0] - truth).abs()[:, both].mean()) for c in (small, plain)]
     assert error[0] <= error[1] + 1e-4
 
 
 # training clips -----------------------------------------------------------------------------------
-
-
-def some_clip(frames=3, height=16, width=24):
-    generator = torch.Generator().manual_seed(0)
-    draw = lambda *shape: torch.rand(*shape, generator=generator)
-    camera = Camera("front", width, height, 20.0, 20.0, width / 2, height / 2)
-    condition = Condition(
-        tuple(View(camera, np.eye(4), 0.1 * t) for t in range(frames)),
-        draw(frames, 3, height, width),
-        50 * draw(frames, 1, height, width),
-        draw(frames, 1, height, width) > 0.5,
-        draw(3, height, width),
-        draw(frames, 1, height, width) > 0.5,
-        draw(frames, 3, height, width),
-    )
-    depth = 80 * draw(frames, 1, height, width)
-    return Clip(
-        condition, draw(frames, 3, height, width), depth, depth > 5, torch.randint(0, 19, (frames, height, width))
-    )
 
 
 def test_shards_give_back_what_was_packed_and_a_missing_one_is_named(tmp_path):

@@ -43,21 +43,6 @@ def test_no_number_of_any_verb_may_be_nan_or_infinite(tmp_path: Path, number: st
         config.load(RenderConfig, None, tmp_path / "c.yaml")
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("inner: {iterations: 0}", "iterations"),
-        ("inner: {iterations: many}", "iterations"),
-        ("seed: [1]", "seed"),
-        ("inner: {itertions: 20}", r"inner\.iterations"),
-    ],
-)
-def test_wrong_values_and_unknown_keys_name_the_field(tmp_path: Path, text: str, said: str) -> None:
-    (tmp_path / "c.yaml").write_text(text)
-    with pytest.raises(UsageError, match=said):
-        config.load(Outer, None, tmp_path / "c.yaml")
-
-
 @config.settings
 class Wheels:
     kind: str = "steel"

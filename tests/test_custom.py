@@ -246,4 +246,4 @@ def test_the_example_of_the_documentation_is_a_log(repository: Path, tmp_path: P
     assert (len(log.images), len(log.sweeps), len(log.tracks)) == (2, 1, 1)
     assert log.images[1].time_s == 0.1 and log.sweeps[0].time_s == 0.05
     assert np.allclose(log.tracks[0].world_from_object[1, :3, 3], [16.2, 3.5, 0.8])
-    assert log.cameras["front"].camera.cx == 962.6 and log.cameras["front"].lens is not None
+    assert log.cameras["front"].recorded.cx == 962.6 and log.cameras["front"].lens is not None

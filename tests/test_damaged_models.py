@@ -37,36 +37,24 @@ VALUES: list[Any] = [None, "x", -1, 10**30, 1e300, True, [], [1], [[1, "x"]], {}
 def altered(value: Any) -> Iterator[Any]:
     """A JSON value with each part of it, at every depth, missing or something else."""
     yield from VALUES
-    parts: Any = (
-        value.items() if isinstance(value, dict) else list(enumerate(value))[:2] if isinstance(value, list) else ()
-    )
-    for name, part in parts:
-        yield (
-            {key: kept for key, kept in value.items() if key != name}
-            if isinstance(value, dict)
-            else value[:name] + value[name + 1 :]
-        )
-        for other in altered(part):
-            yield {**value, name: other} if isinstance(value, dict) else [*value[:name], other, *value[name + 1 :]]
+    if isinstance(value, dict):
+        for name, part in value.items():
+            yield {key: kept for key, kept in value.items() if key != name}
+            yield from ({**value, name: other} for other in altered(part))
+    elif isinstance(value, list):
+        for place, part in enumerate(value[:2]):
+            before, after = value[:place], value[place + 1 :]
+            yield before + after
+            yield from ([*before, other, *after] for other in altered(part))
 
 
 def altered_tensors(tensors: dict[str, np.ndarray]) -> Iterator[dict[str, np.ndarray]]:
     """Tensors with each of them missing, of another shape, type or content."""
     for name, value in tensors.items():
         yield {key: kept for key, kept in tensors.items() if key != name}
-        others = [
-            value[:0],
-            value[:-1],
-            np.concatenate([value, value]),
-            value[..., None],
-            value.reshape(-1),
-            np.zeros((), value.dtype),
-        ]
-        others += [
-            value.astype(np.int64),
-            np.full_like(value, np.nan) if value.dtype.kind == "f" else np.full_like(value, 100),
-        ]
-        for other in others:
+        others = [value[:0], value[:-1], np.concatenate([value, value]), value[..., None], value.reshape(-1)]
+        wrong = np.full_like(value, np.nan if value.dtype.kind == "f" else 100)
+        for other in (*others, np.zeros((), value.dtype), value.astype(np.int64), wrong):
             yield {**tensors, name: np.ascontiguousarray(other)}
     yield {"x": np.zeros(1)}
     yield {**tensors, "gone.x": np.zeros(1), "7/offsets.column.shift": np.zeros(1)}

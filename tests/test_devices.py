@@ -18,7 +18,6 @@ def said(monkeypatch):
 def test_an_explicit_device_is_never_replaced_and_auto_is_the_cpu_without_cuda(monkeypatch, said):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert devices.choose_device("auto", "fit") == torch.device("cpu") and said == ["fit: on the CPU"]
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     for name in ("cuda", "cuda:0"):
         with pytest.raises(ResourceError, match="--device"):
             devices.choose_device(name, "fit")
@@ -37,15 +36,10 @@ def test_auto_is_the_first_cuda_device_and_says_its_name_and_memory(monkeypatch,
         devices.choose_device("cuda:2", "fit")
 
 
-@pytest.mark.parametrize("name", ["gpu", "cuda:x", "", "cuda:-1", "AUTO"])
-def test_unknown_devices_are_refused_with_the_known_ones(name):
-    with pytest.raises(UsageError, match="auto, cpu, cuda"):
+@pytest.mark.parametrize("name", ["gpu", "cuda:x", "", "cuda:-1", "AUTO", "mps"])
+def test_unknown_devices_and_those_without_an_implementation_are_refused_with_the_known_ones(name):
+    with pytest.raises(UsageError, match=r"auto, cpu, cuda" if name != "mps" else "fit: not implemented"):
         devices.choose_device(name, "fit")
-
-
-def test_mps_is_refused_where_nothing_is_implemented_on_it():
-    with pytest.raises(UsageError, match="rasterizer: not implemented"):
-        devices.choose_device("mps", "rasterizer")
 
 
 def test_memory_of_a_device_that_runs_out_is_an_error_with_a_remedy():

@@ -21,8 +21,9 @@ from mudg.base.errors import ResourceError, UsageError
 from mudg.base.types import Condition
 from mudg.diffusion import model_files, parallel
 from mudg.diffusion.model import MDM
+from mudg.diffusion.model_files import generated
 from mudg.diffusion.models import model_config
-from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated, half_format
+from mudg.diffusion.requests import GeneratedClip, SampleRequest, half_format
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.diffusion.views import check_config
 from mudg.labels.depth_networks import Preparation, TransformersDepth

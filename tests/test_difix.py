@@ -17,9 +17,9 @@ from mudg.benchmarks.rows import Row
 from mudg.benchmarks.settings import BenchConfig
 from mudg.diffusion import condition as conditions
 from mudg.diffusion import views
-from mudg.diffusion.condition import ConditionRules
+from mudg.diffusion.condition import ConditionRules, DriveInputs
 from mudg.diffusion.settings import SynthesizeConfig
-from mudg.diffusion.views import ConditionSources, conditions_of
+from mudg.diffusion.views import conditions_of
 from mudg.gaussians.recipes import recipe_of
 from mudg.gaussians.settings import METHODS, FitConfig
 from mudg.steps.fit import Fit
@@ -41,8 +41,8 @@ def test_a_repair_sees_the_render_and_one_photograph_and_nothing_measured(fine):
     rules = ConditionRules(48, 32, 48 * fine, 32 * fine)
     image = np.random.default_rng(1).integers(0, 255, (32, 48, 3)).astype(np.uint8)
     view = view_at(0.2, cam)
-    given = ConditionSources(fused_cloud(3), (), [Photo(view, image)], rules, shown)
-    for grid, condition in enumerate(conditions_of(given, "repair", [view], {})):
+    given = DriveInputs(fused_cloud(3), (), [Photo(view, image)], shown)
+    for grid, condition in enumerate(conditions_of(given, "repair", [view], rules, {})):
         own = shown(view.resized(48 * fine, 32 * fine)) if fine and grid else shown(view)
         width = condition.color.shape[-1]
         assert not bool(condition.valid.any())
@@ -52,13 +52,14 @@ def test_a_repair_sees_the_render_and_one_photograph_and_nothing_measured(fine):
         assert torch.equal(condition.color, condition.renders.color)
         assert torch.equal(condition.depth, condition.renders.depth)
         assert bool((condition.semantics == 2).all())
-    small = conditions_of(replace(given, rules=ConditionRules(48, 32)), "repair", [view], {})[0]
+    coarse = ConditionRules(48, 32)
+    small = conditions_of(given, "repair", [view], coarse, {})[0]
     assert torch.allclose(small.backdrop[0], conditions.image_tensor(image), atol=1e-5)
     elsewhere = FusedCloud(replace(given.cloud.static, xyz=given.cloud.static.xyz + 500), {})
-    without_points = replace(given, cloud=elsewhere, rules=ConditionRules(48, 32))
-    assert torch.equal(conditions_of(without_points, "repair", [view], {})[0].color, small.color)
+    without_points = replace(given, cloud=elsewhere)
+    assert torch.equal(conditions_of(without_points, "repair", [view], coarse, {})[0].color, small.color)
     with pytest.raises(UsageError, match="renders"):
-        conditions_of(replace(given, render_at=None), "repair", [view], {})
+        conditions_of(replace(given, render_at=None), "repair", [view], coarse, {})
 
 
 def test_repairs_need_a_fit_and_only_they_go_with_one():

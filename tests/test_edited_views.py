@@ -22,15 +22,14 @@ from mudg.base.types import FusedCloud, Observation, Photo, PointCloud, RenderPl
 from mudg.base.weather_settings import Conditions
 from mudg.core.edit import Motion
 from mudg.core.pictures import to_bytes
-from mudg.core.weather import DriveFacts
 from mudg.core.weather.gbuffer import Surroundings
 from mudg.core.weather.light import srgb_decode, srgb_encode
 from mudg.diffusion import condition as clip_parts
 from mudg.diffusion import model_files as files
-from mudg.diffusion.condition import ConditionRules, InWeather, build_conditions, image_tensor
+from mudg.diffusion.condition import ConditionRules, DriveInputs, InWeather, build_conditions, image_tensor
 from mudg.diffusion.model import MDM
 from mudg.diffusion.settings import SynthesizeConfig
-from mudg.diffusion.views import ConditionSources, JobInputs, conditions_of, view_maker
+from mudg.diffusion.views import JobInputs, view_maker
 from mudg.editing.edit import boxes_mask, cleared_cloud, photos_of_edited, vacated_at
 from mudg.editing.plan import Actor, EditPlan, EditWorld, plan_edits
 from mudg.editing.render import REPAIR_STEPS, RenderMixer, off_path_m
@@ -77,11 +76,11 @@ def test_the_condition_of_a_removed_object_is_that_of_a_log_that_never_had_it() 
     assert all(p.usable is not None and bool(p.usable[p.rgb.max(-1) > 0].any()) for p in with_box)
     assert not any(bool(p.usable[(p.rgb == 0).all(-1)].any()) for p in with_box)
     empty = [Photo(p.view, image_of_wall(view_at(), 12.0)) for p in with_box]
-    given = build_conditions(CLOUD, [], [target], with_box, RULES, vacated_at=vacated_at(plan))[0]
-    never = build_conditions(CLOUD, [], [target], empty, RULES)[0]
+    given = build_conditions(DriveInputs(CLOUD, [], with_box, vacated_at=vacated_at(plan)), [target], RULES)[0]
+    never = build_conditions(DriveInputs(CLOUD, [], empty), [target], RULES)[0]
     for name in ("color", "depth", "valid", "warped", "semantics"):
         assert torch.equal(getattr(given, name), getattr(never, name)), name
-    seen = build_conditions(CLOUD, [], [target], [replace(p, usable=None) for p in with_box], RULES)[0]
+    seen = build_conditions(DriveInputs(CLOUD, [], [replace(p, usable=None) for p in with_box]), [target], RULES)[0]
     assert not torch.equal(seen.color, never.color)  # the box would be in the picture
     near, far = (float((one.backdrop - never.backdrop).abs().max()) for one in (given, seen))
     assert near < 0.2 < far
@@ -90,7 +89,7 @@ def test_the_condition_of_a_removed_object_is_that_of_a_log_that_never_had_it() 
 def test_what_nobody_saw_continues_its_surroundings_and_does_not_count_as_seen() -> None:
     plan = drive(REMOVED)
     photos = photos_of_edited([photo_with_box(0.0, -2.0)], plan)
-    made = build_conditions(CLOUD, [], [view_at()], photos, RULES, vacated_at=vacated_at(plan))[0]
+    made = build_conditions(DriveInputs(CLOUD, [], photos, vacated_at=vacated_at(plan)), [view_at()], RULES)[0]
     hole = vacated_at(plan)(view_at()).mask
     assert 0 < float(hole.float().mean()) < 0.4
     assert not bool((made.warped[0, 0] | made.valid[0, 0])[hole].any())
@@ -116,7 +115,9 @@ def test_what_photographs_determined_behind_a_removed_object_is_kept(usual: floa
         return RenderPlanes(full * one, 12 * one, one, certainty, (2 * one).to(torch.uint8))
 
     photos = photos_of_edited([photo_with_box(0.0, -2.0)], plan)
-    made = build_conditions(CLOUD, [], [view_at()], photos, RULES, render_at=render, vacated_at=vacated_at(plan))[0]
+    made = build_conditions(
+        DriveInputs(CLOUD, [], photos, render_at=render, vacated_at=vacated_at(plan)), [view_at()], RULES
+    )[0]
     red = (made.color[0] == full).all(0)
     assert made.renders is not None and bool(red[left].all()) and bool(made.warped[0, 0][left].all())
     assert bool((made.renders.certainty[0, 0][left] == usual).all())
@@ -133,8 +134,8 @@ def test_ground_that_a_removed_object_darkened_keeps_its_place_but_not_its_colou
     dark = (np.abs(xyz[:, 0] - 6) < 0.8) & (np.abs(xyz[:, 1] + 2) < 1)
     rgb = np.where(dark[:, None], 0, 130).repeat(3, 1).astype(np.uint8)
     cloud = FusedCloud(PointCloud(xyz, rgb, "world", semantics=np.full(len(xyz), ID["road"], np.uint8)), {})
-    made = build_conditions(cloud, [], [view_at()], [], RULES, vacated_at=vacated_at(plan))[0]
-    plain = build_conditions(cloud, [], [view_at()], [], RULES)[0]
+    made = build_conditions(DriveInputs(cloud, [], [], vacated_at=vacated_at(plan)), [view_at()], RULES)[0]
+    plain = build_conditions(DriveInputs(cloud, [], []), [view_at()], RULES)[0]
     black = plain.valid[0, 0] & (plain.color[0].amax(0) < 0.1)
     assert int(black.sum()) > 10
     assert bool(made.valid[0, 0][black].all()) and torch.equal(made.depth[0, 0][black], plain.depth[0, 0][black])
@@ -143,7 +144,7 @@ def test_ground_that_a_removed_object_darkened_keeps_its_place_but_not_its_colou
 
 def test_the_published_reference_is_masked_too() -> None:
     photos = photos_of_edited([photo_with_box(0.0, -2.0)], drive(REMOVED))
-    made = build_conditions(CLOUD, [], [view_at()], photos, replace(RULES, published=True))[0]
+    made = build_conditions(DriveInputs(CLOUD, [], photos), [view_at()], replace(RULES, published=True))[0]
     assert float(made.reference.amax(0).min()) > 0.2
     kept = torch.from_numpy(photos[0].usable)
     assert torch.equal(made.reference[:, kept], image_tensor(photos[0].rgb)[:, kept])
@@ -356,11 +357,11 @@ def test_points_and_reference_of_the_published_condition_are_in_fog_at_their_own
 
     light = Surroundings(*(np.full(3, 0.5) for _ in range(3)), np.zeros(3), np.array([0.0, 0.0, 1.0]), np.full(3, 0.5))
     fog = Conditions.model_validate({"weather": {"fog": {"visibility_m": 30}}})
-    how = InWeather(fog, DriveFacts(light), 0, lambda _: (0.0, 0.0, 0.0))
+    how = InWeather(fog, light, 0, lambda _: (0.0, 0.0, 0.0))
     rules = ConditionRules(12, 8, 48, 32, published=True)
-    sources = ConditionSources(cloud, [], [photo], rules, render, weather=how)
-    clear = conditions_of(replace(sources, weather=None), "full", views, {})[0]
-    made = conditions_of(sources, "full", views, {})[0]
+    drive = DriveInputs(cloud, [], [photo], render, weather=how)
+    clear = build_conditions(replace(drive, weather=None), views, rules)[0]
+    made = build_conditions(drive, views, rules)[0]
     assert torch.equal(made.depth, clear.depth)
     assert float(clear.color.max()) == 0 == float(clear.reference.max())
     colored = made.color[0].amax(0) > 0

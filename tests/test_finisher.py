@@ -6,52 +6,29 @@ import pytest
 import torch
 from hypothesis import given as drawn
 from hypothesis import strategies
-from test_mdm import TINY, randomised, some_condition
+from tiny_networks import FINISHING, TINY, randomise, randomised
 from torch.nn import functional
-from toy_clips import made_up_clip, with_patch
+from toy_clips import made_up_clip, some_condition, some_pixels, with_patch
 
 from mudg.base.errors import UsageError
 from mudg.diffusion import model as mdm
 from mudg.diffusion import network, requests
-from mudg.diffusion.model import BatchPart, LossSettings
+from mudg.diffusion.model import BatchPart
 from mudg.diffusion.models import draw_weights
-from mudg.diffusion.network import ConditionPixels, Finisher, Made, Refined, finish_in_tiles
+from mudg.diffusion.network import Finisher, Made, Refined, finish_in_tiles
 from mudg.diffusion.requests import SampleRequest
 
-FINISHING = replace(TINY, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1))
+
+def some_made(height, width):
+    pixels = some_pixels(height, width, seed=1)
+    return Made(pixels.color, pixels.depth_code, pixels.ids, pixels.render_code - 3)
 
 
-def some_pixels(height, width, frames=2, seed=0):
-    """A condition of random pixels, with renders."""
-    generator = torch.Generator().manual_seed(seed)
-    image = lambda c: torch.rand(frames, c, height, width, generator=generator) * 2 - 1
-    mask = lambda: (image(1) > 0).float()
-    ids = lambda: torch.randint(0, 19, (frames, 1, height, width), generator=generator, dtype=torch.uint8)
-    return ConditionPixels(
-        image(3), image(3), image(1), mask(), mask(), ids(), ids(), image(3), image(1), mask(), image(1).abs(), ids()
-    )
-
-
-def some_made(height, width, frames=2, seed=1):
-    generator = torch.Generator().manual_seed(seed)
-    image = lambda c: torch.rand(frames, c, height, width, generator=generator) * 2 - 1
-    ids = torch.randint(0, 19, (frames, 1, height, width), generator=generator, dtype=torch.uint8)
-    return Made(image(3), image(1), ids, image(1) - 3)
-
-
-def random_finisher(blocks=(1, 1), seed=2):
+def random_finisher(blocks=(1, 1)):
     """One whose every weight matters."""
-    made, generator = Finisher((8, 16), blocks), torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for value in made.parameters():
-            fan = value[0].numel() if value.ndim > 1 else 1
-            value.copy_(torch.randn(value.shape, generator=generator) * (1.5 / fan**0.5 if value.ndim > 1 else 0.3))
+    made = Finisher((8, 16), blocks)
+    randomise(made.parameters(), seed=2, gain=1.5, bias=0.3)
     return made.eval()
-
-
-def biases(finisher):
-    """Views of the last layer's biases, one per part of the output."""
-    return finisher.leave.bias.split(Finisher.SIZES)
 
 
 # tiles --------------------------------------------------------------------------------------------
@@ -148,7 +125,7 @@ def test_it_starts_as_fixed_shares_of_its_sources_and_an_unknown_class_takes_non
 @pytest.mark.parametrize("source", range(4))
 def test_it_can_copy_each_source(source):
     finisher, given, made = Finisher((8, 16), (1, 1)), some_pixels(32, 48), some_made(32, 48)
-    of_color, of_depth, of_class = biases(finisher)[:3]
+    of_color, of_depth, of_class = finisher.leave.bias.split(Finisher.SIZES)[:3]
     of_color[4 * source : 4 * source + 4] = 30.0
     of_class[4 * source : 4 * source + 4] = 30.0
     depth_source = {0: 0, 1: 1, 3: 2}.get(source)
@@ -205,7 +182,7 @@ def test_the_finisher_starts_from_the_stated_error_not_from_the_confidence():
 
 def gradients(model, clips):
     model.zero_grad(set_to_none=True)
-    loss = model.loss(clips, BatchPart(0, 0, 0, len(clips)), LossSettings(None, 1.0, 0.2))
+    loss = model.loss(clips, BatchPart(0, 0, 0, len(clips)))
     loss.total.backward()
     return loss, {name: None if p.grad is None else p.grad.clone() for name, p in model.named_parameters()}
 
@@ -262,7 +239,7 @@ def test_a_patch_is_finished_from_its_own_part_of_its_own_clip(monkeypatch, row,
     stated["rgb"][:, :, :3] = functional.avg_pool2d(of_clips, 2).unflatten(0, (2, frames))
     monkeypatch.setattr(model, "refine", refined)
     monkeypatch.setattr(model.finisher, "forward", finished)
-    model._finisher_terms(stated, encoded, clips, LossSettings(None, 1.0, 0.2))
+    model._finisher_terms(stated, encoded, clips, BatchPart(0, 0, 0, len(clips)))
     made, scale = seen[0]
     assert scale.tolist() == [2.0] * frames
     assert made.rgb.shape == (frames, 3, 2 * side, 2 * side)

@@ -5,17 +5,14 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from fit_settings import fit_to, fitted_bytes, interrupted, small_fit, written_street
-from toy_world import camera, fused_cloud, truth, view_at, write_scene
+from fit_settings import fit_to, fitted_bytes, interrupted, mean_psnr, small_fit, written_street
+from toy_world import fused_cloud, write_scene
 
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
-from mudg.core import metrics
-from mudg.core.raster.rasterize import RasterConfig
 from mudg.gaussians import fit
 from mudg.gaussians import storage as continued
 from mudg.gaussians.corrections import Appearance
@@ -43,35 +40,30 @@ def go_on(world: dict[str, Path], out: Path, config: FitConfig | None = None, **
     return fit_to(world, out, config or settings(), **named).run()
 
 
-def psnr_beside(folder: Path) -> float:
-    model = fit.load_model(folder)
-    views = [view_at(time_s, camera(width=SIZE[0], height=SIZE[1]), left_m=2.0) for time_s in (0.3, 0.9)]
-    drawn = [(fit.render_view(model, view, RasterConfig()).rgb, truth(view).rgb) for view in views]
-    return float(np.mean([metrics.psnr(*pair) for pair in drawn]))
-
-
 def test_it_starts_from_the_finished_scene_and_learns_from_virtual_views_at_once(world, tmp_path, monkeypatch):
     seen, learn = [], fit._learn_from
 
     def spy(state, view, **how):
-        seen.append((len(seen), view.kind))
+        seen.append(view.kind)
         return learn(state, view, **how)
 
     monkeypatch.setattr(fit, "_learn_from", spy)
     one = go_on(world, tmp_path / "one", settings(iterations=1, virtual__continued_probability=1.0, virtual__stop=1.0))
-    assert [kind for _, kind in seen] == ["recorded", "virtual"]
+    assert seen == ["recorded", "virtual"]
     old, new = fit.load_model(world["plain"]), fit.load_model(one)
-    added = len(new.table) - len(old.table)
-    assert added > 0  # Gaussians at surfaces that only virtual views show
+    assert len(new.table) > len(old.table)  # Gaussians at surfaces that only virtual views show
     moved = torch.cdist(old.table["means"], new.table["means"]).amin(1)
     assert float(moved.detach().median()) < 0.02
     assert new.facts["method"] == "mudg_s" and new.facts["scene"] == old.facts["scene"]
-    assert store.read_json(one / "run.json")["inputs"]["start"] == store.digest(world["plain"])
-    assert store.read_json(one / "run.json")["summary"]["steps"] == 1
+    state = store.read_json(one / "run.json")
+    assert (state["inputs"]["start"], state["summary"]["steps"]) == (store.digest(world["plain"]), 1)
 
 
 def test_few_more_steps_help_beside_the_path_and_are_the_second_half_of_a_run(world, tmp_path, monkeypatch):
-    assert psnr_beside(go_on(world, tmp_path / "fit", settings(iterations=40))) > psnr_beside(world["plain"]) + 0.3
+    assert (
+        mean_psnr(go_on(world, tmp_path / "fit", settings(iterations=40)), SIZE, 2.0)
+        > mean_psnr(world["plain"], SIZE, 2.0) + 0.3
+    )
     config = continued.whole_run(settings(iterations=500))
     assert (config.iterations, continued.begun_at(config.iterations)) == (1000, 500)
     assert config.virtual.probability == FitConfig().virtual.continued_probability
@@ -115,11 +107,9 @@ def test_classes_that_only_virtual_views_show_are_added(world):
 
 def test_learnt_corrections_of_cameras_are_kept(world, tmp_path):
     changes = {"appearance__cameras": True, "appearance__exposure": "camera"}
-    settled = settings("street_gaussians", iterations=12, **changes)
-    plain = fit_to(world, tmp_path / "plain", settled).run()
+    plain = fit_to(world, tmp_path / "plain", settings("street_gaussians", iterations=12, **changes)).run()
     learnt = store.read_tensors(plain / "appearance.safetensors")
-    start = continued.StartFit(plain, "")
-    names = store.read_json(plain / "appearance.json")["names"]
+    start, names = continued.StartFit(plain, ""), store.read_json(plain / "appearance.json")["names"]
     kept = continued.continued_appearance(start, Appearance(names))
     assert torch.equal(kept.tables["cameras"]["shift"], learnt["cameras/column.shift"])
     assert learnt["cameras/column.shift"].abs().max() > 0

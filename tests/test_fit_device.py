@@ -190,7 +190,7 @@ def test_a_step_copies_a_view_there_and_one_row_of_numbers_back(world, tmp_path,
             assert [copy.where for copy in back] == ["gaussians/schedule.py:refuse"], step
             assert back[0].values < 100
     late = [copy for copy in steps.of[5] if copy.way == "there" and copy.values <= NUMBERS]
-    assert all(copy.where == "gaussians/nodes.py:_sent" for copy in late), late
+    assert all(copy.where == "gaussians/nodes.py:_placement" for copy in late), late
 
 
 def test_densification_brings_no_rows_back(plain_fit):

@@ -48,9 +48,8 @@ def node(fitted):
 def test_a_displaced_picture_is_that_of_moved_offsets(fitted, node):
     view = view_at(0.3, camera(width=SIZE[0], height=SIZE[1]))
     here = compose(fitted.model, 0.3, semantics=False)
-    rows = {1: (here.node == 1).nonzero()[:, 0]}
     for axis, step in enumerate(fit_poses.STEPS):
-        moved = fit_poses._displaced(here, rows, {1: node.pose_matrix(0.3)}, axis, step)
+        moved = fit_poses._displaced(here, {1: node.pose_matrix(0.3)}, axis, step)
         change = np.zeros((FRAMES, 4))
         change[1, axis] = step  # the key at 0.3 s
         node.add_offsets(change[:, :3], change[:, 3])

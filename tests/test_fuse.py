@@ -393,8 +393,8 @@ class KittiCheck:
         cloud, target = self.last
         poses = {track_id: self.scene.track(track_id).pose_at(target.time_s) for track_id in cloud.objects}
         seen = project_cloud(cloud, poses, target, config)
-        picture = (seen.color.permute(1, 2, 0).numpy() * 255 + 0.5).astype(np.uint8)
-        return picture, seen.valid[0].numpy()
+        picture = (seen.rgb.permute(1, 2, 0).numpy() * 255 + 0.5).astype(np.uint8)
+        return picture, seen.valid.numpy()
 
     def draw(self, view: View, xyz: np.ndarray, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         uv, z = geometry.project(view, xyz)

@@ -14,7 +14,7 @@ from refusals import refused
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.editing.settings import ScoreConfig
-from mudg.networks import i3d
+from mudg.networks import folders, i3d
 from mudg.scene.read import read_scene
 from mudg.scoring import sets as videos
 from mudg.scoring import tables as score_tables
@@ -58,7 +58,7 @@ def test_both_layouts_give_equal_features_and_the_epsilon_matters(state, monkeyp
     with torch.no_grad():
         one = i3d.I3DFeatures(state)(clip)
         other = i3d.I3DFeatures({renamed(name): value for name, value in state.items()})(clip)
-        monkeypatch.setattr(i3d, "NORM_EPSILON", 1e-5)
+        monkeypatch.setattr(folders, "NORM_EPSILON", 1e-5)
         fine = i3d.I3DFeatures(state)(clip)
     assert one.shape == (1, 400) and torch.equal(one, other) and not torch.equal(one, fine)
 

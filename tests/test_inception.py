@@ -44,29 +44,20 @@ def test_the_published_file_has_these_tensors() -> None:
     assert shapes["Mixed_7c.branch_pool.bn.running_var"] == (192,) and shapes["fc.weight"] == (1008, 2048)
 
 
-SIZES = {
-    "Mixed_5b": (192, 35, 256, 35),
-    "Mixed_5c": (256, 35, 288, 35),
-    "Mixed_5d": (288, 35, 288, 35),
-    "Mixed_6a": (288, 35, 768, 17),
-    "Mixed_6b": (768, 17, 768, 17),
-    "Mixed_6e": (768, 17, 768, 17),
-    "Mixed_7a": (768, 17, 1280, 8),
-    "Mixed_7b": (1280, 8, 2048, 8),
-    "Mixed_7c": (2048, 8, 2048, 8),
-}
-
-
-@pytest.mark.parametrize("name", SIZES)
-def test_sizes_of_blocks(network: inception.InceptionFeatures, name: str) -> None:
-    into, side, out, after = SIZES[name]
-    assert network.block(name, torch.zeros(1, into, side, side)).shape == (1, out, after, after)
-
-
-def test_features_do_not_depend_on_the_batch(network: inception.InceptionFeatures) -> None:
+def test_features_do_not_depend_on_the_batch(network: inception.InceptionFeatures, monkeypatch) -> None:
     images = torch.stack([inception.prepared(picture(seed=n), "tf1") for n in range(2)])
+    sizes, block = [], network.block
+
+    def noted(name: str, x: torch.Tensor) -> torch.Tensor:
+        made = block(name, x)
+        sizes.append(made.shape[1:])
+        return made
+
+    monkeypatch.setattr(network, "block", noted)
     found = network(images)
     assert found.shape == (2, 2048) and float((found[0] - found[1]).abs().max()) > 1e-3
+    channels, sides = [256, 288, 288, *[768] * 5, 1280, 2048, 2048], [35] * 3 + [17] * 5 + [8] * 3
+    assert sizes == [(width, side, side) for width, side in zip(channels, sides, strict=True)]
     assert torch.allclose(network(images[1:]), found[1:], atol=1e-5)
     with pytest.raises(InputError, match="images of one size"):
         network(torch.zeros(1, 3, 224, 224))

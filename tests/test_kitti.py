@@ -237,7 +237,7 @@ def test_real_tracking_boxes_project_to_their_rectangles(shared_data: Callable[[
         uncut = left > 1 and top > 1 and right < 1240 and bottom < 373
         if box.frame not in (10, 20) or not uncut:
             continue
-        corners = geometry.transform_points(box.sensor_from_box, signs * box.size_m)
+        corners = geometry.transform_points(box.pose, signs * box.size_m)
         uv = geometry.project(view, corners)[0] - 0.5  # KITTI counts from the pixel's centre
         differences.append(np.abs(np.r_[uv.min(0), uv.max(0)] - [left, top, right, bottom]).max())
     assert len(differences) >= 10

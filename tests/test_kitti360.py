@@ -188,13 +188,13 @@ def test_the_same_box_by_any_axes(tmp_path: Path, axes: np.ndarray) -> None:
     pose, size = yaw_matrix(0.4, (3.0, 4.0, 1.0)), np.array([4.5, 1.8, 1.5])
     turned = pose.copy()
     turned[:3, :3] = pose[:3, :3] @ axes
-    (box,), _ = boxes_of(tmp_path, made.box_xml(1, turned, np.abs(axes.T @ size)))
+    ((box, _),), _ = boxes_of(tmp_path, made.box_xml(1, turned, np.abs(axes.T @ size)))
     assert box.size_m == pytest.approx((4.5, 1.8, 1.5))
     expected = made.SOURCE_FROM_WORLD @ pose
-    assert np.abs(box.world_from_box[:3, 3] - expected[:3, 3]).max() < 1e-6
-    assert abs(box.world_from_box[:3, 0] @ expected[:3, 0]) == pytest.approx(1)
-    assert np.linalg.det(box.world_from_box[:3, :3]) == pytest.approx(1)
-    assert box.world_from_box[2, 2] == pytest.approx(1)
+    assert np.abs(box.pose[:3, 3] - expected[:3, 3]).max() < 1e-6
+    assert abs(box.pose[:3, 0] @ expected[:3, 0]) == pytest.approx(1)
+    assert np.linalg.det(box.pose[:3, :3]) == pytest.approx(1)
+    assert box.pose[2, 2] == pytest.approx(1)
 
 
 def test_classes_labels_and_shear(tmp_path: Path) -> None:
@@ -205,7 +205,7 @@ def test_classes_labels_and_shear(tmp_path: Path) -> None:
     named = named.replace(">car<", ">unknownVehicle<")
     classes = [made.box_xml(n, pose, size, semantic=number) for n, number in enumerate((19, 11, 77), 1)]
     found, left_out = boxes_of(tmp_path, *classes, made.box_xml(4, sheared, size), named)
-    assert [box.label for box in found] == ["person", "unknown vehicle"]
+    assert [box.label for box, _ in found] == ["person", "unknown vehicle"]
     assert left_out == {"of classes that do not move": 2, "that are not cuboids": 1}
 
 
@@ -234,10 +234,10 @@ def test_standing_boxes_hold_in_their_window_and_one_drawn_twice_in_a_frame_is_t
         (lambda s: s.replace("<opencv_storage>", '<!DOCTYPE x [<!ENTITY a "b">]><opencv_storage>'), "entities"),
         (lambda s: s.replace('version="1.0"', 'version="1.0" encoding="cp037"'), "encoding"),
         (lambda s: s[: len(s) // 2], "cut off"),
-        (lambda s: s.replace("<rows>4</rows>", "<rows>999999999</rows>"), "size it declares"),
+        (lambda s: s.replace("<rows>4</rows>", "<rows>999999999</rows>"), "wrong number of values"),
         (lambda s: s.replace("<timestamp>-1</timestamp>", "<timestamp>soon</timestamp>"), "'timestamp'"),
         (lambda s: re.sub(r"(<transform.*?<data>\s*)\S+", r"\1nan", s, flags=re.S), "not finite"),
-        (lambda s: re.sub(r"(<transform.*?<data>\s*)\S+", r"\1car", s, flags=re.S), "no number"),
+        (lambda s: re.sub(r"(<transform.*?<data>\s*)\S+", r"\1car", s, flags=re.S), "not a number"),
     ],
 )
 def test_spoilt_box_files(source: Path, tmp_path: Path, change: Callable[[str], str], words: str) -> None:

@@ -51,17 +51,10 @@ def test_an_interrupted_run_saves_its_step_and_continues_bit_for_bit(clips, whol
     assert all(torch.equal(first[name], second[name]) for name in first)
     scores = [json.loads((p.parent / "metrics.json").read_text()) for p in (whole, parts)]
     assert scores[0] == scores[1]
-
-
-def test_outputs_and_reuse(clips, tmp_path):
-    out = tmp_path / "run"
-    model_folder = Learn(out=out, settings=tiny(clips, score_every=4)).run()
-    assert (out / "samples" / "0000004.png").stat().st_size > 1000
-    content = json.loads((model_folder / "model.json").read_text())
-    assert content["facts"]["recipe"]["steps"] == 4
-    assert content["facts"]["held_out"]["clips"] == 2
-    assert "held-out" in (model_folder / "MODEL_CARD.md").read_text().lower()
-    assert Learn(out=out, settings=tiny(clips, score_every=4)).run() == model_folder
+    assert json.loads((parts / "model.json").read_text())["facts"]["held_out"]["clips"] == 2
+    assert "held-out" in (parts / "MODEL_CARD.md").read_text().lower()
+    assert (parts.parent / "samples" / "0000004.png").stat().st_size > 1000
+    assert Learn(out=tmp_path / "parts", settings=with_settings(config, log_every=1)).run() == parts  # used again
 
 
 def test_training_continues_from_a_model(clips, whole, tmp_path):

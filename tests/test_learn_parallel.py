@@ -19,7 +19,7 @@ from mudg.base.config import dump_yaml
 from mudg.base.errors import NumericsError, UsageError
 from mudg.diffusion import learn, model_files, models, parallel
 from mudg.diffusion.clips import ShardFolder, class_weights
-from mudg.diffusion.model import MDM, BatchPart, LossSettings
+from mudg.diffusion.model import MDM, BatchPart
 from mudg.diffusion.parallel import Ranks, TrainingState
 from mudg.steps.synthesize import Learn
 
@@ -168,11 +168,11 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(clips):
     model = MDM(models.model_config(tiny(clips)))
     models.draw_weights(model.net, 0, "weights")
     settings, balance = tiny(clips), class_weights(ShardFolder(clips), range(2), 0.5)
-    rules = LossSettings(balance, refined_share=0.5, reference_dropout=0.2)
 
     def loss(part, step):
         drawn = learn.clips_of_cities(settings, clips).draw(step, 4, 2, "batch", part)
-        return float(model(drawn, BatchPart(settings.seed, step, part.start or 0, 4), rules).total.detach())
+        own = BatchPart(settings.seed, step, part.start or 0, 4, balance, refined_share=0.5)
+        return float(model(drawn, own).total.detach())
 
     for step in range(3):
         parts = [loss(slice(n, n + 1), step) for n in range(4)]
@@ -186,14 +186,11 @@ def test_portions_and_recomputing_change_nothing(clips, tmp_path):
     assert_same_losses(tmp_path / "plain", tmp_path / "portions", (1, 2))
 
 
-def test_clips_are_shared_evenly_or_not_at_all():
+def test_clips_are_shared_evenly_or_not_at_all_and_bad_terms_are_named():
     taken = [part for rank in range(4) for part in Ranks(rank, 4, torch.device("cpu")).share(24, 3)]
     assert [n for part in taken for n in range(part.start, part.stop)] == list(range(24))
     with pytest.raises(UsageError, match="divided evenly"):
         Ranks(0, 4, torch.device("cpu")).share(6, 1)
-
-
-def test_a_term_that_is_not_finite_is_named():
     with pytest.raises(NumericsError, match=r"depth term of the network(.|\n)*step 4"):
         parallel.agreed_terms(ALONE, {"rgb": 1.0, "depth": float("nan")}, 1, 4, "network")
     assert parallel.agreed_terms(ALONE, {"rgb": 3.0}, 2, 4, "network") == ({"rgb": 1.5}, False)

@@ -17,31 +17,10 @@ from torch import Tensor
 
 from mudg import native
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.core import losses, native_ops
-from mudg.core.table import AdamColumn, torch_adam_columns
+from mudg.core import native_ops
+from mudg.core.native_ops import AdamColumn
 
 needs_native = pytest.mark.skipif(native.library() is None, reason=native.status())
-
-
-@pytest.fixture
-def pool() -> Any:
-    """(sum function, restores the thread setting)."""
-    library = native.require("the test")
-    before = native.threads()
-    library.mudg_parallel_sum.argtypes = [ctypes.c_int64, ctypes.c_int64]
-    library.mudg_parallel_sum.restype = ctypes.c_int64
-    yield library.mudg_parallel_sum
-    native.set_threads(before)
-
-
-@pytest.fixture(params=["avx512", "avx2", "portable"])
-def isa(request: pytest.FixtureRequest) -> Any:
-    try:
-        native.set_isa(request.param)
-    except (UsageError, ResourceError) as error:
-        pytest.skip(str(error))
-    yield request.param
-    native.set_isa("")
 
 
 # ---- loading -------------------------------------------------------------------------------------
@@ -100,12 +79,13 @@ def test_the_thread_count_comes_from_the_environment(monkeypatch: pytest.MonkeyP
 # ---- the pool ------------------------------------------------------------------------------------
 
 
-@needs_native
 @pytest.mark.parametrize("threads", [1, 2, 7])
-def test_every_index_is_visited_exactly_once(pool: Any, threads: int) -> None:
-    native.set_threads(threads)
+def test_every_index_is_visited_exactly_once(set_threads: Callable[[int], None], threads: int) -> None:
+    set_threads(threads)
+    summed = native.require("the test").mudg_parallel_sum
+    summed.argtypes, summed.restype = [ctypes.c_int64, ctypes.c_int64], ctypes.c_int64
     for count, grain in ((0, 1), (1, 1), (5, 100), (1000, 1), (100_003, 64), (64, 0)):
-        assert pool(count, grain) == count * (count - 1) // 2
+        assert summed(count, grain) == count * (count - 1) // 2
 
 
 @needs_native
@@ -155,7 +135,7 @@ def test_photometric_equals_its_float64_twin(
     of = lambda dtype: (weight.to(dtype),) if weighted else ()
     mine, exact = prediction.clone().requires_grad_(), prediction.double().requires_grad_()
     got = native_ops.photometric(mine, target, ssim, *of(torch.float32))
-    want = losses.photometric(exact, target.double(), ssim, *of(torch.float64))
+    want = native_ops.photometric(exact, target.double(), ssim, *of(torch.float64))
     assert got.item() == pytest.approx(want.item(), rel=1e-6, abs=1e-7)
     (found,), (true,) = _gradients(3 * got, mine), _gradients(3 * want, exact)
     assert (found - true).norm() <= 2e-6 * true.norm() + 1e-12
@@ -170,7 +150,7 @@ def test_box_mean_equals_its_float64_twin(isa: str, shape: tuple[int, ...], size
     generator = torch.Generator().manual_seed(4)
     values, upstream = (torch.randn(shape, generator=generator) for _ in range(2))
     mine, exact = values.clone().requires_grad_(), values.double().requires_grad_()
-    got, want = native_ops.box_mean(mine, size), native_ops.torch_box_mean(exact, size)
+    got, want = native_ops.box_mean(mine, size), native_ops.box_mean(exact, size)
     assert got.shape == values.shape and (got.double() - want).abs().max() < 1e-6
     got.backward(upstream)
     want.backward(upstream.double())
@@ -182,26 +162,23 @@ def adam(*tensors: Any) -> None:
     native_ops.adam_columns([AdamColumn(*tensors[:5])], *tensors[5:])
 
 
-def twin(*tensors: Any) -> None:
-    """The same in plain torch."""
-    torch_adam_columns([AdamColumn(*tensors[:5])], *tensors[5:])
+def test_without_the_library_plain_torch_does_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    (prediction, target), cover = _images((3, 20, 20)), _images((1, 20, 20))[0]
+    labels = torch.arange(400).view(20, 20) % 4
 
+    def all_of_them() -> list[Tensor]:
+        moved = torch.ones(4, 3)
+        adam(moved, torch.full((4, 3), 0.5), torch.zeros(4, 3), torch.zeros(4, 3), 0.1, 1)
+        boxes, sky = native_ops.box_mean(prediction, 3), native_ops.over(prediction, cover, target[:, ::2])
+        named = native_ops.class_loss(prediction, labels, cover[0], 2.0)
+        return [native_ops.photometric(prediction, target), boxes, sky, named, moved]
 
-def test_without_the_library_the_plain_twins_do_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    prediction, target = _images((3, 20, 20))
-    parameter, gradient = torch.ones(4, 3), torch.full((4, 3), 0.5)
-    with_library = native_ops.photometric(prediction, target).item()
+    with_library = all_of_them()
     monkeypatch.setattr(native, "_loaded", None)
     monkeypatch.setattr(native, "_problem", "not built: test")
-    assert native_ops.photometric(prediction, target).item() == pytest.approx(with_library, rel=1e-5)
-    adam(parameter, gradient, torch.zeros(4, 3), torch.zeros(4, 3), 0.1, 1)
-    torch.testing.assert_close(parameter, torch.full((4, 3), 0.9))
-    torch.testing.assert_close(native_ops.box_mean(prediction, 3), native_ops.torch_box_mean(prediction, 3))
-    cover, labels = torch.rand(1, 20, 20), torch.ones(20, 20, dtype=torch.int64)
-    planes = (prediction, cover, target)
-    torch.testing.assert_close(native_ops.over(*planes), native_ops.torch_over(*planes))
-    got = native_ops.class_loss(prediction, labels, cover[0], 2.0)
-    torch.testing.assert_close(got, losses.class_loss(prediction, labels, cover[0], 2.0))
+    for mine, expected in zip(all_of_them(), with_library, strict=True):
+        torch.testing.assert_close(mine, expected, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(mine, torch.full((4, 3), 0.9))
 
 
 # ---- cross entropy of classes, pictures over the sky ---------------------------------------------
@@ -218,7 +195,7 @@ def test_class_loss_equals_its_float64_twin(isa: str, shape: tuple[int, int, int
     mine, exact = values.clone().requires_grad_(), values.double().requires_grad_()
     channel = shape[0] - 1
     got = native_ops.class_loss(mine, target, weight, 7.0, (channel, lift) if lifted else None)
-    want = losses.class_loss(exact, target, weight.double(), 7.0, (channel, lift.double()) if lifted else None)
+    want = native_ops.class_loss(exact, target, weight.double(), 7.0, (channel, lift.double()) if lifted else None)
     assert got.item() == pytest.approx(want.item(), rel=2e-6, abs=1e-6)
     (found,), (true,) = _gradients(3 * got, mine), _gradients(3 * want, exact)
     assert (found - true).norm() <= 3e-6 * true.norm() + 1e-9 and found[:, target == 255].abs().sum() == 0
@@ -247,7 +224,7 @@ def test_picture_over_the_sky_equals_its_float64_twin(
     inputs = [torch.rand(shape, generator=generator) for shape in shapes]
     upstream = torch.randn(channels, height, width, generator=generator)
     mine, exact = [t.clone().requires_grad_() for t in inputs], [t.double().requires_grad_() for t in inputs]
-    got, want = native_ops.over(*mine), native_ops.torch_over(*exact)
+    got, want = native_ops.over(*mine), native_ops.over(*exact)
     torch.testing.assert_close(got.double(), want, rtol=1e-6, atol=2e-6)
     for found, true in zip(
         _gradients((got * upstream).sum(), *mine), _gradients((want * upstream).sum(), *exact), strict=True
@@ -255,14 +232,13 @@ def test_picture_over_the_sky_equals_its_float64_twin(
         torch.testing.assert_close(found, true, rtol=2e-5, atol=2e-5)
 
 
-@needs_native
-def test_losses_and_sky_do_not_depend_on_the_number_of_threads(pool: Any) -> None:
+def test_losses_and_sky_do_not_depend_on_the_number_of_threads(set_threads: Callable[[int], None]) -> None:
     generator = torch.Generator().manual_seed(3)
     logits, coarse, rgb = (torch.randn(shape, generator=generator) for shape in ((9, 90, 70), (3, 20, 15), (3, 90, 70)))
     target, weight = torch.randint(0, 9, (90, 70), generator=generator), torch.rand(90, 70, generator=generator)
     results = []
     for threads in (1, 3):
-        native.set_threads(threads)
+        set_threads(threads)
         leaves = [t.clone().requires_grad_() for t in (logits, coarse, rgb, weight)]
         sky = native_ops.over(leaves[2], leaves[3][None], leaves[1])
         value = native_ops.class_loss(leaves[0], target, weight, 10.0) + sky.square().sum()
@@ -285,7 +261,7 @@ def test_adam_equals_its_float64_twin(isa: str, shape: tuple[int, ...], sparse: 
     for step in range(1, 6):
         gradient = torch.randn(shape, generator=generator)
         adam(mine[0], gradient, mine[1], mine[2], 1e-2, step, visible)
-        twin(exact[0], gradient.double(), exact[1], exact[2], 1e-2, step, visible)
+        adam(exact[0], gradient.double(), exact[1], exact[2], 1e-2, step, visible)
     for got, want in zip(mine, exact):
         torch.testing.assert_close(got.double(), want, rtol=2e-6, atol=2e-6)
     if visible is not None:

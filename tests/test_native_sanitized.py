@@ -59,7 +59,7 @@ def test_kernels_are_clean_under_the_sanitizers(tmp_path: Path, monkeypatch: pyt
     tests = [str(ROOT / "tests" / name) for name in ("test_raster.py", "test_native.py")]
     # Loading other libraries on purpose, and forking, is what these tests do; the sanitizers have nothing to say to
     # that.
-    skipped = "not library and not five_million and not forked and not environment"
+    skipped = "not library and not forked and not environment"
     command = [sys.executable, "-c", RUN, str(library), *tests, "-k", skipped]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=1800, check=False)
     assert done.returncode == 0, (done.stdout + done.stderr)[-20000:]

@@ -57,50 +57,28 @@ def as_nobody(work: Callable[[], object], said: Path) -> int:
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
-def closed_folder(root: Path) -> list[str]:
-    (root / "scene").chmod(0)
-    return ["fuse", str(root / "scene"), "--out", str(root / "out")]
-
-
-def closed_file(root: Path) -> list[str]:
-    (root / "scene" / "scene.json").chmod(0)
-    return ["fuse", str(root / "scene"), "--out", str(root / "out")]
-
-
-def closed_image(root: Path) -> list[str]:
-    next((root / "scene" / "images" / "front").iterdir()).chmod(0)
-    return ["fuse", str(root / "scene"), "--out", str(root / "out")]
-
-
-def closed_output(root: Path) -> list[str]:
-    (root / "closed").mkdir()
-    (root / "closed").chmod(0o555)
-    return ["fuse", str(root / "scene"), "--out", str(root / "closed" / "out")]
-
-
-def closed_settings(root: Path) -> list[str]:
-    (root / "fuse.yaml").write_text("voxel_m: 0.2\n")
-    (root / "fuse.yaml").chmod(0)
-    return ["fuse", str(root / "scene"), "--config", str(root / "fuse.yaml"), "--out", str(root / "out")]
-
-
 @pytest.mark.parametrize(
-    ("close", "code", "words"),
+    ("closed", "mode", "code", "words"),
     [
-        (closed_folder, 5, "access to a file was refused"),
-        (closed_file, 3, "file cannot be read"),
-        (closed_image, 3, "file cannot be read"),
-        (closed_output, 5, "cannot create a folder"),
-        (closed_settings, 3, "file cannot be read"),
+        ("scene", 0, 5, "access to a file was refused"),
+        ("scene/scene.json", 0, 3, "file cannot be read"),
+        ("scene/images/front/000000.png", 0, 3, "file cannot be read"),
+        ("runs", 0o555, 5, "cannot create a folder"),
+        ("fuse.yaml", 0, 3, "file cannot be read"),
     ],
 )
 def test_what_is_closed_is_said(
-    close: Callable[[Path], list[str]], code: int, words: str, open_folder: Path, tmp_path: Path
+    closed: str, mode: int, code: int, words: str, open_folder: Path, tmp_path: Path
 ) -> None:
     toy_views.write_scene(open_folder / "scene", lidar=True)
+    (open_folder / "fuse.yaml").write_text("voxel_m: 0.2\n")
+    (open_folder / "runs").mkdir()
+    (open_folder / "runs").chmod(0o777)
     for scene in ("scene", "none"):  # what it imports may lie where nobody else reads
         app.main(["fuse", str(open_folder / scene), "--out", str(tmp_path / "out")])
-    command = close(open_folder)
+    scene, config, out = (str(open_folder / name) for name in ("scene", "fuse.yaml", "runs/out"))
+    command = ["fuse", scene, "--config", config, "--out", out]
+    (open_folder / closed).chmod(mode)
     assert as_nobody(lambda: app.main(command), tmp_path / "said") == code
     said = (tmp_path / "said").read_text()
     assert words in said and "Permission denied" in said and "Traceback" not in said

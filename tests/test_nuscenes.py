@@ -156,7 +156,7 @@ BROKEN: dict[str, tuple[str, Callable[[Rows], object], str]] = {
     ),
     "three rotation values": ("ego_pose", lambda r: r[0].update(rotation=[1, 0, 0]), "missing or malformed"),
     "translation is a text": ("ego_pose", lambda r: r[0].update(translation=["1", 2, 3]), "missing or malformed"),
-    "intrinsics sheared": ("calibrated_sensor", shear, "intrinsics are malformed"),
+    "intrinsics sheared": ("calibrated_sensor", shear, "not of a pinhole camera"),
     "file outside the release": (DATA, updating(filename="../../etc/passwd"), "file name contains"),
     "missing timestamp": (DATA, lambda r: of_scene(r).pop("timestamp"), "missing or malformed"),
     "two records with one token": (DATA, lambda r: r.append(of_scene(r)), "two records"),

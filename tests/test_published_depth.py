@@ -4,8 +4,6 @@ one is found out.
 Exact depth is the ray-traced city's, or LiDAR points projected in float64.
 """
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
@@ -16,10 +14,11 @@ from mudg.base.types import Photo
 from mudg.city.config import CityConfig
 from mudg.city.world import CityWorld
 from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
-from mudg.diffusion.condition import ConditionRules, build_conditions
+from mudg.diffusion.condition import ConditionRules, DriveInputs, build_conditions
 from mudg.diffusion.published import PublishedLatents
 from mudg.diffusion.requests import SampleRequest
 from mudg.formats.settings import IngestConfig
+from mudg.networks.codec import MODALITIES, Decoded
 from mudg.scene.clouds import read_fused
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
@@ -36,15 +35,11 @@ def standing_in(monkeypatch, depth):
     factor = model.codec.factor
     cells = torch.zeros(1, frames, 1, height // factor, width // factor)
     latents = PublishedLatents(cells, cells, cells, cells + 1)
-    nothing = SimpleNamespace(
-        rgb=torch.zeros(frames, 3, height, width), depth=depth, semantics=torch.zeros(frames, height, width).long()
-    )
+    nothing = Decoded(torch.zeros(frames, 3, height, width), depth, torch.zeros(frames, height, width).long())
     monkeypatch.setattr(model, "encode_condition", lambda *_: latents)
     monkeypatch.setattr(model, "image_tokens", torch.nn.Identity())
     model.image_tokens.queries = torch.zeros(1)
-    monkeypatch.setattr(
-        model, "_denoise", lambda *_: (dict.fromkeys(("rgb", "depth", "semantics"), cells[0]), cells[0])
-    )
+    monkeypatch.setattr(model, "_denoise", lambda *_: (dict.fromkeys(MODALITIES, cells[0]), cells[0]))
     monkeypatch.setattr(model.codec, "decode", lambda *_: nothing)
     return model
 
@@ -70,9 +65,8 @@ def exact(request):
     recorded, (width, height) = request.param
     world, cloud, photos = city_of(*recorded)
     views = world.frame_views("front")
-    condition = build_conditions(
-        cloud, world.tracks(), views, photos, ConditionRules(width, height, *recorded, published=True)
-    )[0]
+    rules = ConditionRules(width, height, *recorded, published=True)
+    condition = build_conditions(DriveInputs(cloud, world.tracks(), photos), views, rules)[0]
     depth = np.stack([world.render(view.resized(width, height)).depth for view in views])[:, None]
     return condition, torch.from_numpy(np.nan_to_num(depth, nan=100.0, posinf=100.0)).float().clamp(max=100)
 
@@ -124,15 +118,12 @@ def kitti(shared_data, tmp_path_factory):
 def points_at(cloud, view):
     """Depth f64[H,W] of the nearest static point of every pixel, in float64, gaps taking the nearest pixel's."""
     camera = view.camera
-    x, y, z = (
-        np.linalg.inv(view.world_from_cam) @ np.c_[cloud.static.xyz.astype(np.float64), np.ones(len(cloud.static))].T
-    )[:3]
+    points = np.c_[cloud.static.xyz.astype(np.float64), np.ones(len(cloud.static))]
+    x, y, z = (np.linalg.inv(view.world_from_cam) @ points.T)[:3]
     ahead = z > 1
     x, y, z = x[ahead], y[ahead], z[ahead]
-    column, row = (
-        np.floor(camera.fx * x / z + camera.cx).astype(int),
-        np.floor(camera.fy * y / z + camera.cy).astype(int),
-    )
+    column = np.floor(camera.fx * x / z + camera.cx).astype(int)
+    row = np.floor(camera.fy * y / z + camera.cy).astype(int)
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (z < 100)
     depth = np.full((camera.height, camera.width), np.inf)
     np.minimum.at(depth, (row[inside], column[inside]), z[inside])
@@ -145,7 +136,7 @@ def test_points_of_a_recorded_drive_agree_with_themselves(kitti, monkeypatch, re
     scene, cloud = kitti
     views = [frame.view for frame in scene.frames_of(next(iter(scene.cameras)))][:FRAMES]
     size = (1024, 576)
-    condition = build_conditions(cloud, (), views, (), ConditionRules(*size, *recorded, published=True))[0]
+    condition = build_conditions(DriveInputs(cloud, (), ()), views, ConditionRules(*size, *recorded, published=True))[0]
     depth = torch.from_numpy(np.stack([points_at(cloud, view.resized(*size)) for view in views])[:, None]).float()
     for scale, shift_m in ((1.0, 0.0), *DISTORTIONS):
         clip = standing_in(monkeypatch, scale * depth + shift_m).sample(condition, SampleRequest(1))

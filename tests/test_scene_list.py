@@ -199,11 +199,11 @@ def test_drawing_ahead_draws_what_would_be_drawn(clips, tmp_path):
 
 def test_a_listed_log_is_cut_once_when_it_is_drawn(tmp_path, monkeypatch):
     calls = collections.Counter()
-    windows = [log_clips.LogWindow("front", ("a",), False)] * 3
+    windows = [log_clips.LogWindow(("a",), False)] * 3
     monkeypatch.setattr(shard_sources.log_clips, "log_source", lambda text: log_clips.LogSource(tmp_path, tmp_path))
     monkeypatch.setattr(shard_sources.store, "digest", lambda path: "content")
     monkeypatch.setattr(shard_sources, "read_scene", lambda path: None)
-    monkeypatch.setattr(shard_sources.log_clips, "log_windows", lambda scene, rules: windows)
+    monkeypatch.setattr(log_clips.LogClipRules, "windows", lambda rules, scene: windows)
 
     def write_log(source, rules, chosen, folder):
         calls.update(["write"])

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from refusals import refused
+from test_location import _empty_memory, fsspec  # noqa: F401
 
 from mudg import app
 from mudg.base import staging, store
@@ -16,8 +17,6 @@ from mudg.base.errors import ResourceError
 from mudg.base.location import Location
 from mudg.editing.settings import ScoreConfig
 from mudg.steps.render import Report, Score
-
-fsspec = pytest.importorskip("fsspec", reason="the store in memory is fsspec's")
 
 CITY = "--city.n-frames 2 --city.width 48 --city.height 32 --city.cameras front --no-contact-sheet".split()
 
@@ -27,15 +26,6 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("scenes") / "city"
     assert app.main(["ingest", "city", str(out), *CITY, "--quiet"]) == 0
     return out
-
-
-@pytest.fixture(autouse=True)
-def _empty_memory() -> Iterator[None]:
-    files = fsspec.filesystem("memory")
-    files.store.clear()
-    files.pseudo_dirs[:] = [""]
-    yield
-    files.store.clear()
 
 
 @pytest.fixture

@@ -201,19 +201,19 @@ def test_boxes_of_the_real_frame_project_onto_the_recorded_rectangles(shared_dat
         projected = logs.parse_message(logs.read_payload(file, *place), message, "real")["projected"]
     log = TfrecordLog(path)
     frame = log.frames[0]
-    boxes = {box.id: box for box in frame.boxes}
+    boxes = {box[0]: box[2:] for box in frame.boxes}
     names = {number: name for name, number in made.CAMERA_NUMBERS.items()}
     errors = []
     for camera in projected:
         name = names[camera["name"]]
         calibration = log.cameras[name]
         pose, _ = waymo.middle_of_exposure(frame.shots[name])
-        cam_from_vehicle = invert(pose @ waymo.vehicle_from_cam(calibration)) @ frame.global_from_vehicle
+        cam_from_vehicle = invert(pose @ calibration.vehicle_from_cam()) @ frame.global_from_vehicle
         fx, fy, cx, cy, *lens = calibration.intrinsic
         for item in camera["labels"]:
-            box = next(box for key, box in boxes.items() if item["id"].startswith(key))
-            corners = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), -1).reshape(-1, 3) * box.size_m
-            corners = transform_points(cam_from_vehicle @ box.vehicle_from_box, corners)
+            vehicle_from_box, size_m = next(box for key, box in boxes.items() if item["id"].startswith(key))
+            corners = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), -1).reshape(-1, 3) * size_m
+            corners = transform_points(cam_from_vehicle @ vehicle_from_box, corners)
             if (corners[:, 2] < 0.5).any():
                 continue
             x, y = corners[:, 0] / corners[:, 2], corners[:, 1] / corners[:, 2]

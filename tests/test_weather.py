@@ -24,7 +24,7 @@ from mudg.base.weather_settings import (
     WeatherSettings,
 )
 from mudg.core import weather
-from mudg.core.weather import air, ground
+from mudg.core.weather import air
 from mudg.core.weather import light as relight
 from mudg.core.weather.gbuffer import (
     GBuffer,
@@ -175,18 +175,18 @@ def test_fog_by_hand() -> None:
 
 
 def test_water_mirrors_by_fresnel() -> None:
-    assert ground.fresnel(np.array([1.0, 0.0])) == pytest.approx([0.02, 1.0])
+    assert relight.fresnel(np.array([1.0, 0.0])) == pytest.approx([0.02, 1.0])
     exact = np.cos(np.radians(60)), np.sqrt(1 - (np.sin(np.radians(60)) / 1.33) ** 2)
     rs = ((exact[0] - 1.33 * exact[1]) / (exact[0] + 1.33 * exact[1])) ** 2
     rp = ((exact[1] - 1.33 * exact[0]) / (exact[1] + 1.33 * exact[0])) ** 2
-    assert float(ground.fresnel(np.array(exact[0]))) == pytest.approx((rs + rp) / 2, abs=0.012)
+    assert float(relight.fresnel(np.array(exact[0]))) == pytest.approx((rs + rp) / 2, abs=0.012)
 
 
 def test_the_image_of_a_wall_is_found_in_the_road() -> None:
     """A ray from the road at distance x meets the wall at the height that similar triangles give."""
     view = forward_view()
     scene = street(view)
-    mirror = ground.screen_mirror(scene, view, LIGHT)
+    mirror = relight.screen_mirror(scene, view, LIGHT)
     rays, _ = world_rays(view)
     points = world_points(view, scene.depth)
     road = (scene.classes == ID["road"]) & (np.abs(rays[..., 1]) < 0.2)
@@ -202,23 +202,23 @@ def test_the_image_of_a_wall_is_found_in_the_road() -> None:
 def test_wet_road_is_darker_below_the_camera_and_changes_nothing_else() -> None:
     view = forward_view(pitch=0.6)
     scene = street(view)
-    wet = ground.wet_ground(scene, view, LIGHT, 1.0, 0.0, 3)
+    wet = relight.wet_ground(scene, view, LIGHT, 1.0, 0.0, 3)
     road = scene.classes == ID["road"]
     np.testing.assert_array_equal(wet[~road], scene.color[~road])
     steep = road & (world_points(view, scene.depth)[..., 0] < 2.5)
     assert steep.sum() > 20
-    np.testing.assert_allclose(wet[steep], 0.08 * ground.WET_DARKENING, atol=0.03)
+    np.testing.assert_allclose(wet[steep], 0.08 * relight.WET_DARKENING, atol=0.03)
 
 
 def test_snow_lies_on_level_open_ground_only() -> None:
     view = forward_view()
     scene = street(view)
-    cover = ground.snow_cover(scene, view, 1.0, 4)
+    cover = relight.snow_cover(scene, view, 1.0, 4)
     assert (cover[scene.classes == ID["road"]] == 1).all()
     assert not cover[scene.classes == ID["building"]].any()
     assert not cover[scene.sky].any()
     covered_over = replace(scene, openness=np.zeros_like(scene.openness))
-    assert not ground.snow_cover(covered_over, view, 1.0, 4).any()
+    assert not relight.snow_cover(covered_over, view, 1.0, 4).any()
 
 
 # --- light ----------------------------------------------------------------------------------------
@@ -325,13 +325,13 @@ def test_a_drive_is_edited_image_by_image() -> None:
         scene = street(view)
         shown.append(weather.ShownView(view, relight.srgb_encode(scene.color), scene.depth, scene.classes))
     drive = weather.drive_facts(shown)
-    assert drive.surroundings.ground_z_m == pytest.approx(0, abs=1e-3)
+    assert drive.ground_z_m == pytest.approx(0, abs=1e-3)
     assert drive.heights.top_m.max() == pytest.approx(6, abs=0.3)
     same = weather.edited_view(shown[0], Conditions(), 1, drive)
     np.testing.assert_allclose(same, shown[0].rgb, atol=1e-5)
     foggy = weather.edited_view(shown[0], CASES["fog"], 1, drive)
     wall = shown[0].classes == ID["building"]
-    haze = relight.srgb_encode(drive.surroundings.airlight[None])[0]
+    haze = relight.srgb_encode(drive.airlight[None])[0]
     assert np.abs(foggy - haze)[wall].mean() < 0.5 * np.abs(shown[0].rgb - haze)[wall].mean()
     refused("estimated from views", weather.drive_facts, [])
 

@@ -6,6 +6,8 @@ from __future__ import annotations
 import json
 import sys
 import warnings
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,32 @@ def small_mdm(**changes: Any) -> MDMConfig:
     attention = {"spatial_attention": (False, True), "temporal_attention": (False, True)}
     codec = CodecConfig(decoder_width=8, decoder_blocks=1)
     return MDMConfig(**{**size, **attention, "codec": codec, "patch": 2, "window": 4, "area_px": 24576, **changes})
+
+
+TINY = small_mdm(widths=(16, 24), head_width=8, patch=1, window=8)
+PLAIN = replace(TINY, refine_widths=(), refine_blocks=())
+FINISHING = replace(TINY, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1))
+
+
+def randomise(values: Iterable[torch.Tensor], seed: int = 0, gain: float = 0.5, bias: float = 0.1) -> None:
+    """Fill weights and biases with random numbers, so that every path matters."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for value in values:
+            scale = gain / value[0].numel() ** 0.5 if value.ndim > 1 else bias
+            value.copy_(torch.randn(value.shape, generator=generator) * scale)
+
+
+def learn_part(model: MDM) -> list[torch.nn.Parameter]:
+    """Parameters that training changes after the codec."""
+    return [p for n, p in model.named_parameters() if not n.startswith("codec.")]
+
+
+def randomised(config: MDMConfig) -> MDM:
+    """A model whose zero-initialised layers are random too."""
+    model = MDM(config).eval()
+    randomise(learn_part(model))
+    return model
 
 
 def saved_mdm(folder: Path, **changes: Any) -> Path:
@@ -116,8 +144,7 @@ def _marigold(folder: Path) -> tuple[Any, Any]:
 
 
 def depthlab(folder: Path) -> dict[str, Any]:
-    """DepthLab's files as they are published, around a Marigold and a CLIP of vectors of six numbers;
-    the networks."""
+    """DepthLab's files as they are published, around a Marigold and a CLIP of vectors of six numbers; the networks."""
     t, d = package("transformers"), package("diffusers")
     unet, vae = _marigold(folder / "marigold-depth-v1-0")
     config = {name: value for name, value in unet.config.items() if not name.startswith("_")}

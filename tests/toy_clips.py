@@ -7,6 +7,7 @@ import json
 import signal
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,46 @@ from mudg.base.types import Camera, Clip, Condition, FinePatch, RenderPlanes, Vi
 from mudg.diffusion.city_clips import HELD_OUT
 from mudg.diffusion.clips import write_shard
 from mudg.diffusion.learn import DrawingAhead
+from mudg.diffusion.network import ConditionPixels
 from mudg.diffusion.settings import LearnCodec, LearnConfig
 
 WIDTH, HEIGHT, WINDOW = 48, 32, 4
+
+
+def some_ids(generator: torch.Generator, frames: int, height: int, width: int) -> torch.Tensor:
+    """Classes 0 to 18, and one in five unknown."""
+    ids = torch.randint(0, 19, (frames, 1, height, width), generator=generator, dtype=torch.uint8)
+    return torch.where(torch.rand(ids.shape, generator=generator) < 0.2, torch.full_like(ids, 255), ids)
+
+
+def some_condition(frames: int = 3, height: int = 16, width: int = 24, seed: int = 0) -> Condition:
+    """A condition of random numbers."""
+    generator = torch.Generator().manual_seed(seed)
+    camera = Camera("front", width, height, 20.0, 20.0, width / 2, height / 2)
+    views = tuple(View(camera, np.eye(4), 0.1 * t) for t in range(frames))
+    draw = lambda *shape: torch.rand(*shape, height, width, generator=generator)
+    color, depth, valid = draw(frames, 3), 3 + 60 * draw(frames, 1), draw(frames, 1) > 0.5
+    reference, warped, backdrop = draw(3), draw(frames, 1) > 0.3, draw(frames, 3)
+    ids = [some_ids(generator, frames, height, width) for _ in range(2)]
+    return Condition(views, color, depth, valid, reference, warped, backdrop, *ids)
+
+
+def some_clip() -> Clip:
+    """A clip of random numbers; a part of its depth is not true."""
+    generator = torch.Generator().manual_seed(1)
+    rgb, depth = (torch.rand(3, channels, 16, 24, generator=generator) for channels in (3, 1))
+    ids = torch.randint(0, 19, (3, 16, 24), generator=generator)
+    return Clip(some_condition(), rgb, 80 * depth, depth > 0.06, ids)
+
+
+def some_pixels(height: int, width: int, frames: int = 2, seed: int = 0) -> ConditionPixels:
+    """A condition of random pixels, with renders."""
+    generator = torch.Generator().manual_seed(seed)
+    image = lambda c: torch.rand(frames, c, height, width, generator=generator) * 2 - 1
+    mask = lambda: (image(1) > 0).float()
+    ids = lambda: torch.randint(0, 19, (frames, 1, height, width), generator=generator, dtype=torch.uint8)
+    own = image(3), image(3), image(1), mask(), mask(), ids(), ids()
+    return ConditionPixels(*own, image(3), image(1), mask(), image(1).abs(), ids())
 
 
 def made_up_clip(seed: int, width: int = WIDTH, height: int = HEIGHT) -> Clip:
@@ -46,13 +84,16 @@ def made_up_clip(seed: int, width: int = WIDTH, height: int = HEIGHT) -> Clip:
     return Clip(condition, rgb, depth, depth < 500, ids)
 
 
+def part_of(x: torch.Tensor, row: int, column: int, side: int = 12, scale: int = 2) -> torch.Tensor:
+    """What a patch made by `with_patch` shows of an image of its clip."""
+    cut = x[..., row : row + side, column : column + side]
+    return cut.repeat_interleave(scale, -1).repeat_interleave(scale, -2)
+
+
 def with_patch(clip: Clip, row: int = 6, column: int = 10, side: int = 12, scale: int = 2) -> Clip:
     """The clip with a patch that shows a square of it `scale` times finer (and no more sharply)."""
 
-    def finer(x: torch.Tensor) -> torch.Tensor:
-        cut = x[..., row : row + side, column : column + side]
-        return cut.repeat_interleave(scale, -1).repeat_interleave(scale, -2)
-
+    finer = partial(part_of, row=row, column=column, side=side, scale=scale)
     c = clip.condition
     camera = Camera("front", side * scale, side * scale, 40.0 * scale, 40.0 * scale, side * scale / 2, side * scale / 2)
     assert c.renders is not None

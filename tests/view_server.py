@@ -32,10 +32,10 @@ def serving(
 ) -> Iterator[tuple[int, str]]:
     """Port and token of a server of a fit. ``edits``: script that the page begins with, and where edits are saved."""
     config = ViewConfig(**{"images": 0, "browser": False, "device": "cpu", **settings})
-    server, site = view.server_of(config, fit, compare, scene, *edits)
+    server = view.server_of(config, fit, compare, scene, *edits)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
-        yield server.server_address[1], site.token
+        yield server.server_address[1], server.token
     finally:
         server.shutdown()
         server.server_close()

@@ -35,9 +35,10 @@ from mudg.core.noise import ScheduleConfig
 from mudg.core.pictures import class_colors, depth_colors, to_bytes
 from mudg.diffusion import city_clips, model_files, models
 from mudg.diffusion import clips as clip_shards
+from mudg.diffusion.model_files import generated
 from mudg.diffusion.published import GUIDANCE, PublishedConfig, PublishedLatents, PublishedMDM, WorkSplit
 from mudg.diffusion.published_network import AutoencoderConfig, ResamplerConfig, VideoUNetConfig
-from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated
+from mudg.diffusion.requests import GeneratedClip, SampleRequest
 from mudg.networks.clip import TowerConfig
 from mudg.networks.codec import MODALITIES
 from mudg.networks.featnets import CodecFeatures, PerceptualDistance
@@ -348,7 +349,9 @@ def main(words: Sequence[str] | None = None) -> dict[str, Any]:
     rules, config = (SMALL_RULES, SMALL_CONFIG) if options.small else (RULES, CONFIG)
     seen, unseen = range(options.cities), city_clips.REPORTED[: 1 if options.small else None]
     (work / "clips").mkdir(parents=True, exist_ok=True)
-    city_clips.write_missing(rules, [*seen, *unseen], work / "clips")
+    missing = [city for city in (*seen, *unseen) if not clip_shards.shard_path(work / "clips", city).is_file()]
+    for city in log.progress(missing, len(missing), "generating cities"):
+        city_clips.write_city(rules, city, work / "clips")
     model = trained(options, config, every_clip(work / "clips", seen, rules.window), device)
     clips = every_clip(work / "clips", unseen, rules.window)[: options.clips]
     distance = PerceptualDistance(CodecFeatures(model_files.load("embedded").codec))

@@ -114,11 +114,8 @@ def _smaller(words: Sequence[str]) -> str:
 
 
 def find_verb(words: Sequence[str]) -> tuple[str, list[str]]:
-    """The verb of a command line, of one word or two, and the words behind it.
-
-    Raises:
-        UsageError: there is no such verb; the nearest is named.
-    """
+    """The verb of a command line, of one word or two, and the words behind it. UsageError: there is no such verb; the
+    nearest is named."""
     from mudg import steps
 
     name, rest = words[0], list(words[1:])
@@ -160,11 +157,8 @@ def _listed(names: Sequence[str]) -> list[str]:
 
 
 def parse(words: Sequence[str]) -> tuple[Step, Common]:
-    """A command line as its step, and the flags that every command has.
-
-    Raises:
-        UsageError: an unknown verb or flag, a missing or wrong value. InputError: --config cannot be read.
-    """
+    """A command line as its step, and the flags that every command has. UsageError: an unknown verb or flag, a missing
+    or wrong value. InputError: --config cannot be read."""
     from mudg import steps
     from mudg.steps import command
 
@@ -186,9 +180,7 @@ def _run_verb(verb: str, words: Sequence[str]) -> tuple[dict[str, Any], bool]:
 
         processes.hold_life_line()
 
-    def call(placed: Any) -> dict[str, Any]:
-        return placed.answer(placed.run())
-
+    call = lambda placed: placed.answer(placed.run())
     with _sigterm_interrupts():
         # whose workers stage in and out for every step
         if any("://" in word for word in words) and not verb.startswith("batch"):
@@ -236,12 +228,11 @@ def _sigterm_interrupts() -> Iterator[None]:
     def stop(_number: int, _frame: object) -> None:
         raise Terminated
 
+    before = signal.getsignal(signal.SIGTERM)
     try:
-        before = signal.signal(signal.SIGTERM, stop)
-    except ValueError:  # not the main thread
-        yield
-        return
-    try:
+        with contextlib.suppress(ValueError):  # not the main thread
+            signal.signal(signal.SIGTERM, stop)
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        with contextlib.suppress(ValueError):
+            signal.signal(signal.SIGTERM, before)

@@ -60,11 +60,10 @@ def checked_address(text: str) -> str:
         what, where = "an address holds a query, which may be a secret", f"{scheme}://{head.partition('?')[0]}/..."
         raise UsageError(what, where=where, expected=f"{scheme}://bucket/folder", remedy="leave the part from ? on out")
     parts = [part for part in tail.split("/") if part]
-    if ".." in parts or "." in parts or "\0" in rest or "::" in head:
+    what = "an address is not plain" if {"..", "."} & {*parts} or "\0" in rest or "::" in head else ""
+    if what or (not head and scheme != "memory"):
         where, expected = text[:200].replace("\0", "?"), f"{scheme}://bucket/folder"
-        raise UsageError("an address is not plain", where=where, expected=expected)
-    if not head and scheme != "memory":
-        raise UsageError("an address names no bucket", where=text[:200], expected=f"{scheme}://bucket/folder")
+        raise UsageError(what or "an address names no bucket", where=where, expected=expected)
     return f"{scheme}://" + "/".join(part for part in (head, *parts) if part)
 
 
@@ -196,12 +195,6 @@ def _plain(name: str, where: str) -> str:
     if not parts or name.startswith("/") or ".." in parts or any(one in name for one in foreign):
         raise IntegrityError("a name leads out of its folder", where=where, got=repr(name)[:200])
     return name
-
-
-def _files_below(folder: Path) -> list[str]:
-    """Relative POSIX names of all regular files, sorted, without temporary ones and locks."""
-    names = (name for name in store.all_names(folder) if PurePosixPath(name).name not in ("lock", CONTENTS))
-    return [name for name in names if ".part" not in name and (folder / name).is_file()]
 
 
 # locations ----------------------------------------------------------------------------------------
@@ -403,7 +396,8 @@ class Location:
         frm = Path(frm)
         if not frm.is_dir():
             raise InputError("no folder to upload", where=str(frm))
-        paths = {name: frm / name for name in _files_below(frm)}
+        names = (one for one in store.all_names(frm) if ".part" not in one and (frm / one).is_file())
+        paths = {one: frm / one for one in names if PurePosixPath(one).name not in ("lock", CONTENTS)}
         files = {name: Expected(path.stat().st_size, store.sha256_file(path)) for name, path in paths.items()}
         sizes, earlier = self.tree(), self.uploaded()
         before = earlier.files if earlier is not None else {}

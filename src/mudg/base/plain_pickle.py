@@ -118,17 +118,10 @@ NUMPY_MAKERS: Final[Mapping[str, Maker | None]] = {
 
 
 def read_pickle(content: bytes, where: str, makers: Mapping[str, Maker | None]) -> Any:
-    """Plain values from a pickle: numbers, texts, bytes, lists, tuples, dicts, ``Array``, ``PickledObject``.
-
-    Args:
-        content: the pickle, protocol 0 to 5.
-        where: for messages.
-        makers: name in the file (``module.name``) -> function from plain values to a plain value; None = a class or
-            name that may only be mentioned: objects of it become a ``PickledObject``.
-
-    Raises:
-        InputError: cut off, malformed, too large, or it names something that is not in ``makers``.
-    """
+    """Plain values from a pickle, protocol 0 to 5: numbers, texts, bytes, lists, tuples, dicts, ``Array``,
+    ``PickledObject``. makers: name in the file (``module.name``) -> function from plain values to a plain value; None =
+    a class or name that may only be mentioned: objects of it become a ``PickledObject``. InputError: cut off,
+    malformed, too large, or it names something that is not in ``makers``."""
     if len(content) > MAX_BYTES:
         got = f"{len(content)} bytes"
         raise InputError("pickle is too large", where=where, expected=f"<= {MAX_BYTES} bytes", got=got)
@@ -234,12 +227,8 @@ class _Machine:
         if opcode in ("EMPTY_LIST", "EMPTY_DICT", "EMPTY_TUPLE"):
             stack.append({"EMPTY_LIST": [], "EMPTY_DICT": {}, "EMPTY_TUPLE": ()}[opcode])
         elif opcode in ("TUPLE1", "TUPLE2", "TUPLE3"):
-            size = int(opcode[-1])
-            items = tuple(stack[-size:])
-            del stack[-size:]
-            if len(items) != size:
-                raise IndexError("stack is too short")
-            stack.append(items)
+            items = [stack.pop() for _ in range(int(opcode[-1]))]
+            stack.append(tuple(items[::-1]))
         elif opcode in ("TUPLE", "LIST"):
             items = self._since_mark()
             stack.append(tuple(items) if opcode == "TUPLE" else items)

@@ -41,17 +41,9 @@ Lines = dict[tuple[str | int, ...], int]
 
 def parse_yaml(text: str | bytes, where: str, largest: int = LARGEST_BYTES, lines: Lines | None = None) -> Any:
     """The value that YAML text stands for: null, true or false, decimal numbers, texts, lists, and mappings whose keys
-    are texts.
-
-    Dates, numbers in other bases and numbers with colons are texts.
-
-    Args:
-        where: name of the file for messages. largest: bytes that it may have. lines: gets the line of each value.
-
-    Raises:
-        InputError: it is not YAML, says what a plain value is, has anchors, or is larger, deeper or holds more values
-            than any file of its kind.
-    """
+    are texts. Dates, numbers in other bases and numbers with colons are texts. where: name of the file for messages.
+    largest: bytes that it may have. lines: gets the line of each value. InputError: it is not YAML, says what a plain
+    value is, has anchors, or is larger, deeper or holds more values than any file of its kind."""
     if len(text) > largest:
         raise InputError("YAML file is too large", where=where, expected=f"at most {largest} bytes", got=f"{len(text)}")
     reader = _Reader(where, largest // BYTES_A_VALUE, lines)

@@ -62,7 +62,8 @@ def one_torch_thread() -> Iterator[None]:
 @contextlib.contextmanager
 def child_environment() -> Iterator[None]:
     """Environment of processes started in this block: one thread each, and waiting without spinning."""
-    wanted = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE", "MUDG_THREADS": "1"}
+    counts = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MUDG_THREADS")
+    wanted = {"OMP_WAIT_POLICY": "PASSIVE", **dict.fromkeys(counts, "1")}
     before = {name: os.environ[name] for name in wanted if name in os.environ}
     os.environ.update(wanted)
     try:
@@ -287,22 +288,22 @@ _stop_asked = threading.Event()
 
 def _stoppable(function: Callable[..., Result], items: tuple[Any, ...]) -> Result:
     """A call in a worker; SIGTERM and Ctrl-C raise KeyboardInterrupt in it, unless it takes them (``Interruption``)."""
+
+    def stop(*_: object) -> None:
+        if not _stop_asked.is_set():  # once: what tidies up is not stopped again
+            _stop_asked.set()
+            raise KeyboardInterrupt
+
     heard = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) != signal.SIG_IGN]
     try:
         for number in heard:
-            signal.signal(number, _stop_call)
+            signal.signal(number, stop)
         if _stop_asked.is_set():
             raise KeyboardInterrupt
         return function(*items)
     finally:
         for number in heard:
             signal.signal(number, lambda *_: _stop_asked.set())
-
-
-def _stop_call(_number: int, _frame: types.FrameType | None) -> None:
-    if not _stop_asked.is_set():  # once: what tidies up is not stopped again
-        _stop_asked.set()
-        raise KeyboardInterrupt
 
 
 class _Spawning(SpawnContext):
@@ -317,7 +318,7 @@ class _Spawning(SpawnContext):
 
 
 class Pool(concurrent.futures.ProcessPoolExecutor):
-    """A pool of quiet processes of one torch thread each."""
+    """A pool of quiet processes, to be used within ``child_environment``: of one thread each."""
 
     def __init__(self, processes: int) -> None:
         self._spawning = _Spawning()
@@ -330,10 +331,7 @@ class Pool(concurrent.futures.ProcessPoolExecutor):
 
 
 def _prepare_child() -> None:
-    import torch
-
     log.set_quiet(True)
-    torch.set_num_threads(1)
     parent = multiprocessing.parent_process()
     if parent is not None:  # a worker would wait for work for ever
         _end_after(functools.partial(wait, [parent.sentinel]), "parent")
@@ -394,7 +392,7 @@ def run_limited(work: Callable[[], None], limit_bytes: int, where: Path) -> int:
     the limit was reached, or the process was ended from outside. And what the work itself raises."""
     if sys.platform != "linux":
         log.warn("this system has no limit of address space; a hostile file may take all memory")
-    with Pool(1) as pool:
+    with child_environment(), Pool(1) as pool:
         try:
             return pool.submit(_limited, work, limit_bytes, where).result()
         except BrokenProcessPool as error:

@@ -36,28 +36,14 @@ OwnNames = Callable[[Path], Sequence[str]]
 those last that the function itself reads. All other files belong to somebody else."""
 
 
-@dataclass(frozen=True)
 class Replacement:
-    """A folder whose content is replaced as a whole by one that is made beside it: ``.NAME.new.part``. The old content
-    is ``.NAME.old.part`` from the moment the new one has its name until the files of the old result are removed; those
-    of somebody else move to the new folder. Links are resolved: see ``Replacement.at``."""
+    """The folder that a path names or links to, and whose content is replaced as a whole by one that is made beside it:
+    ``.NAME.new.part`` (``staging``). The old content is ``.NAME.old.part`` (``retired``) from the moment the new one
+    has its name until the files of the old result are removed; those of somebody else move to the new folder."""
 
-    folder: Path
-
-    @classmethod
-    def at(cls, path: Path) -> Replacement:
-        """For the folder that ``path`` names or links to; it need not exist."""
-        return cls(Path(os.path.realpath(path)))
-
-    @property
-    def staging(self) -> Path:
-        """Where the new content is made."""
-        return store.staging_path(self.folder)
-
-    @property
-    def retired(self) -> Path:
-        """Where the old content waits for its removal."""
-        return store.retired_path(self.folder)
+    def __init__(self, path: Path) -> None:
+        self.folder = Path(os.path.realpath(path))
+        self.staging, self.retired = store.staging_path(self.folder), store.retired_path(self.folder)
 
     def begin(self) -> Path:
         """Make the staging folder, or take up the one that is there. ResourceError: a mount point, or it cannot be
@@ -223,14 +209,9 @@ class _State(ForeignRecord):
 
 @dataclass(frozen=True)
 class VerbOutput:
-    """What a verb writes.
-
-    Args:
-        verb: its name. version: counts up when its rules change; older results are then made again.
-        files: names of its files, relative to the folder, as patterns: ``*`` stands for any part of one name, and a
-            ``/`` at the end for everything below. A file that matches none belongs to somebody else: it is not listed
-            and never removed.
-    """
+    """What a verb writes. version: counts up when its rules change; older results are then made again. files: names of
+    its files, relative to the folder, as patterns: ``*`` stands for any part of one name, and a ``/`` at the end for
+    everything below. A file that matches none belongs to somebody else: it is not listed and never removed."""
 
     verb: str
     version: int
@@ -239,13 +220,12 @@ class VerbOutput:
 
 def _matches(name: str, patterns: Sequence[str]) -> bool:
     parts = name.split("/")
-
-    def fits(pattern: str) -> bool:
+    for pattern in patterns:
         wanted = pattern.rstrip("/").split("/")
         length = len(parts) > len(wanted) if pattern.endswith("/") else len(parts) == len(wanted)
-        return length and all(map(fnmatchcase, parts, wanted))
-
-    return any(map(fits, patterns))
+        if length and all(map(fnmatchcase, parts, wanted)):
+            return True
+    return False
 
 
 def is_temporary(name: str) -> bool:
@@ -365,20 +345,14 @@ class RunDir:
 
         ``complete`` is True when an earlier run with the same key finished and its manifest verifies: the verb then
         returns at once. An unfinished run with the same key is continued, also one that is to replace another result.
-
-        Args:
-            inputs: name -> digest of what is read. paths: name -> where it lies, for who asks the result later
-                (`known_input`).
-            overwrite: replace a result of another key, or one that was altered, as soon as the new one is finished.
-
-        Raises:
-            UsageError: the folder holds the output of another verb or configuration, or files of somebody else.
-            IntegrityError: the finished result was altered. ResourceError: it cannot be written, or another live
-                process is working in it.
-        """
+        inputs: name -> digest of what is read. paths: name -> where it lies, for who asks the result later
+        (`known_input`). overwrite: replace a result of another key, or one that was altered, as soon as the new one is
+        finished. UsageError: the folder holds the output of another verb or configuration, or files of somebody else.
+        IntegrityError: the finished result was altered. ResourceError: it cannot be written, or another live process
+        is working in it."""
         out, values = Path(path), [output.verb, output.version, dict(config), dict(inputs)]
         key = hashlib.sha256(store.json_text(values, indent=None).encode()).hexdigest()
-        own, replacement = functools.partial(own_names, output), Replacement.at(out)
+        own, replacement = functools.partial(own_names, output), Replacement(out)
         replacement.recover(_is_finished, own)
         state, staged = run_state(out), run_state(replacement.staging)
         same = state.get("key") == key
@@ -493,7 +467,7 @@ class RunDir:
         self.complete = True
 
     def _take_place(self) -> None:
-        Replacement.at(self.out).swap(functools.partial(own_names, self._output))
+        Replacement(self.out).swap(functools.partial(own_names, self._output))
         self.path = self.out
 
     def reused(self) -> Path:
@@ -607,16 +581,10 @@ class ResultFile:
         forms: Sequence[Path] = (),
         overwrite: bool = False,
     ) -> Iterator[ResultFile]:
-        """Hold the output of a verb. Call ``refuse_overlap`` first.
-
-        Args:
-            inputs: name -> digest of what is read. forms: where the result may lie (none: at ``out``). overwrite:
-                replace what is there.
-
-        Raises:
-            UsageError: another result, or somebody else's file, is there. IntegrityError: the finished result was
-                altered. ResourceError: it cannot be written, or another live process is writing it.
-        """
+        """Hold the output of a verb. Call ``refuse_overlap`` first. inputs: name -> digest of what is read. forms:
+        where the result may lie (none: at ``out``). overwrite: replace what is there. UsageError: another result, or
+        somebody else's file, is there. IntegrityError: the finished result was altered. ResourceError: it cannot be
+        written, or another live process is writing it."""
         key = hashlib.sha256(store.json_text([verb, dict(settings), dict(inputs)], indent=None).encode()).hexdigest()
         result = cls(Path(out), verb, key, forms)
         with locked(result._lock, out):

@@ -14,7 +14,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -53,7 +53,8 @@ def run_staged(
     flags = {item.name: getattr(args, item.name) for item in fields(args) if item.name != "settings"}
     inputs, outputs = dict[Location, str](), dict[Location, str]()
     for name, value in flags.items():
-        for given in _addresses(value):
+        several = value.values() if isinstance(value, Mapping) else value if isinstance(value, tuple) else (value,)
+        for given in filter(None, map(_address, several)):
             if name == "config":
                 what, remedy = "--config is a file of this machine", "fetch it first"
                 raise UsageError(what, where="--config", got=str(given), remedy=remedy)
@@ -61,7 +62,13 @@ def run_staged(
             known.setdefault(given, f"{part}/{len(known)}/{given.name}")
     if not inputs and not outputs:
         return call(args)
-    _refuse_touching(inputs, outputs)
+    for out in outputs:
+        if out.text.count("/") < 3:
+            raise UsageError("an output is a folder or file in a bucket", where=str(out), expected=f"{out}/name")
+        for given in inputs:
+            if f"{out}/".startswith(f"{given}/") or f"{given}/".startswith(f"{out}/"):
+                where, remedy = f"output: {out}", "choose an output apart from everything that is read"
+                raise UsageError("the output touches an input", where=where, got=f"input: {given}", remedy=remedy)
     key = hashlib.sha256("\n".join([verb, *sorted(map(str, {*inputs, *outputs}))]).encode()).hexdigest()[:12]
     root = Path(tempfile.gettempdir()) if scratch is None else scratch
     folder = root.absolute() / f"mudg-{verb.replace(' ', '-')}-{key}"
@@ -106,16 +113,6 @@ def _shown(value: Any, places: Mapping[Location, Path]) -> Any:
 # what is where ------------------------------------------------------------------------------------
 
 
-def _refuse_touching(inputs: Iterable[Location], outputs: Iterable[Location]) -> None:
-    for out in outputs:
-        if out.text.count("/") < 3:
-            raise UsageError("an output is a folder or file in a bucket", where=str(out), expected=f"{out}/name")
-        for given in inputs:
-            if f"{out}/".startswith(f"{given}/") or f"{given}/".startswith(f"{out}/"):
-                where, remedy = f"output: {out}", "choose an output apart from everything that is read"
-                raise UsageError("the output touches an input", where=where, got=f"input: {given}", remedy=remedy)
-
-
 @contextlib.contextmanager
 def _alone_in(folder: Path) -> Iterator[None]:
     """The scratch folder, for this process and user alone: its name can be guessed, and the system's temporary folder
@@ -136,14 +133,6 @@ def _alone_in(folder: Path) -> Iterator[None]:
         again = "the same command goes on with it. Delete the folder to give it up"
         log.info(f"{folder} keeps what was fetched and made: {again}")
         raise
-
-
-def _addresses(value: Any) -> Iterator[Location]:
-    several = value.values() if isinstance(value, Mapping) else value if isinstance(value, tuple) else (value,)
-    for one in several:
-        found = _address(one)
-        if found is not None:
-            yield found
 
 
 def _address(value: Any) -> Location | None:

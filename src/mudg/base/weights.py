@@ -275,9 +275,6 @@ def published_names(clean: Iterable[str]) -> dict[str, str]:
 class _Ignored:
     """Stand-in for an object that a training framework left in a checkpoint. Keeps nothing, does nothing."""
 
-    def __new__(cls, *_: object, **__: object) -> _Ignored:
-        return super().__new__(cls)
-
     def __init__(self, *_: object, **__: object) -> None: ...
 
     def __setstate__(self, _: object) -> None: ...
@@ -314,10 +311,7 @@ def read_checkpoint(path: Path) -> dict[str, Tensor]:
     Understood: a training-framework file (`state_dict` inside), a DeepSpeed file (`module` inside, names that start
     with `_forward_module.`), a plain mapping of names to tensors, safetensors, and a TorchScript archive, of which only
     the tensors are read. Tensors are mapped from the file where its format allows, so that memory is taken as they are
-    used.
-
-    Raises:
-        InputError: missing, truncated, or holds objects that are not on the list of harmless ones, or no tensors.
+    used. InputError: missing, truncated, or holds objects that are not on the list of harmless ones, or no tensors.
     """
     path = Path(path)
     if not path.is_file():

@@ -18,7 +18,6 @@ from torch import Tensor
 
 from mudg.base import seeds
 from mudg.base.palette import DYNAMIC_IDS
-from mudg.base.types import FusedCloud, Scene
 from mudg.core import losses, native_ops
 from mudg.core.raster.rasterize import rasterize
 from mudg.core.table import Table
@@ -26,9 +25,7 @@ from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import NodeRows, RigidNode
 from mudg.gaussians.recipes import DrawnView, Recipe
 from mudg.gaussians.rendering import boxes_in_view, objects_only
-from mudg.gaussians.settings import FitConfig
-from mudg.gaussians.start import start_model
-from mudg.gaussians.views import StoredView
+from mudg.gaussians.start import FitStart
 
 # curves -------------------------------------------------------------------------------------------
 #
@@ -215,11 +212,9 @@ SSIM_SHARE: Final = 0.2
 class BezierRecipe(Recipe):
     """See the module's text."""
 
-    def start(
-        self, scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
-    ) -> SceneModel:
+    def start(self, given: FitStart) -> SceneModel:
         """See ``Recipe``."""
-        model = start_model(scene, fused, views, classes, config)
+        model = given.model()
         columns = {name: value.detach() for name, value in model.table.columns.items()}
         table = Table(columns | {"curve": torch.zeros(len(model.table), 4, 3)}, model.table.labels)
         nodes = tuple(BezierNode.of_rigid(node) if isinstance(node, RigidNode) else node for node in model.nodes)

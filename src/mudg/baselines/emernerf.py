@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -41,31 +41,13 @@ ERROR_KEPT = 0.7
 BOX_PERCENTILES = (2.0, 98.0)
 
 
-@dataclass(frozen=True, eq=False)
-class LidarRays:
-    """M LiDAR measurements: origins and unit directions f32[M, 3], ranges f32[M] in metres, times f32[M] in seconds."""
-
-    origins: Tensor
-    directions: Tensor
-    range_m: Tensor
-    time_s: Tensor
-
-    def __len__(self) -> int:
-        return len(self.origins)
-
-    def batch(self, count: int, extent: fields.Extent, generator: torch.Generator) -> tuple[fields.Rays, Tensor]:
-        """``count`` of them, drawn with replacement, and their ranges."""
-        chosen = torch.randint(0, len(self), (count,), generator=generator)
-        times = ((self.time_s[chosen] - extent.start_s) / extent.span_s).clamp(0, 1)[:, None]
-        rays = fields.Rays(
-            self.origins[chosen], self.directions[chosen], times.float(), torch.zeros(count, dtype=torch.int64)
-        )
-        return rays, self.range_m[chosen]
+LidarRays = tuple[fields.Rays, Tensor]
+"""LiDAR measurements: rays with times in seconds f64[M, 1], and their ranges f32[M] in metres."""
 
 
 def lidar_rays(scene: Scene) -> LidarRays | None:
-    """All returns of all sweeps as rays; None where there are none. Each has its own time and, along the vehicle's
-    path, its own origin."""
+    """All returns of all sweeps; None where there are none. Each has its own time and, along the vehicle's path, its
+    own origin."""
     share = 1.0
     parts: list[tuple[np.ndarray, ...]] = []
     along_path = lambda t: [np.interp(t, scene.ego.times_s, axis) for axis in scene.ego.world_from_ego[:, :3, 3].T]
@@ -84,7 +66,8 @@ def lidar_rays(scene: Scene) -> LidarRays | None:
     if not sum(len(part[0]) for part in parts):
         return None
     origins, directions, range_m, time_s = (torch.from_numpy(np.concatenate(column)) for column in zip(*parts))
-    return LidarRays(origins.float(), directions.float(), range_m.float(), time_s)
+    cameras = torch.zeros(len(range_m), dtype=torch.int64)
+    return fields.Rays(origins.float(), directions.float(), time_s[:, None], cameras), range_m.float()
 
 
 def extent_of(scene: Scene, lidar: LidarRays | None) -> fields.Extent:
@@ -95,7 +78,8 @@ def extent_of(scene: Scene, lidar: LidarRays | None) -> fields.Extent:
         reach = f"the inner box reaches {AROUND_CAMERAS_M:.0f} m around the cameras"
         log.warn(f"no LiDAR: {reach}, and nothing measures distance")
     else:
-        points = (lidar.origins + lidar.range_m[:, None] * lidar.directions).numpy()
+        rays, range_m = lidar
+        points = (rays.origins + range_m[:, None] * rays.directions).numpy()
         low, high = np.percentile(points, BOX_PERCENTILES, axis=0)
     center, half = (low + high) / 2, np.maximum((high - low) / 2, 1.0)
     times = np.array(sorted({frame.view.time_s for frame in scene.frames}))
@@ -199,7 +183,7 @@ def observe(field: fields.RadianceField, view: View, budget: fields.Budget, sour
         view, field.extent, field.cameras.index(camera.name) if camera.name in field.cameras else 0
     )
     for begin in range(0, len(rays), RAYS_AT_ONCE):
-        part = rays.part(begin, begin + RAYS_AT_ONCE).to(field.device)
+        part = rays[begin : begin + RAYS_AT_ONCE].to(field.device)
         marched = fields.march(field, part, budget)
         rest = torch.stack([marched.median_m, marched.opacity], 1)
         parts.append(torch.cat([fields.colors(field, part, marched)[0], rest], 1).cpu())
@@ -345,7 +329,7 @@ def optimise(state: RadianceState, config: FitConfig, folder: RunDir) -> None:
 def take_step(state: RadianceState, config: FitConfig, step: int) -> dict[str, Tensor]:
     """A gradient step from pixels and one from LiDAR rays; the weighted loss terms of both."""
     field, device = state.field, state.field.device
-    budget, (pixels, lidar_rays) = BUDGETS[config.radiance.size], BATCHES[config.radiance.size]
+    budget, (pixels, returns) = BUDGETS[config.radiance.size], BATCHES[config.radiance.size]
     dynamic = DYNAMIC_WEIGHT * dynamic_share(step, config.iterations)
     learns = step <= WARM_UP * config.iterations or step % PROPOSALS_EVERY == 0
     for optimiser in state.optimisers:
@@ -363,7 +347,11 @@ def take_step(state: RadianceState, config: FitConfig, step: int) -> dict[str, T
         return terms
 
     generator = seeds.torch_generator(config.seed, step, "radiance lidar")
-    given, range_m = state.lidar.batch(lidar_rays, field.extent, generator)
+    every, ranges = state.lidar
+    chosen = torch.randint(0, len(every), (returns,), generator=generator)
+    given, range_m = every[chosen], ranges[chosen]
+    times = ((given.times - field.extent.start_s) / field.extent.span_s).clamp(0, 1)
+    given = replace(given, times=times.float())
     marched, draws, _ = _marched(field, given, budget, generator, learns)
     sight_m = sight_width(step, config.iterations)
     measured = fields.lidar_terms(field, marched, draws, range_m.to(device), dynamic, sight_m)

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mudg.base import records, seeds, weights
+from mudg.baselines.omnire import waves
 from mudg.core.grids import HashGrid, encode
 
 # sampling -----------------------------------------------------------------------------------------
@@ -157,18 +158,6 @@ class Extent:
         return min(1.0, max(0.0, (time_s - self.start_s) / self.span_s))
 
 
-@dataclass(frozen=True, eq=False)
-class FieldValues:
-    """What the fields say at N samples: features ``[N, width]``, densities ``[N]`` per metre, flow ``[N, 6]`` (forward,
-    backward) in metres per time step."""
-
-    static: Tensor
-    dynamic: Tensor
-    static_density: Tensor
-    dynamic_density: Tensor
-    flow: Tensor
-
-
 class RadianceField(nn.Module):
     """All fields with their parameters. ``cameras``: names; each has an appearance of its own. ``facts``: method, scene
     and so on, kept on disk."""
@@ -208,12 +197,13 @@ class RadianceField(nn.Module):
         """Flow ``[N, 6]`` at places ``[N, 3]`` and times ``[N, 1]``."""
         return self.flow(torch.cat([self.unit(xyz), time], 1))
 
-    def values(self, xyz: Tensor, time: Tensor, share: Tensor | float = 1.0) -> FieldValues:
-        """Everything at places ``[N, 3]`` and normalised times ``[N, 1]``. ``share``: of the flow that aggregation
-        follows, ``[N, 1]`` in [0, 1]: random while training, 1 else."""
+    def values(self, xyz: Tensor, time: Tensor, share: Tensor | float) -> dict[str, Tensor]:
+        """What the fields say at places ``[N, 3]`` and normalised times ``[N, 1]``, as ``Marched`` names it. ``share``:
+        of the flow that aggregation follows, ``[N, 1]`` in [0, 1]: random while training, 1 else."""
         static, flow = self.static(self.unit(xyz)), self.flow_at(xyz, time)
         dynamic = aggregated(self.dynamic_feature, xyz, time, flow, share, self.extent.step)
-        return FieldValues(static, dynamic, _density(static[:, 0]), _density(dynamic[:, 0]), flow)
+        densities = {"static_density": _density(static[:, 0]), "dynamic_density": _density(dynamic[:, 0])}
+        return {"static": static, "dynamic": dynamic, "flow": flow, **densities}
 
     def dynamic_feature(self, xyz: Tensor, time: Tensor) -> Tensor:
         """The dynamic field's feature ``[N, width]``, not aggregated."""
@@ -221,7 +211,7 @@ class RadianceField(nn.Module):
 
     def context(self, directions: Tensor, camera: Tensor) -> Tensor:
         """What colour depends on besides the place: coded direction and appearance, ``[R, ...]``."""
-        return torch.cat([encoded_direction(directions), self.appearance[camera]], 1)
+        return torch.cat([waves(directions, OCTAVES, 1.0), self.appearance[camera]], 1)
 
     def cycle_loss(self, xyz: Tensor, time: Tensor, flow: Tensor) -> Tensor:
         """How far the flow there and back misses its start: half the mean of both squares. What it is compared with is
@@ -257,12 +247,6 @@ def aggregated(feature: Any, xyz: Tensor, time: Tensor, flow: Tensor, share: Ten
     places = torch.cat([xyz + share * flow[:, :3], xyz + share * flow[:, 3:]])
     there = feature(places, torch.cat([time + share * step, time - share * step]))
     return 0.5 * here + 0.25 * (there[:count] + there[count:])
-
-
-def encoded_direction(directions: Tensor) -> Tensor:
-    """Directions ``[R, 3]`` with the sines and cosines of 2^k times them, k = 0..4: ``[R, 33]``."""
-    scaled = torch.cat([directions * 2.0**k for k in range(OCTAVES)], 1)
-    return torch.cat([directions, scaled.sin(), scaled.cos()], 1)
 
 
 def _density(raw: Tensor) -> Tensor:
@@ -353,9 +337,8 @@ class Rays:
         """The same rays on a device."""
         return Rays(*(t.to(device, non_blocking=True) for t in vars(self).values()))
 
-    def part(self, begin: int, end: int) -> Rays:
-        """Some of them."""
-        return Rays(*(t[begin:end] for t in vars(self).values()))
+    def __getitem__(self, chosen: slice | Tensor) -> Rays:
+        return Rays(*(t[chosen] for t in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -391,8 +374,9 @@ class RayDraws:
 @dataclass(frozen=True, eq=False)
 class Marched:
     """Rays after marching, n samples each: edges ``[R, n + 1]``, normalised and as distances; middles and weights ``[R,
-    n]``; places ``[R * n, 3]`` and times ``[R * n, 1]``; what the fields say there; and edges and weights of every
-    proposal round."""
+    n]``; places ``[R * n, 3]`` and times ``[R * n, 1]``; edges and weights of every proposal round; and what the fields
+    say at the N = R n samples: features ``[N, width]``, densities ``[N]`` per metre, flow ``[N, 6]`` (forward,
+    backward) in metres per time step."""
 
     along: Tensor
     edges_m: Tensor
@@ -400,8 +384,12 @@ class Marched:
     weights: Tensor
     xyz: Tensor
     times: Tensor
-    values: FieldValues
     proposals: tuple[tuple[Tensor, Tensor], ...]
+    static: Tensor
+    dynamic: Tensor
+    static_density: Tensor
+    dynamic_density: Tensor
+    flow: Tensor
 
     @property
     def opacity(self) -> Tensor:
@@ -426,7 +414,7 @@ class Marched:
 
     def dynamic_weights(self) -> Tensor:
         """Share of the weights that belongs to what moves, ``[R, n]``."""
-        moving, still = self.values.dynamic_density, self.values.static_density
+        moving, still = self.dynamic_density, self.static_density
         return self.weights * (moving / (moving + still).clamp_min(TINY)).view_as(self.weights)
 
 
@@ -453,8 +441,9 @@ def march(
     middles_m = (edges_m[:, 1:] + edges_m[:, :-1]) / 2
     xyz, times = _places(rays, middles_m), rays.times.expand(-1, budget.samples).reshape(-1, 1)
     values = field.values(xyz, times, 1.0 if draws is None else draws.share)
-    density = (values.static_density + values.dynamic_density).view_as(middles_m)
-    return Marched(edges, edges_m, middles_m, rendering_weights(density, edges_m), xyz, times, values, tuple(rounds))
+    density = (values["static_density"] + values["dynamic_density"]).view_as(middles_m)
+    weights = rendering_weights(density, edges_m)
+    return Marched(edges, edges_m, middles_m, weights, xyz, times, tuple(rounds), **values)
 
 
 def _places(rays: Rays, middles_m: Tensor) -> Tensor:
@@ -465,11 +454,10 @@ def colors(field: RadianceField, rays: Rays, marched: Marched) -> tuple[Tensor, 
     """Colours ``[R, 3]`` over the sky, and the shadow ``[R * n, 1]`` that what moves casts on what stands, 0 (none) to
     1."""
     context, size = field.context(rays.directions, rays.cameras), (*marched.weights.shape, -1)
-    values, moving = marched.values, marched.dynamic_weights()
-    shadow = field.shadow(values.dynamic).sigmoid()
+    moving, shadow = marched.dynamic_weights(), field.shadow(marched.dynamic).sigmoid()
     standing = (marched.weights - moving) * (1 - shadow).view_as(moving)
-    rgb = (standing[..., None] * field.color(values.static.view(size), context)).sum(1)
-    rgb = rgb + (moving[..., None] * field.color(values.dynamic.view(size), context)).sum(1)
+    rgb = (standing[..., None] * field.color(marched.static.view(size), context)).sum(1)
+    rgb = rgb + (moving[..., None] * field.color(marched.dynamic.view(size), context)).sum(1)
     return rgb + (1 - marched.opacity)[:, None] * field.sky(context).sigmoid(), shadow
 
 
@@ -527,9 +515,8 @@ def line_of_sight(weights: Tensor, edges_m: Tensor, range_m: Tensor, sight_m: fl
 
 def _of_motion(field: RadianceField, marched: Marched, draws: RayDraws, dynamic: float) -> dict[str, Tensor]:
     """What every batch has: little may move, and flow there and back ends where it began."""
-    values, chosen = marched.values, draws.cycle
-    missed = field.cycle_loss(marched.xyz[chosen], marched.times[chosen], values.flow[chosen])
-    return {"dynamic": dynamic * values.dynamic_density.mean(), "cycle": CYCLE_WEIGHT * missed}
+    missed = field.cycle_loss(*(of[draws.cycle] for of in (marched.xyz, marched.times, marched.flow)))
+    return {"dynamic": dynamic * marched.dynamic_density.mean(), "cycle": CYCLE_WEIGHT * missed}
 
 
 def proposal_loss(marched: Marched) -> Tensor:

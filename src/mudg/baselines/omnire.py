@@ -19,14 +19,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mudg.base import seeds
-from mudg.base.types import FusedCloud, Scene
 from mudg.core.table import Table
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import DeformableNode, NodeRows, RigidNode, StaticNode
 from mudg.gaussians.recipes import DrawnView, Recipe
 from mudg.gaussians.settings import FitConfig
-from mudg.gaussians.start import start_model
-from mudg.gaussians.views import StoredView, TrainView
+from mudg.gaussians.start import FitStart
+from mudg.gaussians.views import TrainView
 
 # networks -----------------------------------------------------------------------------------------
 
@@ -65,9 +64,9 @@ class FlatNetwork:
         return found
 
 
-def waves(values: Tensor, octaves: int) -> Tensor:
-    """Values ``[n, c]`` with sine and cosine of their 1, 2, 4, ... pi fold: ``[n, c (1 + 2 octaves)]``."""
-    scaled = torch.cat([values * (math.pi * 2**octave) for octave in range(octaves)], 1)
+def waves(values: Tensor, octaves: int, first: float = math.pi) -> Tensor:
+    """Values ``[n, c]`` with sine and cosine of them times 1, 2, 4, ... ``first``: ``[n, c (1 + 2 octaves)]``."""
+    scaled = torch.cat([values * (first * 2**octave) for octave in range(octaves)], 1)
     return torch.cat([values, torch.sin(scaled), torch.cos(scaled)], 1)
 
 
@@ -153,9 +152,7 @@ class DeformedNode(RigidNode):
         """See ``Node``."""
         if self.field is None or self.rests or len(rows.means) == 0 or self.keys_around(time_s) is None:
             return super().at_time(rows, time_s)
-        size_m = torch.tensor(self.size_m, dtype=rows.means.dtype).to(rows.means.device, non_blocking=True)
-        place = 2 * rows.means / size_m
-        moved = self.field.displacement(place, time_s, self.instance)
+        moved = self.field.displacement(self.place_in_box(rows.means), time_s, self.instance)
         return super().at_time(replace(rows, means=rows.means + moved), time_s)
 
     def moved(self, object_from_new: NDArray[Any]) -> Self:
@@ -188,15 +185,13 @@ class OmniRecipe(Recipe):
 
     last_densified: ClassVar[float] = 0.5
 
-    def start(
-        self, scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
-    ) -> SceneModel:
+    def start(self, given: FitStart) -> SceneModel:
         """See ``Recipe``."""
-        model = start_model(scene, fused, views, classes, config)
+        model, config = given.model(), given.config
         limbed = [node for node in model.nodes if isinstance(node, DeformableNode)]
         if not limbed:
             return model
-        times = [frame.view.time_s for frame in scene.frames]
+        times = [frame.view.time_s for frame in given.scene.frames]
         field = DeformationField.fresh((min(times), max(times)), LAYERS, WIDTH, len(limbed), config.seed)
         nodes = [
             DeformedNode.of_rigid(node, limbed.index(node)) if isinstance(node, DeformableNode) else node
@@ -213,7 +208,6 @@ class OmniRecipe(Recipe):
 
     def terms(self, drawn: DrawnView) -> dict[str, Tensor]:
         """See ``Recipe``."""
-        lidar = drawn.lidar
-        if lidar is None:
+        if (lidar := drawn.view.lidar) is None:
             return {}
         return {"lidar": LIDAR_WEIGHT * (drawn.render.depth.reshape(-1)[lidar.pixel] - lidar.depth_m).abs().mean()}

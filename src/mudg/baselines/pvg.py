@@ -10,7 +10,7 @@ no limits on size that grow with the distance, no growing image sizes. Published
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar, Final
 
@@ -19,14 +19,13 @@ import torch
 from torch import Tensor
 
 from mudg.base import log, seeds
-from mudg.base.types import FusedCloud, Scene
 from mudg.core import losses
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import NodeRows, StaticNode
 from mudg.gaussians.recipes import SCENE_UNIT_M, DrawnView, Recipe
 from mudg.gaussians.settings import FitConfig
-from mudg.gaussians.start import painted_sky, timed_points, world_model
-from mudg.gaussians.views import StoredView, TrainView
+from mudg.gaussians.start import FitStart, frame_seconds
+from mudg.gaussians.views import TrainView
 
 # vibration ----------------------------------------------------------------------------------------
 #
@@ -61,13 +60,6 @@ class VibrationNode(StaticNode):
     def __init__(self, name: str, middle_s: float, frame_s: float, early: float = 0.0) -> None:
         super().__init__(name)
         self.middle_s, self.frame_s, self.early = float(middle_s), float(frame_s), float(early)
-
-    @classmethod
-    def of_times(cls, times_s: Sequence[float], name: str = "background") -> VibrationNode:
-        """The node of a log with images at these times (repeats allowed)."""
-        times = sorted(set(times_s))
-        span = times[-1] - times[0]
-        return cls(name, (times[0] + times[-1]) / 2, span / (len(times) - 1) if span > 0 else 0.1)
 
     def time_of(self, time_s: float) -> float:
         """Seconds to units of time."""
@@ -120,20 +112,19 @@ class VibrationRecipe(Recipe):
 
     last_densified: ClassVar[float] = 0.5
 
-    def start(
-        self, scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
-    ) -> SceneModel:
+    def start(self, given: FitStart) -> SceneModel:
         """See ``Recipe``. Of the fused cloud only the cameras' colours are used."""
-        node = VibrationNode.of_times([frame.view.time_s for frame in scene.frames])
-        points, time_s = timed_points(scene, views, classes, config, fused.colors)
-        duration = FRAME * (len({frame.view.time_s for frame in scene.frames}) - 1)
+        (points, time_s), config = given.timed_points(), given.config
+        times = {frame.view.time_s for frame in given.scene.frames}
+        node = VibrationNode("background", (min(times) + max(times)) / 2, frame_seconds(given.scene))
+        duration = FRAME * (len(times) - 1)
         random = seeds.numpy_rng(config.seed, 0, "start times").random(len(time_s))
         drawn = (random - 0.5) * FILLED_SPAN * duration
         measured = (time_s - node.middle_s) / node.frame_s * FRAME
         tau = torch.from_numpy(np.where(np.isnan(time_s), drawn, measured))
-        columns = points.columns(classes, config.sh_degree) | starting_columns(len(tau), tau, duration)
+        columns = points.columns(given.classes, config.sh_degree) | starting_columns(len(tau), tau, duration)
         log.info(f"start: {len(tau)} vibrating Gaussians")
-        return world_model(node, columns, classes, config, fused.colors, painted_sky(views, fused.colors))
+        return given.world_model(node, columns)
 
     def drawn_model(self, model: SceneModel, view: TrainView, step: int, config: FitConfig) -> SceneModel:
         """See ``Recipe``: at every second step or so, the state of another time, carried to the view's."""

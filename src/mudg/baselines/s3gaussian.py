@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from mudg.base import log, seeds
-from mudg.base.types import FusedCloud, Scene, View
+from mudg.base.types import View
 from mudg.baselines.omnire import FlatNetwork
 from mudg.core import losses
 from mudg.core.grids import TIME, PlaneSizes, look_up
@@ -28,8 +28,8 @@ from mudg.gaussians.nodes import NodeRows, StaticNode
 from mudg.gaussians.recipes import DrawnView, Recipe
 from mudg.gaussians.schedule import FIELD_STEPS
 from mudg.gaussians.settings import FitConfig
-from mudg.gaussians.start import timed_points, world_model
-from mudg.gaussians.views import StoredView, TrainView
+from mudg.gaussians.start import FitStart
+from mudg.gaussians.views import TrainView
 
 # hexplane -----------------------------------------------------------------------------------------
 #
@@ -200,23 +200,21 @@ class FieldRecipe(Recipe):
         """See ``Recipe``."""
         return replace(config, loss=replace(config.loss, lidar_weight=0.0, ssim_weight=SSIM_SHARE / (1 + SSIM_SHARE)))
 
-    def start(
-        self, scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
-    ) -> SceneModel:
+    def start(self, given: FitStart) -> SceneModel:
         """See ``Recipe``. Of the fused cloud only the cameras' colours are used."""
-        points, time_s = timed_points(scene, views, classes, config, fused.colors)
+        (points, time_s), config = given.timed_points(), given.config
         measured = points.xyz[~np.isnan(time_s)].astype(np.float64)
         low, high = measured.min(0), measured.max(0)
         margin = BOX_MARGIN * (high - low) + 0.1
-        times = [frame.view.time_s for frame in scene.frames]
+        times = [frame.view.time_s for frame in given.scene.frames]
         first, last = min(times), max(max(times), min(times) + 1e-3)
         sizes = replace(SIZES, time=max(2, min(SIZES.time, len(set(times)) // FRAMES_PER_CELL)))
         gain = SHORT_GAIN if config.iterations < FIELD_STEPS else 1.0
         node = HexPlaneNode.fresh([*(low - margin), first], [*(high + margin), last], sizes, config.seed, gain)
-        columns = points.columns(classes, config.sh_degree)
+        columns = points.columns(given.classes, config.sh_degree)
         numbers = node.learnt["planes"].numel()
         log.info(f"start: {len(time_s)} Gaussians, {numbers} numbers in {sizes.levels} x 6 planes")
-        return world_model(node, columns, classes, config, fused.colors)
+        return given.world_model(node, columns)
 
     def drawn_model(self, model: SceneModel, view: TrainView, step: int, config: FitConfig) -> SceneModel:
         """See ``Recipe``: at first nothing moves; then what is near the frustum."""
@@ -226,7 +224,7 @@ class FieldRecipe(Recipe):
     def terms(self, drawn: DrawnView) -> dict[str, Tensor]:
         """See ``Recipe``."""
         terms: dict[str, Tensor] = {}
-        lidar, whole = drawn.lidar, 1 + SSIM_SHARE
+        lidar, whole = drawn.view.lidar, 1 + SSIM_SHARE
         if lidar is not None:
             error = losses.sparse_squared_depth(drawn.render.depth, lidar.pixel, lidar.depth_m, LIDAR_SPAN_M)
             terms["lidar"] = LIDAR_WEIGHT / whole * error

@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mudg.base import log, store
-from mudg.base.camera_colors import ColorMap
 from mudg.base.devices import choose_device
 from mudg.base.errors import InputError
 from mudg.base.run_folder import RunDir
-from mudg.base.types import Frame, Observation, Scene, View
+from mudg.base.types import ColorMap, Frame, Observation, Scene, View
 from mudg.benchmarks.places import Protocol
 from mudg.core import calibration, lidar, metrics, trajectory
 from mudg.core.fusion import STATIC

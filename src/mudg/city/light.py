@@ -18,8 +18,7 @@ from mudg.base import seeds, store
 from mudg.base.errors import InputError
 from mudg.city import layout as rec
 from mudg.city.config import CityConfig
-from mudg.core.weather.air import patch_threshold
-from mudg.core.weather.ground import noise_seed
+from mudg.core.weather.air import noise_seed, patch_threshold
 
 Numbers = NDArray[np.float64]
 LAMP_POWER: Final = 64.0

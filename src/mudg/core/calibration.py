@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import geometry
-from mudg.base.camera_colors import SAME_COLORS, CameraColors, ColorMap
 from mudg.base.geometry import transform_points
-from mudg.base.types import View
+from mudg.base.types import SAME_COLORS, CameraColors, ColorMap, View
 
 # colours ------------------------------------------------------------------------------------------
 # Cameras of a rig overlap little at one moment, but the front camera sees what the side cameras pass a little later. So
@@ -69,16 +68,9 @@ def _line(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]
 
 
 def match_cameras(cameras: Iterable[str], seen: Iterable[Seen]) -> CameraColors:
-    """The maps of all cameras to the first one's colours, along the pairs of cameras that share the most points.
-
-    Args:
-        cameras: names, the one whose colours become the common ones first.
-        seen: sets of points, each with what the cameras saw of it.
-
-    Returns:
-        Maps of the cameras whose colours differ. A camera that shares too few points with the others keeps its colours,
-        as if they were common ones.
-    """
+    """The maps of those cameras whose colours differ to the first one's, along the pairs of cameras that share the most
+    points of ``seen``: sets of points, each with what the cameras saw of it. A camera that shares too few points with
+    the others keeps its colours, as if they were common ones."""
     names = tuple(cameras)
     given: dict[tuple[str, str], list[tuple[NDArray[np.uint8], NDArray[np.uint8]]]] = {}
     for points in seen:
@@ -153,14 +145,11 @@ _SLACK: Final = 0.05
 class EdgeAlignment:
     """How well depth edges fall on image edges.
 
-    Args:
-        score: 1 = no turn fits better; 0 = no better than the median turn; below 0 = worse.
-        best_turn_deg: the turn that fits best, about the camera's y axis (right +) and its x axis (up +), degrees.
-        contrast: how far the peak stands out, as a share of the median.
-        jumps: depth jumps seen.
-        verdict: ``right``; ``doubtful`` if a turn inside the range tried fits clearly better; ``unknown`` if edges do
-            not tell.
-        sigmas: by how many of its standard errors ``best_turn_deg`` fits better than the given pose.
+    ``score``: 1 = no turn fits better, 0 = no better than the median turn, below 0 = worse. ``best_turn_deg``: the turn
+    that fits best, about the camera's y axis (right +) and its x axis (up +), by ``sigmas`` of its standard errors
+    better than the given pose. ``contrast``: how far the peak stands out, as a share of the median. ``jumps``: depth
+    jumps seen. ``verdict``: ``right``; ``doubtful`` if a turn inside the range tried fits clearly better; ``unknown``
+    if edges do not tell.
     """
 
     score: float

@@ -218,14 +218,9 @@ def beyond_reach(
 ) -> NDArray[np.bool_]:
     """Where the scanner looked and nothing came back: what is there is far, if it is not glass; bool[H, W].
 
-    Only near the horizon and up to the highest beam: below, the road would answer, and windows of cars are what is
-    silent.
-
-    Args:
-        view: camera and pose.
-        measured: f32[H, W] metres, NaN = none.
-        highest_rad: elevation of the scanner's highest beam above the horizontal.
-        gap_deg: largest angle between neighbouring beams.
+    Only near the horizon and up to the elevation ``highest_rad`` of the highest beam: below, the road would answer, and
+    windows of cars are what is silent. ``measured``: f32[H, W] metres, NaN = none; ``gap_deg``: largest angle between
+    neighbouring beams.
     """
     known = np.isfinite(measured)
     if not known.any():
@@ -249,14 +244,9 @@ def complete_depth(
     sky: NDArray[np.bool_] | None = None,
     beyond: NDArray[np.bool_] | None = None,
 ) -> DenseDepth:
-    """Fill a sparse depth map, guided by its image. InputError: shapes differ, or a measurement is not positive.
-
-    Args:
-        rgb: u8[H, W, 3].
-        measured: f32[H, W] metres, NaN where nothing was measured.
-        sky: bool[H, W]; None = no sky.
-        beyond: bool[H, W], where the scanner looked and nothing came back, see ``beyond_reach``; None = nowhere.
-    """
+    """Fill a sparse depth map f32[H, W] in metres (NaN where nothing was measured), guided by its image u8[H, W, 3].
+    ``sky``, and ``beyond`` where the scanner looked and nothing came back (``beyond_reach``): bool[H, W], or None for
+    nowhere. InputError: shapes differ, or a measurement is not positive."""
     shape = measured.shape
     sky = np.zeros(shape, bool) if sky is None else sky
     beyond = np.zeros(shape, bool) if beyond is None else beyond & ~sky

@@ -19,14 +19,10 @@ from mudg.base.errors import InputError
 
 def overlap_m(poses_a: Array, size_a: ArrayLike, poses_b: Array, size_b: ArrayLike) -> Array:
     """How deep pairs of boxes overlap, f64[T] metres: the shortest way that parts them; negative: the gap along the
-    best axis.
+    best axis. Poses are world_from_box f64[T, 4, 4], origin in the centre; sizes length, width, height.
 
     Separating axes of two boxes: three faces of each and the nine cross products of their edges (Gottschalk et al.,
     1996).
-
-    Args:
-        poses_a, poses_b: world_from_box f64[T, 4, 4], origin in the centre of the box. size_a, size_b: length, width,
-            height.
     """
     half_a, half_b = np.asarray(size_a, np.float64) / 2, np.asarray(size_b, np.float64) / 2
     edges_a, edges_b = np.swapaxes(poses_a[:, :3, :3], 1, 2), np.swapaxes(poses_b[:, :3, :3], 1, 2)
@@ -148,14 +144,9 @@ QUINTIC_PEAK: Final = 10 / 3**0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """A path: straight lines and slerp between poses at key times.
-
-    Args:
-        times_s: f64[K], strictly increasing.
-        poses: world_from_object f64[K, 4, 4], metres.
-        source_s: f64[K], the moment of the recording that each key shows, so that what moves within a box (a walking
-            person) can follow when a path is retimed.
-    """
+    """A path: straight lines and slerp between poses world_from_object f64[K, 4, 4] at key times f64[K], strictly
+    increasing. ``source_s`` f64[K]: the moment of the recording that each key shows, so that what moves within a box (a
+    walking person) can follow when a path is retimed."""
 
     times_s: Array
     poses: Array
@@ -210,10 +201,7 @@ def quintic(s: Array) -> Array:
 @dataclass(frozen=True, slots=True)
 class Displacement:
     """A displacement in the frame of the object: metres ahead, to the left and up, a turn to the left in radians.
-
-    Args:
-        from_s: when it begins; None: it is there at all times. ramp_s: how long it takes to come about.
-    """
+    ``from_s``: when it begins (None: it is there at all times); ``ramp_s``: how long it takes to come about."""
 
     ahead_m: float = 0.0
     left_m: float = 0.0
@@ -276,28 +264,18 @@ def grounded(motion: Motion, before: Motion, ground: HeightMap) -> Motion:
 
     Keys of both belong together. Where the ground is unknown at either place, a key stays as it is.
     """
-    new, old = motion.poses[:, :2, 3], before.poses[:, :2, 3]
-    return _set_on(motion, ground.height(new) - ground.height(old), ground.normal(old), ground.normal(new))
-
-
-def _set_on(motion: Motion, rise: Array, before: Array, after: Array) -> Motion:
-    """A path whose ground rises, and turns from one normal to another, at every key; NaN: stays."""
-    poses = motion.poses.copy()
+    new, old, poses = motion.poses[:, :2, 3], before.poses[:, :2, 3], motion.poses.copy()
+    rise, normals, tilted = ground.height(new) - ground.height(old), ground.normal(old), ground.normal(new)
     for i in np.flatnonzero(np.isfinite(rise)):
         poses[i, 2, 3] += rise[i]
-        poses[i, :3, :3] = _turn_between(before[i], after[i]) @ poses[i, :3, :3]
+        poses[i, :3, :3] = _turn_between(normals[i], tilted[i]) @ poses[i, :3, :3]
     return replace(motion, poses=poses)
 
 
 def along_points(points: Array, height_m: float, ground: HeightMap | None, floor_m: float = 0.0) -> Motion:
-    """A path through given places.
-
-    Args:
-        points: f64[P, 4]: time in seconds, x, y in metres, heading in radians (NaN: along the path); times increase.
-            One point stands.
-        height_m: of the object's origin above the ground. floor_m: height of the ground where ``ground`` does not know
-            it.
-    """
+    """A path through places f64[P, 4]: time in seconds, x, y in metres, heading in radians (NaN: along the path); times
+    increase, and one point stands. ``height_m``: of the object's origin above the ground; ``floor_m``: height of the
+    ground where ``ground`` does not know it."""
     times, xy, yaw = points[:, 0], points[:, 1:3], points[:, 3]
     if len(points) > 1:
         steps = max(2, int(np.ceil((times[-1] - times[0]) / (2 * STEP_S))) + 1)

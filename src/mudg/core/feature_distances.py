@@ -54,13 +54,10 @@ def kernel_distance_error(
     generated: ArrayLike, real: ArrayLike, blocks: Sequence[ArrayLike], rng: np.random.Generator, draws: int = 200
 ) -> float:
     """Standard error of ``kernel_distance`` by a block bootstrap: rows of a block, such as frames of one log, depend on
-    each other and are drawn together.
+    each other and are drawn together. ``blocks``: block number of every row of either set, at least two blocks each,
+    else InputError; ``draws``: number of resamples, >= 2.
 
     A row that is drawn twice is never compared with itself: pairs of one row are left out, as in the distance itself.
-
-    Args:
-        blocks: block number of every row of either set; at least two blocks each, else InputError.
-        rng: draws the blocks. draws: number of resamples, >= 2.
     """
     a, b = _pair(generated, real, 2)
     groups = []

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import palette
-from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import InputError
 from mudg.base.geometry import invert, pinhole, yaw_of
-from mudg.base.types import FusedCloud, Photo, PointCloud, SweepPoints, Track, View
+from mudg.base.types import SAME_COLORS, CameraColors, FusedCloud, Photo, PointCloud, SweepPoints, Track, View
 from mudg.core.project import RULES, DrawLimits, PointLayer, draw_points, nearer_depth
 
 Matrix = NDArray[np.float64]
@@ -29,16 +28,10 @@ MOVING_TURN_DEG: Final = 15.0
 
 @dataclass(frozen=True, slots=True)
 class FusionRules:
-    """The numbers of the rules of fusion.
-
-    Args:
-        voxel_m: keep one point per voxel of this side, the one seen from nearest by; 0 keeps all.
-        occlusion_test: leave out colours from behind nearer surfaces.
-        box_growth_m: moving boxes are grown by this on each side and on top.
-        floor_margin_m: points this close above the box's floor stay static.
-        moving_distance_m: dead-banded displacement or path length from which a track moves.
-        min_object_points: dynamic objects with fewer coloured points are left out.
-    """
+    """The numbers of the rules of fusion: keep one point per voxel of side ``voxel_m``, the one seen from nearest by (0
+    keeps all); leave out colours from behind nearer surfaces; grow moving boxes on each side and on top; points closer
+    than ``floor_margin_m`` above the box's floor stay static; a track moves from this dead-banded displacement or path
+    length on; leave out dynamic objects with fewer coloured points."""
 
     voxel_m: float = 0.0
     occlusion_test: bool = True
@@ -135,9 +128,8 @@ def separate(
     """Assign each point of a sweep to a dynamic object or to the static world: points inside a moving box, slightly
     grown and only above a margin over its floor, so that the road stays road. In overlapping boxes the smaller wins.
 
-    Returns:
-        ``owner`` i32[N], index into ``dynamic`` or STATIC; and for each of them present the points it owns in its own
-        frame, f32[n, 3], in the order of ``np.flatnonzero(owner == index)``.
+    Returns ``owner`` i32[N], index into ``dynamic`` or STATIC; and for each of them present the points it owns in its
+    own frame, f32[n, 3], in the order of ``np.flatnonzero(owner == index)``.
     """
     xyz = sweep.points.xyz
     owner = np.full(len(xyz), STATIC, np.int32)
@@ -200,9 +192,8 @@ def color_points(
     between sweep and image taken into account. If several cameras see it, the one whose optical axis points closest to
     it wins, and all vote for its class, weighted by the cosine to their axes.
 
-    Returns:
-        seen bool[N]; hidden bool[N]: in an image, but behind a nearer surface in all of them; and where seen rgb
-        u8[N, 3], semantics u8[N] and depth f32[N] to the camera that gave the colour.
+    Returns seen bool[N]; hidden bool[N]: in an image, but behind a nearer surface in all of them; and where seen rgb
+    u8[N, 3], semantics u8[N] and depth f32[N] to the camera that gave the colour.
     """
     count = len(owner)
     best = np.full(count, -1.0, np.float32)
@@ -465,27 +456,18 @@ def _majority(
 # --- the whole ------------------------------------------------------------------------------------
 
 
-DEFAULT_RULES: Final = FusionRules()
-
-
 def fuse_sweeps(
     sweeps: Iterable[SweepShots],
     tracks: Sequence[Track],
-    rules: FusionRules = DEFAULT_RULES,
+    rules: FusionRules = FusionRules(),
     cameras: CameraColors = SAME_COLORS,
 ) -> tuple[FusedCloud, FusionReport]:
-    """Fuse sweeps and images; one sweep is held in memory at a time.
+    """Fuse sweeps, in any order, with the images that may colour them; one is held in memory at a time. Which of all
+    tracked boxes move is decided here. ``cameras``: maps of the images' colours to common ones.
 
-    Args:
-        sweeps: sweeps with the images that may colour them, in any order.
-        tracks: all tracked boxes; which of them move is decided here.
-        rules: see ``FusionRules``.
-        cameras: maps of the images' colours to common ones (``core/calibration.py``).
-
-    Returns:
-        The fused cloud (static: world frame; objects: box frame, by track id) and a report. ``semantics`` are None
-        when neither points nor images carried labels. A log without points gives an empty static cloud. Moving objects
-        with too few coloured points are left out, and so are their points: they would smear the static world.
+    Returns the fused cloud (static: world frame; objects: box frame, by track id) and a report. ``semantics`` are None
+    when neither points nor images carried labels. A log without points gives an empty static cloud. Moving objects with
+    too few coloured points are left out, and so are their points: they would smear the static world.
     """
     report = FusionReport(verdicts={track.id: judge_track(track, rules) for track in tracks})
     dynamic = [track for track in tracks if report.verdicts[track.id].moving]

@@ -70,15 +70,9 @@ class PlaneSizes:
 
 
 def look_up(places: Tensor, numbers: Tensor, sizes: PlaneSizes) -> Tensor:
-    """Features ``[N, features * levels]`` of places ``[N, 4]``, -1 to 1 along x, y, z, t.
-
-    Places outside get the features of the nearest place on the border. Differentiable once, in planes and places.
-    InputError: shapes do not fit.
-
-    Args:
-        places: ``[N, 4]``.
-        numbers: ``[sizes.numbers]``.
-    """
+    """Features ``[N, features * levels]`` of places ``[N, 4]``, -1 to 1 along x, y, z, t, in planes of ``numbers
+    [sizes.numbers]``. Places outside get the features of the nearest place on the border. Differentiable once, in
+    planes and places. InputError: shapes do not fit."""
     check_shape(places, "planes of place and time: places", (None, 4))
     check_shape(numbers, "planes of place and time: numbers", (sizes.numbers,))
     library = native.library()
@@ -159,15 +153,9 @@ _MASK32 = (1 << 32) - 1
 
 @dataclass(frozen=True)
 class HashGrid:
-    """The shape of a grid. UsageError: a value outside these ranges.
-
-    Args:
-        dimensions: 3 or 4.
-        levels: 1 to 32.
-        features: per level: 1, 2, 4 or 8.
-        coarsest, finest: cells along an axis of the first and the last level; those between grow geometrically.
-        log2_entries: a level has at most 2 to this power entries.
-    """
+    """The shape of a grid of 3 or 4 dimensions, 1 to 32 levels, and 1, 2, 4 or 8 features per level. ``coarsest``,
+    ``finest``: cells along an axis of the first and the last level; those between grow geometrically. A level has at
+    most 2 to the power ``log2_entries`` entries. UsageError: other values."""
 
     dimensions: int
     levels: int
@@ -220,15 +208,9 @@ class HashGrid:
 
 
 def encode(points: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
-    """Features ``[N, levels * features]`` of points ``[N, D]`` in the unit cube.
-
+    """Features ``[N, levels * features]`` of points ``[N, D]`` in the unit cube, from a table of ``grid.table_shape``.
     Points outside get the features of the nearest place on the border. Differentiable once, in table and points.
-    InputError: shapes do not fit the grid.
-
-    Args:
-        points: ``[N, D]`` in [0, 1].
-        table: ``grid.table_shape``.
-    """
+    InputError: shapes do not fit the grid."""
     check_shape(points, "hash grid: points", (None, grid.dimensions))
     check_shape(table, "hash grid: table", grid.table_shape)
     library = native.library()

@@ -139,16 +139,8 @@ def spiral(count: int) -> Array:
 
 
 def mixing(rotation: Tensor, degree: int) -> Tensor:
-    """How coefficients of degree 1 to ``degree`` mix when their frame is turned.
-
-    Args:
-        rotation: world_from_frame [3, 3], on the CPU.
-        degree: 1 to 3.
-
-    Returns:
-        f32[K - 1, K - 1], K = (degree + 1)^2, orthogonal: coefficients of the world = matrix @ coefficients of the
-        frame.
-    """
+    """How coefficients of degree 1 to ``degree`` mix when their frame is turned by world_from_frame [3, 3] (on the
+    CPU): f32[K - 1, K - 1], K = (degree + 1)^2, orthogonal, takes those of the frame to those of the world."""
     turn = rotation.detach().double().numpy()
     return torch.block_diag(*(torch.from_numpy(band_rotation(turn, band)) for band in range(1, degree + 1))).float()
 

@@ -41,14 +41,8 @@ def ball_sizes(xyz: Array) -> Array:
 
 
 def met_points(beams: Array, xyz: Array, sizes: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Where beams meet a surface of points.
-
-    Args:
-        beams: unit directions f64[B, 3]. xyz: f64[N, 3]. sizes: radii f64[N] (``ball_sizes``).
-
-    Returns:
-        Range f64[B] metres, infinite where a beam meets nothing, and the first point that it meets i64[B] (-1: none).
-    """
+    """Where beams (unit directions f64[B, 3]) meet a surface of points f64[N, 3] of radii f64[N] (``ball_sizes``):
+    range f64[B] metres, infinite where a beam meets nothing, and the first point that it meets i64[B] (-1: none)."""
     ranges, first = np.full(len(beams), np.inf), np.full(len(beams), -1)
     if not len(xyz) or not len(beams):
         return ranges, first
@@ -108,14 +102,9 @@ SPREAD_SHARE: Final = 0.03
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OwnedPoints:
-    """Points with what they belong to.
-
-    Args:
-        xyz: f32[N, 3] metres, static ones in the world, others in the frame of their object.
-        owner: i32[N], number of the object among the dynamic tracks, or STATIC.
-        ids: u8[N] train ids, 255 = unknown.
-        gap_deg: largest angle between neighbouring beams.
-    """
+    """Points f32[N, 3] metres, static ones in the world, others in the frame of their object, its number ``owner``
+    i32[N] among the dynamic tracks (or STATIC), train ids u8[N] (255 = unknown), and the largest angle between
+    neighbouring beams."""
 
     xyz: NDArray[np.float32]
     owner: NDArray[np.int32]
@@ -129,15 +118,9 @@ class OwnedPoints:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointTruth:
-    """What LiDAR points say about a view.
-
-    Args:
-        depth: f32[H, W] metres of the point that a pixel shows, 0 = none.
-        dynamic: bool[H, W]: it belongs to a dynamic object.
-        color: u8[H, W, 3], its colour in the recorded image of that time, where ``colored`` bool[H, W]: that image
-            shows it, too.
-        classes: u8[H, W], its class in the recorded image's labels, 255 = none or not shown there.
-    """
+    """What LiDAR points say about a view: depth f32[H, W] in metres of the point that a pixel shows (0 = none), whether
+    it belongs to a dynamic object, its colour u8[H, W, 3] in the recorded image of that time where that image shows it,
+    too (``colored``), and its class u8[H, W] in the image's labels (255 = none or not shown there)."""
 
     depth: NDArray[np.float32]
     dynamic: NDArray[np.bool_]
@@ -180,14 +163,8 @@ def pixels_of(
 def carried(
     recorded: View, image: NDArray[np.uint8], world: NDArray[np.float32], gap_deg: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """What an image shows at points: its pixels' values u8[N + 1, ...] for N points, and which of them it shows, bool[N
-    + 1].
-
-    The last entry is that of no point, as the index -1 of ``visible`` asks for it.
-
-    Args:
-        recorded: the image's view. image: u8[H, W, ...], colours or classes. world: f32[N, 3].
-    """
+    """What an image u8[H, W, ...] (colours or classes) shows at points f32[N, 3]: its pixels' values u8[N + 1, ...],
+    and which points it shows, bool[N + 1]. The last entry is that of no point (index -1 of ``visible``)."""
     _, index = visible(recorded, world, gap_deg)
     rows, columns = np.nonzero(index >= 0)
     values = np.zeros((len(world) + 1, *image.shape[2:]), np.uint8)
@@ -209,6 +186,13 @@ class ShownFrame:
     depth: NDArray[np.float32]
     rgb: NDArray[np.uint8]
 
+    def sees(self, world: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.uint8]]:
+        """Numbers of the points f32[N, 3] that it shows, and their colours u8[n, 3] there: they fall into the image and
+        are not behind its dense depth (rule ``drawn`` of ``core/project.py``)."""
+        inside, row, column, z = pixels_of(self.view, world)
+        clear = ~RULES["drawn"].hides(self.depth[row, column], z)
+        return np.flatnonzero(inside)[clear], self.rgb[row[clear], column[clear]]
+
 
 def blurred(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """A photograph u8[H, W, 3] averaged over 5x5 pixels, so that a point that is a pixel off has about its colour."""
@@ -223,21 +207,15 @@ def seen_by(
     shown: Sequence[ShownFrame],
     time_s: float,
 ) -> tuple[NDArray[np.bool_], NDArray[np.uint8]]:
-    """Which points bool[N] some shown frame of any time saw, and the colour u8[N, 3] that they had there.
-
-    A point is seen if it falls into the image and its depth there is not behind the frame's dense depth (rule ``drawn``
-    of ``core/project.py``). Frames near ``time_s`` are asked first; the first that saw a point gives its colour.
-    ``place(points, time)`` says where points are.
-    """
+    """Which points bool[N] some shown frame of any time saw, and the colour u8[N, 3] that they had there: frames near
+    ``time_s`` are asked first. ``place(points, time)`` says where points are."""
     seen, colors = np.zeros(len(points.xyz), bool), np.zeros((len(points.xyz), 3), np.uint8)
     for frame in sorted(shown, key=lambda frame: abs(frame.view.time_s - time_s)):
         left = np.flatnonzero(~seen)
         if not len(left):
             break
-        inside, row, column, z = pixels_of(frame.view, place(points.taken(left), frame.view.time_s))
-        clear = ~RULES["drawn"].hides(frame.depth[row, column], z)
-        found = left[inside][clear]
-        seen[found], colors[found] = True, frame.rgb[row[clear], column[clear]]
+        found, shown_there = frame.sees(place(points.taken(left), frame.view.time_s))
+        seen[left[found]], colors[left[found]] = True, shown_there
     return seen, colors
 
 

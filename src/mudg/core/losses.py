@@ -48,8 +48,8 @@ def lpips_distance(
     """LPIPS (Zhang et al. 2018, eq. 1) in the features of any network; differentiable in the prediction.
 
     Per stage: every place's feature vector is brought to length 1, the squared difference is summed over channels and
-    averaged over places; the stages are averaged (without ``channel_weights``) or summed (with them, as LPIPS does).
-    InputError: the two have other shapes.
+    averaged over places; the stages are averaged (without ``channel_weights``) or summed (with them, as LPIPS does): 0
+    for equal images, NaN when nothing counts. InputError: the two have other shapes.
 
     Args:
         prediction: features of one image, per stage ``[C_l, h_l, w_l]``.
@@ -58,9 +58,6 @@ def lpips_distance(
         channel_weights: per stage ``[C_l]`` for the squared differences (default 1).
         over_weight: what a weighted sum is divided by. False: the number of places, so that an image of which little is
             certain also weighs little (loss). True: the sum of the weights, so that only chosen pixels count (score).
-
-    Returns:
-        Scalar: 0 for equal images, NaN when nothing counts.
     """
     total = prediction[0].new_zeros(())
     for stage, (features, target) in enumerate(zip(prediction, target_units, strict=True)):
@@ -133,16 +130,6 @@ def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
     return luminance * (2 * covariance + SSIM_C2) / (variance_p + variance_t + SSIM_C2)
 
 
-def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, weight: Tensor | None = None) -> Tensor:
-    """Scalar ``(1 - w) mean|p - t| + w (1 - mean SSIM)`` of images ``[3, H, W]`` in [0, 1]: the plain-torch form.
-
-    With a weight ``[H, W]`` per pixel: the ``confident_mean`` of both maps. ``core.native_ops.photometric`` computes
-    the same value and gradient in one native pass.
-    """
-    both = (1 - ssim_weight) * (prediction - target).abs() + ssim_weight * (1 - ssim_map(prediction, target))
-    return both.mean() if weight is None else confident_mean(both, weight)
-
-
 def outside_mask_copied(prediction: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
     """The prediction with the target copied in where ``mask`` (bool ``[1, H, W]``) is False.
 
@@ -169,14 +156,9 @@ def trimmed_mean(values: Tensor, keep: float) -> Tensor:
 
 
 def sparse_depth(depth_m: Tensor, pixel: Tensor, target_m: Tensor, keep: float = 0.95) -> Tensor:
-    """Trimmed mean of |depth - target| / target over sparse LiDAR pixels (relative, so that near and far weigh alike).
-
-    Args:
-        depth_m: expected depth ``[1, H, W]``, metres.
-        pixel: i64[M], flat pixel index ``row * W + column`` of each measurement.
-        target_m: ``[M]`` metres, positive.
-        keep: share of the smallest errors that count (Street Gaussians: 0.95).
-    """
+    """Trimmed mean of |depth - target| / target over sparse LiDAR pixels (relative, so that near and far weigh alike),
+    of expected depth ``[1, H, W]`` and measurements ``[M]`` at flat pixel indices ``row * W + column`` i64[M], metres.
+    ``keep``: share of the smallest errors that count (Street Gaussians: 0.95)."""
     at = depth_m.reshape(-1)[pixel]
     return trimmed_mean((at - target_m).abs() / target_m, keep)
 
@@ -201,11 +183,7 @@ def sparse_squared_depth(depth_m: Tensor, pixel: Tensor, target_m: Tensor, span_
 
 def inverse_depth(depth_m: Tensor, alpha: Tensor, sky_m: float) -> Tensor:
     """Inverse depth of a pixel that is partly sky, in 1/m: ``alpha / depth + (1 - alpha) / sky_m`` (Periodic Vibration
-    Gaussians).
-
-    Args:
-        depth_m: expected depth of what covers the pixel, any shape. alpha: the same shape, in [0, 1].
-    """
+    Gaussians); ``depth_m``: expected depth of what covers the pixel, of any shape, ``alpha`` in [0, 1]."""
     return alpha / depth_m.clamp_min(1e-2) + (1 - alpha) / sky_m
 
 
@@ -250,36 +228,6 @@ def opacity_entropy(alpha: Tensor, floor: float = 1e-3) -> Tensor:
     return -(alpha * torch.log(alpha.clamp_min(floor))).mean()
 
 
-def semantic_map(logits: Tensor, target: Tensor) -> Tensor:
-    """Cross-entropy at every pixel; unlabelled pixels (255) give 0.
-
-    Args:
-        logits: ``[C, H, W]``.
-        target: i64[H, W] in 0..C-1 or 255.
-
-    Returns:
-        ``[H, W]``.
-    """
-    check_shape(target, "semantic loss: target", tuple(logits.shape[1:]))
-    return F.cross_entropy(logits[None], target[None], ignore_index=UNLABELLED, reduction="none")[0]
-
-
-def class_loss(
-    logits: Tensor, target: Tensor, weight: Tensor, total: float | Tensor, lift: tuple[int, Tensor] | None = None
-) -> Tensor:
-    """Scalar: cross entropy of every pixel, times its weight, summed and divided by ``total``: the plain-torch form.
-
-    ``core.native_ops.class_loss`` computes the same value and gradient in one native pass, and names the arguments.
-    """
-    if lift is not None:
-        # filled there: a list would be copied, and waited for
-        channel = torch.full((1,), lift[0], device=logits.device)
-        logits = logits.index_add(0, channel, lift[1].detach()[None].to(logits.dtype))
-    labelled = torch.where((target >= 0) & (target < len(logits)), target, UNLABELLED)
-    total = total.to(weight.dtype) if isinstance(total, Tensor) else total
-    return (semantic_map(logits, labelled) * weight).sum() / total
-
-
 def object_map(object_alpha: Tensor, inside_boxes: Tensor, floor: float = 1e-3) -> Tensor:
     """Regulariser of an objects-only render (Street Gaussians, lambda 0.1, after densification).
 
@@ -304,13 +252,8 @@ def identity_distance(difference: Tensor) -> Tensor:
 
 
 def feature_distance(prediction: list[Tensor], target: list[Tensor], weight: Tensor) -> Tensor:
-    """Mean absolute difference of feature maps, every place weighted by its confidence, averaged over the scales.
-    Differentiable (once) in the prediction; everything else is data.
-
-    Args:
-        prediction, target: per scale ``[C_s, H_s, W_s]``.
-        weight: ``[1, H, W]`` in [0, 1] at full size; averaged down to each scale.
-    """
+    """Mean absolute difference of feature maps ``[C_s, H_s, W_s]``, averaged over the scales, every place weighted by
+    its confidence ``[1, H, W]`` in [0, 1], averaged down to each scale. Differentiable (once) in the prediction."""
     total = prediction[0].new_zeros(())
     for mine, theirs in zip(prediction, target):
         check_shape(theirs, "feature_distance", tuple(mine.shape))
@@ -369,11 +312,9 @@ def image_error(error: Tensor, square: float, gradient: float) -> Tensor:
 def depth_code_error(generated: Tensor, truth: Tensor, weight: Tensor, log_per_code: float) -> Tensor:
     """5 x smooth L1 (beta 0.005) of made / true depth - 1, weighted; a plain mean over pixels.
 
-    A surface painted too far away costs more than one too near, as in the measure it is scored by.
-
-    Args:
-        generated, truth: codes ``[N, 1, H, W]``, taken for logarithms of depth in steps of ``log_per_code``.
-        weight: ``[N, 1, H, W]``; 0 where the truth is not known.
+    A surface painted too far away costs more than one too near, as in the measure it is scored by. Codes
+    ``[N, 1, H, W]`` are taken for logarithms of depth in steps of ``log_per_code``; the weight is 0 where the truth is
+    not known.
     """
     ratio = torch.expm1(((generated - truth) * log_per_code).clamp(max=MAX_LOG_RATIO))
     off = F.smooth_l1_loss(ratio, torch.zeros_like(ratio), beta=0.005, reduction="none")

@@ -28,14 +28,9 @@ from mudg.core.street_scores import VisibleAgent
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LaneFacts:
-    """Road markings of a view.
-
-    Args:
-        road: bool[H, W], where they are looked for. marking, band: bool[H, W], where they are, and the band around
-            them.
-        reference: colours f32[3, H, W] in [0, 1]: the true image, or the recorded one carried over by the ground plane.
-        exact: ``marking`` is the truth, not what a rule found in the reference.
-    """
+    """Road markings of a view: where they are looked for, where they are, and the ``band`` around them; colours
+    ``reference`` f32[3, H, W] in [0, 1] of the true image, or of the recorded one carried over by the ground plane.
+    ``exact``: ``marking`` is the truth, not what a rule found in the reference."""
 
     road: NDArray[np.bool_]
     marking: NDArray[np.bool_]
@@ -46,12 +41,8 @@ class LaneFacts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewFacts:
-    """Facts about a view, each None where it is not known.
-
-    Args:
-        points: what LiDAR points say. agents: vehicles that count. lanes: markings.
-        instance: i32[H, W], number of the object that each pixel shows, 0 = none.
-    """
+    """What LiDAR points say of a view, vehicles that count, markings, and the number ``instance`` i32[H, W] of the
+    object that each pixel shows (0 = none); each None where it is not known."""
 
     points: PointTruth | None = None
     agents: tuple[VisibleAgent, ...] | None = None
@@ -104,12 +95,9 @@ class PixelMotion:
 def pixel_motion(
     frame: TrueFrame, following: TrueFrame, moved: Mapping[int, Tensor] | None = None, instance: Tensor | None = None
 ) -> PixelMotion:
-    """Carry every pixel of a frame by its depth into the following one.
-
-    Args:
-        moved: how rigid objects move in the world between the two, f64[4, 4] by their number in ``instance`` i64[H, W]
-            of the first frame; their pixels are carried with them and count as static ones do.
-    """
+    """Carry every pixel of a frame by its depth into the following one. ``moved``: how rigid objects move in the world
+    between the two, f64[4, 4] by their number in ``instance`` i64[H, W] of the first frame; their pixels are carried
+    with them and count as static ones do."""
     height, width = frame.ids.shape
     found = [_motion_of_rows(frame, following, moved, instance, rows) for rows in _bands(height, width)]
     if len(found) == 1:
@@ -192,15 +180,9 @@ def pieces_of(values: Tensor, channels: int = 1) -> Iterator[Tensor]:
 
 
 def psnr(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio in dB for values in [0, 1].
-
-    Args:
-        prediction, truth: ``[C, H, W]``; the prediction is clamped to [0, 1].
-        mask: bool ``[1, H, W]``: pixels that count (default all).
-
-    Returns:
-        dB from the mean squared error over all counted values; infinity for equal images, NaN when nothing counts.
-    """
+    """Peak signal-to-noise ratio in dB of images ``[C, H, W]`` in [0, 1], the prediction clamped to it: from the mean
+    squared error over all values in ``mask`` (bool ``[1, H, W]``). Infinity for equal images, NaN when nothing
+    counts."""
     if mask is not None and not bool(mask.all()):
         chosen = mask.expand_as(truth)
         prediction, truth = prediction[chosen], truth[chosen]
@@ -236,12 +218,8 @@ class DepthErrors:
 
 
 def depth_errors(prediction_m: Tensor, truth_m: Tensor, mask: Tensor) -> DepthErrors:
-    """Compare depth maps (camera z, metres) where ``mask`` is set and the truth is positive and finite. InputError: a
-    counted prediction is not finite.
-
-    Args:
-        prediction_m, truth_m: ``[1, H, W]``. mask: bool ``[1, H, W]``.
-    """
+    """Compare depth maps ``[1, H, W]`` (camera z, metres) where ``mask`` is set and the truth is positive and finite.
+    InputError: a counted prediction is not finite."""
     counted = mask & torch.isfinite(truth_m) & (truth_m > 0)
     predicted_m, true_m = prediction_m[counted], truth_m[counted]
     pixels = predicted_m.numel()
@@ -260,16 +238,8 @@ def depth_errors(prediction_m: Tensor, truth_m: Tensor, mask: Tensor) -> DepthEr
 
 
 def confusion(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Confusion counts i64[19, 19] (row = truth, column = prediction).
-
-    Args:
-        prediction, truth: class ids, integers ``[H, W]``; truth 255 is not counted, a prediction outside 0..18 counts
-            as wrong (it enters no column: see ``iou_of``).
-        mask: bool broadcastable to ``[H, W]``.
-
-    Returns:
-        i64[19, 20]: the last column counts predictions outside the 19 classes.
-    """
+    """Confusion counts i64[19, 20] (row = truth, column = prediction) of class ids ``[H, W]`` where ``mask`` is set;
+    truth 255 is not counted. The last column counts predictions outside the 19 classes, which are wrong."""
     allowed = torch.ones_like(truth, dtype=torch.bool) if mask is None else mask.reshape(truth.shape)
     counts = torch.zeros(CLASS_COUNT * (CLASS_COUNT + 1), dtype=torch.int64)
     for given, made, chosen in zip(pieces_of(truth), pieces_of(prediction), pieces_of(allowed), strict=True):
@@ -341,12 +311,9 @@ def measure(pair: Pair, metrics: Mapping[str, Metric]) -> dict[str, Any]:
 
 
 class Pooled:
-    """A number over all views: the sum of what they add, over what they count for.
-
-    Args:
-        source: what is measured of a view. share: sum and count that a measurement adds (None: it is both). finish:
-            the number from their ratio.
-    """
+    """A number over all views: the sum of what they add, over what they count for. ``source``: what is measured of a
+    view; ``share``: sum and count that a measurement adds (None: it is both); ``finish``: the number from their
+    ratio."""
 
     def __init__(
         self,
@@ -375,16 +342,31 @@ def frame_mean(source: Callable[[Pair], float | None]) -> Pooled:
     return Pooled(source, lambda number: (0.0, 0) if math.isnan(number) else (min(number, 100.0), 1))
 
 
+def _depths(pair: Pair) -> DepthErrors | None:
+    if pair.depth is None or pair.truth_depth is None:
+        return None
+    mask = torch.ones_like(pair.truth_depth, dtype=torch.bool) if pair.mask is None else pair.mask
+    if pair.truth_depth_valid is not None:
+        mask = mask & pair.truth_depth_valid
+    return depth_errors(pair.depth, pair.truth_depth, mask)
+
+
+def _classes(pair: Pair) -> Tensor | None:
+    if pair.semantics is None or pair.truth_semantics is None:
+        return None
+    return confusion(pair.semantics, pair.truth_semantics, pair.mask)
+
+
 def depth_error(
-    field: Literal["abs_rel", "rmse_m", "delta1"], source: Callable[[Pair], DepthErrors | None] | None = None
+    field: Literal["abs_rel", "rmse_m", "delta1"], source: Callable[[Pair], DepthErrors | None] = _depths
 ) -> Pooled:
-    """A depth error pooled over all pixels of the trajectory. source: None: of whole views."""
+    """A depth error pooled over all pixels of the trajectory."""
 
     def share(errors: DepthErrors) -> tuple[float, float]:
         number = errors.rmse_m**2 if field == "rmse_m" else getattr(errors, field)
         return (number * errors.pixels, errors.pixels) if errors.pixels else (0.0, 0)
 
-    return Pooled(source or _depth_errors_of, share, math.sqrt if field == "rmse_m" else float)
+    return Pooled(source, share, math.sqrt if field == "rmse_m" else float)
 
 
 class Neighbours(Pooled):
@@ -401,14 +383,10 @@ class Neighbours(Pooled):
 
 
 class Segmentation:
-    """Mean IoU over the classes present in the truth, or pixel accuracy, from one pooled confusion matrix. source:
-    None: of whole views."""
+    """Mean IoU over the classes present in the truth, or pixel accuracy, from one pooled confusion matrix."""
 
-    def __init__(
-        self, field: Literal["miou", "accuracy"], source: Callable[[Pair], Tensor | None] | None = None
-    ) -> None:
-        self._field = field
-        self.source = source or _confusion_of
+    def __init__(self, field: Literal["miou", "accuracy"], source: Callable[[Pair], Tensor | None] = _classes) -> None:
+        self._field, self.source = field, source
         self.counts = torch.zeros(CLASS_COUNT, CLASS_COUNT + 1, dtype=torch.int64)
 
     def add(self, measured: Tensor | None) -> None:
@@ -497,21 +475,6 @@ def neighbour_of(pair: Pair) -> Pair:
     true depth and classes, and the instances. The rest would fill the memory at large sizes."""
     facts = ViewFacts(instance=pair.facts.instance)
     return replace(pair, depth=None, semantics=None, truth_depth_valid=None, mask=None, moving=None, facts=facts)
-
-
-def _depth_errors_of(pair: Pair) -> DepthErrors | None:
-    if pair.depth is None or pair.truth_depth is None:
-        return None
-    mask = torch.ones_like(pair.truth_depth, dtype=torch.bool) if pair.mask is None else pair.mask
-    if pair.truth_depth_valid is not None:
-        mask = mask & pair.truth_depth_valid
-    return depth_errors(pair.depth, pair.truth_depth, mask)
-
-
-def _confusion_of(pair: Pair) -> Tensor | None:
-    if pair.semantics is None or pair.truth_semantics is None:
-        return None
-    return confusion(pair.semantics, pair.truth_semantics, pair.mask)
 
 
 # ---- LiDAR points, vehicles and markings ---------------------------------------------------------
@@ -633,8 +596,8 @@ def _psnr_of_dynamic(pair: Pair) -> float | None:
 
 @dataclass(frozen=True)
 class MetricRow:
-    """One row of the table: what it needs, which way is better (one: nearest to 1), how to build it (None: its weights
-    are not shipped)."""
+    """One row of the table: what it needs, which way is better (one: nearest to 1), how to build it (None: a caller
+    does, with a motion, weights or detections)."""
 
     title: str
     unit: str
@@ -652,7 +615,7 @@ METRICS: Final[dict[str, MetricRow]] = {
     "perceptual": MetricRow("perceptual", "", ("rgb", "features of the shipped codec"), "lower", None),
     "flicker": MetricRow("flicker", "", ("every frame", "rgb"), "one", flicker_over_truth),
     "warp_error": MetricRow("warp error", "", ("every frame", "rgb"), "lower", None),
-    "temporal_flickering": MetricRow("temporal flickering", "", ("views",), "higher", None),
+    "temporal_flickering": MetricRow("temporal flickering", "", ("views",), "higher", temporal_flickering),
     "lpips": MetricRow("LPIPS", "", ("rgb", "LPIPS weights"), "lower", None),
     "lpips_vgg": MetricRow("LPIPS (VGG)", "", ("rgb", "LPIPS weights"), "lower", None),
     "fid": MetricRow("FID", "", ("rgb", "Inception weights"), "lower", None),
@@ -661,17 +624,25 @@ METRICS: Final[dict[str, MetricRow]] = {
     "abs_rel": MetricRow("AbsRel", "", ("depth",), "lower", lambda: depth_error("abs_rel")),
     "rmse_m": MetricRow("RMSE", "m", ("depth",), "lower", lambda: depth_error("rmse_m")),
     "delta1": MetricRow("delta < 1.25", "", ("depth",), "higher", lambda: depth_error("delta1")),
-    "lidar_abs_rel": MetricRow("AbsRel at points", "", ("LiDAR points",), "lower", None),
-    "lidar_rmse_m": MetricRow("RMSE at points", "m", ("LiDAR points",), "lower", None),
-    "lidar_delta1": MetricRow("delta < 1.25 at points", "", ("LiDAR points",), "higher", None),
-    "lidar_psnr": MetricRow("PSNR at points", "dB", ("LiDAR points",), "higher", None),
+    "lidar_abs_rel": MetricRow(
+        "AbsRel at points", "", ("LiDAR points",), "lower", lambda: depth_error("abs_rel", _point_depths)
+    ),
+    "lidar_rmse_m": MetricRow(
+        "RMSE at points", "m", ("LiDAR points",), "lower", lambda: depth_error("rmse_m", _point_depths)
+    ),
+    "lidar_delta1": MetricRow(
+        "delta < 1.25 at points", "", ("LiDAR points",), "higher", lambda: depth_error("delta1", _point_depths)
+    ),
+    "lidar_psnr": MetricRow("PSNR at points", "dB", ("LiDAR points",), "higher", lambda: decibels(_point_colors)),
     "miou": MetricRow("mIoU", "", ("semantics",), "higher", lambda: Segmentation("miou")),
     "accuracy": MetricRow("pixel accuracy", "", ("semantics",), "higher", lambda: Segmentation("accuracy")),
-    "agreement": MetricRow("agreement of classes", "", ("classes of points",), "higher", None),
-    "agent_iou": MetricRow("agent IoU", "", ("exact vehicles",), "higher", None),
-    "lane_iou": MetricRow("lane IoU", "", ("exact markings",), "higher", None),
-    "lane_correlation": MetricRow("lane gradients", "", ("markings",), "higher", None),
-    "lane_psnr": MetricRow("PSNR of lanes", "dB", ("markings",), "higher", None),
+    "agreement": MetricRow(
+        "agreement of classes", "", ("classes of points",), "higher", lambda: Segmentation("miou", _point_classes)
+    ),
+    "agent_iou": MetricRow("agent IoU", "", ("exact vehicles",), "higher", lambda: Pooled(_agents)),
+    "lane_iou": MetricRow("lane IoU", "", ("exact markings",), "higher", lambda: Pooled(_markings)),
+    "lane_correlation": MetricRow("lane gradients", "", ("markings",), "higher", lambda: frame_mean(_lane_edges)),
+    "lane_psnr": MetricRow("PSNR of lanes", "dB", ("markings",), "higher", lambda: decibels(_lane_colors)),
     "nta_iou": MetricRow("NTA-IoU", "", ("boxes", "detected boxes"), "higher", None),
     "ntl_iou": MetricRow("NTL-IoU", "", ("lane lines", "detected lanes"), "higher", None),
 }
@@ -679,25 +650,18 @@ METRICS: Final[dict[str, MetricRow]] = {
 
 EVERY_VIEW: Final = ("flicker", "temporal_flickering", "warp_error")
 """Metrics that want all views of a trajectory, in order."""
-FACTS: Final[Mapping[str, Callable[[], Metric]]] = {
-    "lidar_abs_rel": lambda: depth_error("abs_rel", _point_depths),
-    "lidar_rmse_m": lambda: depth_error("rmse_m", _point_depths),
-    "lidar_delta1": lambda: depth_error("delta1", _point_depths),
-    "lidar_psnr": lambda: decibels(_point_colors),
-    "agreement": lambda: Segmentation("miou", _point_classes),
-    "agent_iou": lambda: Pooled(_agents),
-    "lane_iou": lambda: Pooled(_markings),
-    "lane_correlation": lambda: frame_mean(_lane_edges),
-    "lane_psnr": lambda: decibels(_lane_colors),
-    "temporal_flickering": temporal_flickering,
-}
-"""Rows of ``METRICS`` that are computed from ``ViewFacts`` or from neighbouring views, for true images, too; the warp
-error needs a motion besides."""
+FACTS: Final = (
+    *("lidar_abs_rel", "lidar_rmse_m", "lidar_delta1", "lidar_psnr", "agreement", "agent_iou"),
+    *("lane_iou", "lane_correlation", "lane_psnr", "temporal_flickering"),
+)
+"""Metrics that are computed from ``ViewFacts`` or from neighbouring views, for true images, too; the warp error needs a
+motion besides."""
 
 
 def build_facts(motion: ExactMotion) -> dict[str, Metric]:
-    """A fresh accumulator for every row of ``FACTS``, and for the warp error."""
-    return {**{name: build() for name, build in FACTS.items()}, "warp_error": warp_error(motion)}
+    """A fresh accumulator for every metric of ``FACTS``, and for the warp error."""
+    built = {name: build() for name in FACTS if (build := METRICS[name].build) is not None}
+    return {**built, "warp_error": warp_error(motion)}
 
 
 def build_all(
@@ -705,14 +669,9 @@ def build_all(
     motion: ExactMotion | None = None,
     more: Mapping[str, Metric] | None = None,
 ) -> dict[str, Metric]:
-    """A fresh accumulator for every metric that can be computed.
-
-    Args:
-        distances: what computes a row that needs weights.
-        motion: shared by several methods on one trajectory (see ``flicker_over_truth``).
-        more: further accumulators, such as ``build_facts``.
-    """
-    own = {name: row.build() for name, row in METRICS.items() if row.build is not None}
+    """A fresh accumulator for every metric that can be computed. ``distances``: what computes a row that needs weights;
+    ``motion``: shared by several methods on one trajectory; ``more``: further accumulators, such as ``build_facts``."""
+    own = {name: row.build() for name, row in METRICS.items() if row.build is not None and name not in FACTS}
     compared = {name: frame_mean(of) for name, of in (distances or {}).items()}
     return {**own, "flicker": flicker_over_truth(motion), **(more or {}), **compared}
 

@@ -1,10 +1,12 @@
-"""Training steps that touch much memory, done in one native pass. Each has a plain-torch twin, which is used, and named
-once, where the native library is missing or the tensors are not float32 on the CPU."""
+"""Training steps that touch much memory, done in one native pass; in plain torch, which is named once, where the native
+library is missing or the tensors are not float32 on the CPU. Differentiable once; values do not depend on the number of
+threads."""
 
 from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,18 +17,19 @@ from torch.nn import functional
 from mudg import native
 from mudg.base import log
 from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.palette import UNLABELLED
 from mudg.base.types import check_shape
 from mudg.core import losses
-from mudg.core.table import BETA1, BETA2, EPSILON, AdamColumn, torch_adam_columns
+
+BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
 
 def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, weight: Tensor | None = None) -> Tensor:
     """Scalar ``(1 - w) mean|p - t| + w (1 - mean SSIM)`` of images ``[C, H, W]`` in [0, 1]; with a weight ``[H, W]``
     for every pixel the mean over all of them of weight times ``(1 - w) |p - t| + w (1 - SSIM)``.
 
-    Differentiable in the prediction (once); target and weight are data. The value does not depend on the number of
-    threads. SSIM: 11x11 Gaussian window, sigma 1.5 px, zero padding. InputError: shapes differ or are not [C, H, W].
-    UsageError: the weight is outside [0, 1].
+    Differentiable in the prediction; target and weight are data. SSIM as in ``losses.ssim_map``. InputError: shapes
+    differ or are not [C, H, W]. UsageError: the weight of SSIM is outside [0, 1].
     """
     check_shape(prediction, "photometric: prediction", (None, None, None))
     check_shape(target, "photometric: target", tuple(prediction.shape))
@@ -37,7 +40,9 @@ def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, we
         weight = weight.detach().to(prediction.dtype).contiguous()
     library = _library_for((prediction, target))
     if library is None or prediction.numel() == 0:
-        return losses.photometric(prediction, target, ssim_weight, weight)
+        both = (1 - ssim_weight) * (prediction - target).abs()
+        both = both + ssim_weight * (1 - losses.ssim_map(prediction, target))
+        return both.mean() if weight is None else losses.confident_mean(both, weight)
     image, wanted = prediction.detach().contiguous(), target.detach().contiguous()
     gradient, status = torch.empty_like(image), ctypes.c_int(0)
     library.mudg_photometric.restype = ctypes.c_double
@@ -56,17 +61,11 @@ def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, we
 def class_loss(
     logits: Tensor, target: Tensor, weight: Tensor, total: float | Tensor, lift: tuple[int, Tensor] | None = None
 ) -> Tensor:
-    """Scalar: cross entropy of every pixel, times its weight, summed and divided by ``total``.
+    """Scalar: cross entropy of the logits ``[C, H, W]`` of every pixel, times its weight ``[H, W]``, summed and divided
+    by ``total``, a positive number or scalar tensor. InputError: sizes differ, or there is no channel.
 
-    Differentiable in the logits (once); everything else is data. The value does not depend on the number of threads.
-    InputError: sizes differ, or there is no channel.
-
-    Args:
-        logits: ``[C, H, W]``.
-        target: i64[H, W] in 0..C-1; anything else (255) is unlabelled and counts nothing.
-        weight: ``[H, W]``.
-        total: positive; a scalar tensor is read where the library computes, and stays on the device elsewhere.
-        lift: a channel, and ``[H, W]`` to add to its logits.
+    Differentiable in the logits; everything else is data. Of ``target`` i64[H, W], what is not in 0..C-1 is unlabelled
+    and counts nothing. ``lift``: a channel, and ``[H, W]`` to add to its logits.
     """
     check_shape(logits, "class loss: logits", (None, None, None))
     planes = {"target": target, "weight": weight, "lift": weight if lift is None else lift[1]}
@@ -76,7 +75,13 @@ def class_loss(
         raise InputError("class loss: there is no such channel to lift", got=f"{lift} of {len(logits)} channels"[:80])
     library = _library_for((logits, weight))
     if library is None or logits.numel() == 0 or target.dtype != torch.int64:
-        return losses.class_loss(logits, target, weight, total, lift)
+        if lift is not None:
+            # filled there: a list would be copied, and waited for
+            raised = torch.full((1,), lift[0], device=logits.device)
+            logits = logits.index_add(0, raised, lift[1].detach()[None].to(logits.dtype))
+        labelled = torch.where((target >= 0) & (target < len(logits)), target, UNLABELLED)[None]
+        errors = functional.cross_entropy(logits[None], labelled, ignore_index=UNLABELLED, reduction="none")[0]
+        return (errors * weight).sum() / (total.to(weight.dtype) if isinstance(total, Tensor) else total)
     channel, added = (-1, None) if lift is None else (lift[0], lift[1].detach().to(torch.float32).contiguous())
     values, ids, weight = logits.detach().contiguous(), target.contiguous(), weight.detach().contiguous()
     gradient, status = torch.empty_like(values), ctypes.c_int(0)
@@ -96,61 +101,63 @@ def class_loss(
 
 
 def over(rgb: Tensor, alpha: Tensor, coarse: Tensor) -> Tensor:
-    """``rgb + (1 - alpha) * coarse``, with the coarse picture enlarged to the size of the other (bilinear between pixel
-    centres).
-
-    Differentiable (once) in all three. InputError: shapes do not fit.
-
-    Args:
-        rgb: ``[C, H, W]``. alpha: ``[1, H, W]``. coarse: ``[C, h, w]``.
-    """
+    """``rgb + (1 - alpha) * coarse``, with the coarse picture ``[C, h, w]`` enlarged to the size of ``rgb [C, H, W]``
+    (bilinear between pixel centres); ``alpha`` is ``[1, H, W]``. Differentiable in all three. InputError: shapes do not
+    fit."""
     check_shape(rgb, "over: rgb", (None, None, None))
     check_shape(coarse, "over: coarse", (len(rgb), None, None))
     check_shape(alpha, "over: alpha", (1, *rgb.shape[1:]))
     library = _library_for((rgb, alpha, coarse))
     if library is None or rgb.numel() == 0 or coarse.numel() == 0:
-        return torch_over(rgb, alpha, coarse)
+        size = (rgb.shape[1], rgb.shape[2])
+        enlarged = functional.interpolate(coarse[None], size=size, mode="bilinear", align_corners=False)[0]
+        return rgb + (1 - alpha) * enlarged
     return _Over.apply(rgb, alpha, coarse, library)
-
-
-def torch_over(rgb: Tensor, alpha: Tensor, coarse: Tensor) -> Tensor:
-    """``over`` in plain torch."""
-    size = (rgb.shape[1], rgb.shape[2])
-    return rgb + (1 - alpha) * functional.interpolate(coarse[None], size=size, mode="bilinear", align_corners=False)[0]
 
 
 def box_mean(values: Tensor, size: int) -> Tensor:
     """Means over ``size`` x ``size`` pixels (odd), of the same shape ``[..., H, W]``; at the borders, over what is
-    there.
-
-    Differentiable (once). UsageError: an even size.
-    """
+    there. UsageError: an even size."""
     if size < 1 or size % 2 == 0:
         raise UsageError("the side of a box of pixels must be odd", got=str(size))
     library = _library_for((values,))
     if library is None or values.numel() == 0:
-        return torch_box_mean(values, size)
+        planes = values.reshape(1, -1, *values.shape[-2:])
+        found = functional.avg_pool2d(planes, size, stride=1, padding=size // 2, count_include_pad=False)
+        return found.reshape(values.shape)
     return _BoxMean.apply(values, size // 2, library)
 
 
-def torch_box_mean(values: Tensor, size: int) -> Tensor:
-    """The plain-torch twin of ``box_mean``."""
-    planes = values.reshape(1, -1, *values.shape[-2:])
-    return functional.avg_pool2d(planes, size, stride=1, padding=size // 2, count_include_pad=False).reshape(
-        values.shape
-    )
+@dataclass(frozen=True, slots=True, eq=False)
+class AdamColumn:
+    """One column of a step of Adam: four tensors of one shape [N, ...] (all but ``gradient`` are updated) and the
+    learning rate."""
+
+    parameter: Tensor
+    gradient: Tensor
+    moment1: Tensor
+    moment2: Tensor
+    rate: float
+
+    def step_in_torch(self, step: int, rows: Tensor | None) -> None:
+        """``adam_columns`` of this one in plain torch."""
+        whole = (self.parameter, self.moment1, self.moment2)
+        parameter, moment1, moment2 = whole if rows is None else (values.clone() for values in whole)
+        moment1.mul_(BETA1).add_(self.gradient, alpha=1 - BETA1)
+        moment2.mul_(BETA2).addcmul_(self.gradient, self.gradient, value=1 - BETA2)
+        denominator = (moment2 / (1 - BETA2**step)).sqrt_().add_(EPSILON)
+        parameter.addcdiv_(moment1, denominator, value=-self.rate / (1 - BETA1**step))
+        if rows is not None:
+            # chosen by a mask: counting rows would wait for the device
+            chosen = rows.view(-1, *[1] * (self.gradient.ndim - 1))
+            for values, updated in zip(whole, (parameter, moment1, moment2)):
+                values.copy_(torch.where(chosen, updated, values))
 
 
 def adam_columns(columns: Sequence[AdamColumn], step: int, chosen: Tensor | None = None) -> None:
-    """One Adam step in place on several columns with the same rows (the kernel of ``Table.adam_step``).
-
-    Betas 0.9 and 0.999, epsilon 1e-15, bias-corrected for ``step`` (from 1). InputError: shapes differ, or ``chosen``
-    is not bool[N]. UsageError: ``step`` below 1.
-
-    Args:
-        columns: any number, N rows each; contiguous for the native path.
-        chosen: bool[N]: only these rows move, parameters and moments; None = all.
-    """
+    """One step of Adam (Kingma & Ba 2015) in place on columns with the same N rows: betas 0.9 and 0.999, epsilon 1e-15,
+    bias-corrected for ``step`` (from 1). ``chosen`` bool[N]: only these rows move, parameters and moments. InputError:
+    shapes differ, or ``chosen`` is not bool[N]. UsageError: ``step`` below 1."""
     if step < 1:
         raise UsageError("Adam steps count from 1", got=str(step))
     if not columns:
@@ -168,7 +175,8 @@ def adam_columns(columns: Sequence[AdamColumn], step: int, chosen: Tensor | None
     library = _library_for((*in_place, *(one.gradient for one in columns)))
     if library is None or not all(t.is_contiguous() for t in in_place):
         with torch.no_grad():
-            torch_adam_columns(columns, step, chosen)
+            for one in columns:
+                one.step_in_torch(step, chosen)
         return
     gradients = [one.gradient.detach().contiguous() for one in columns]
     table = (_Column * len(columns))()

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
@@ -18,7 +18,7 @@ from mudg import native
 from mudg.base import log
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import UNLABELLED
-from mudg.base.types import Camera, FusedCloud, PointCloud, Track, View, check_shape
+from mudg.base.types import Camera, FusedCloud, View, check_shape
 
 # zbuffer: the nearest point of every pixel, native or, operation for operation the same, in numpy --------
 
@@ -28,12 +28,8 @@ _EMPTY: Final = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointLayer:
-    """Points of one rigid frame.
-
-    Args:
-        xyz: f32[N, 3]; points that are not finite are not drawn. world_from_points: pose f64[4, 4] of their frame.
-        splat_px: side of the square of pixels that a point covers.
-    """
+    """Points f32[N, 3] of one rigid frame of pose f64[4, 4], each covering a square of side ``splat_px`` pixels; those
+    that are not finite are not drawn."""
 
     xyz: NDArray[np.float32]
     world_from_points: NDArray[np.float64]
@@ -55,10 +51,7 @@ def draw_points(
     layers: Sequence[PointLayer], view: View, limits: DrawLimits
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Depth f32[H, W] in metres (0 = none) and index i32[H, W] of the nearest point of every pixel, over all layers (-1
-    = none).
-
-    Equal depths go to the lower index.
-    """
+    = none). Equal depths go to the lower index."""
     camera, first = view.camera, 0
     keys = np.full((camera.height, camera.width), _EMPTY)
     library = native.library()
@@ -205,13 +198,9 @@ def visible_depth(
     near_m: float = 0.5,
     far_m: float = 200.0,
 ) -> NDArray[np.float32]:
-    """The nearest point of every pixel, without the hidden ones; f32[H, W] metres, NaN = none. InputError: points have
-    the wrong shape.
-
-    Args:
-        xyz_world: [N, 3] metres; points that are not finite are left out.
-        gap_deg: largest angle between neighbouring beams, for rules whose reach follows from it.
-    """
+    """The nearest point of ``xyz_world [N, 3]`` of every pixel, without the hidden ones; f32[H, W] metres, NaN = none.
+    InputError: points have the wrong shape. ``gap_deg``: largest angle between neighbouring beams, for rules whose
+    reach follows from it."""
     check_shape(xyz_world, "visible_depth: points", (None, 3))
     layer = PointLayer(np.ascontiguousarray(xyz_world, np.float32), np.eye(4))
     depth, index = draw_points([layer], view, DrawLimits(near_m, far_m))
@@ -298,105 +287,9 @@ class ProjectConfig:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SparseView:
-    """A projected cloud.
-
-    Args:
-        color: f32[3, H, W] in [0, 1], 0 where not valid.
-        depth: f32[1, H, W] camera z in metres, 0 where not valid.
-        valid: bool[1, H, W].
-        index: i32[H, W] number of the point seen (static points first, then the objects in order), -1 = none.
-    """
-
-    color: Tensor
-    depth: Tensor
-    valid: Tensor
-    index: Tensor
-
-
-def project_points(
-    xyz: NDArray[np.float32],
-    rgb: NDArray[np.uint8] | None,
-    view: View,
-    *,
-    splat_px: float = 1.0,
-    near_m: float = 0.1,
-    far_m: float = 200.0,
-) -> SparseView:
-    """Draw world points into a view; the nearest wins, equal depths go to the lower index.
-
-    Args:
-        xyz: f32[N, 3] world metres; points that are not finite are not drawn.
-        rgb: u8[N, 3], or None: colour stays 0.
-        splat_px: side of the square of pixels that a point covers.
-    """
-    check_shape(xyz, "project_points: points", (None, 3))
-    config = ProjectConfig(static_splat_px=splat_px, near_m=near_m, far_m=far_m)
-    return _draw([PointLayer(xyz, np.eye(4), splat_px)], None if rgb is None else [rgb], view, config)
-
-
-def project_cloud(
-    cloud: FusedCloud,
-    world_from_object: Mapping[str, NDArray[np.float64]],
-    view: View,
-    config: ProjectConfig | None = None,
-) -> SparseView:
-    """Draw a fused cloud, its objects placed at the given poses, composed by depth, in the colours of the view's
-    camera.
-
-    Args:
-        cloud: the static world and one cloud per object in its box frame.
-        world_from_object: track id -> f64[4, 4] at the view's time; objects without a pose are absent.
-    """
-    config = config or ProjectConfig()
-    layers = [PointLayer(cloud.static.xyz, np.eye(4), config.static_splat_px)]
-    colors: list[NDArray[np.uint8]] = [cloud.static.rgb]
-    for name, points in drawn_objects(cloud, world_from_object):
-        layers.append(PointLayer(points.xyz, world_from_object[name], config.object_splat_px))
-        colors.append(points.rgb)
-    drawn = _draw(layers, colors, view, config)
-    shown = cloud.colors.image_of(view.camera.name, drawn.color)
-    return drawn if shown is drawn.color else replace(drawn, color=shown.clamp(0, 1) * drawn.valid)
-
-
-def drawn_objects(
-    cloud: FusedCloud, world_from_object: Mapping[str, NDArray[np.float64]]
-) -> list[tuple[str, PointCloud]]:
-    """The object clouds that have a pose, in the order in which ``SparseView.index`` counts them."""
-    return [(name, points) for name, points in cloud.objects.items() if name in world_from_object]
-
-
-def _draw(
-    layers: Sequence[PointLayer], colors: Sequence[NDArray[np.uint8]] | None, view: View, config: ProjectConfig
-) -> SparseView:
-    camera = view.camera
-    total = sum(len(layer.xyz) for layer in layers)
-    if total > _MAX_POINTS:
-        raise InputError("too many points for one view", expected=f"<= {_MAX_POINTS}", got=str(total))
-    depth, index = draw_points(layers, view, DrawLimits(config.near_m, config.far_m))
-    if config.occluder_m > 0:
-        limits = DrawLimits(config.near_m, config.far_m, config.occluder_m, config.occluder_max_px)
-        nearest, _ = draw_points(layers, view, limits)
-        hidden = RULES["drawn"].hides(nearest, depth)
-        depth[hidden], index[hidden] = 0.0, -1
-    color, first, library = np.zeros((3, camera.height, camera.width), np.float32), 0, native.library()
-    for rgb in colors or ():
-        table, count = np.ascontiguousarray(rgb), ctypes.c_int64
-        if library is not None:
-            size, numbers = count(index.size), (count(first), count(len(table)))
-            library.mudg_zbuffer_color(pointer(index), size, pointer(table), *numbers, pointer(color))
-        else:
-            mine = (index >= first) & (index < first + len(table))
-            color[:, mine] = (table[index[mine] - first].astype(np.float32) / np.float32(255)).T
-        first += len(table)
-    found, shown = torch.from_numpy(index), torch.from_numpy(index >= 0)[None]
-    return SparseView(torch.from_numpy(color), torch.from_numpy(depth)[None], shown, found)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class ProjectedPoints:
-    """A projected cloud: rgb f32[3,H,W] in [0,1], depth f32[H,W] m, valid bool[H,W], moving bool[H,W] (points of
-    objects), semantics u8[H,W] (255 = unknown)."""
+    """A projected cloud: ``rgb`` f32[3, H, W] in [0, 1] and ``depth`` f32[H, W] camera z in metres, 0 where no point is
+    drawn; ``valid`` bool[H, W]; ``moving`` bool[H, W], points of objects; ``semantics`` u8[H, W] (255 = unknown)."""
 
     rgb: Tensor
     depth: Tensor
@@ -405,20 +298,47 @@ class ProjectedPoints:
     semantics: Tensor
 
 
-def project_sparse(
-    cloud: FusedCloud, tracks: Sequence[Track], view: View, config: ProjectConfig, *, hide: bool
+def project_cloud(
+    cloud: FusedCloud,
+    world_from_object: Mapping[str, NDArray[np.float64] | None],
+    view: View,
+    config: ProjectConfig = ProjectConfig(),
+    *,
+    hide: bool = False,
 ) -> ProjectedPoints:
-    """Project a fused cloud into a view, its objects where they are at that time. ``hide``: leave points out that shine
-    through gaps between nearer ones (rule `condition`)."""
-    poses = {track.id: track.pose_at(view.time_s) for track in tracks if track.id in cloud.objects}
-    placed = {name: pose for name, pose in poses.items() if pose is not None}
-    seen = project_cloud(cloud, placed, view, config)
-    valid = seen.valid[0]
-    if hide:
-        valid = torch.from_numpy(seen_pixels(seen.depth[0].numpy(), valid.numpy(), RULES["condition"]))
-    clouds = [cloud.static, *(points for _, points in drawn_objects(cloud, placed))]
+    """Draw a fused cloud, its objects at poses f64[4, 4] by track (those without one are absent), composed by depth, in
+    the colours of the view's camera. ``hide``: points that shine through gaps between nearer ones (rule ``condition``)
+    are not valid."""
+    camera = view.camera
+    clouds, layers = [cloud.static], [PointLayer(cloud.static.xyz, np.eye(4), config.static_splat_px)]
+    for name, points in cloud.objects.items():
+        if (pose := world_from_object.get(name)) is not None:
+            clouds.append(points)
+            layers.append(PointLayer(points.xyz, pose, config.object_splat_px))
+    if (total := sum(map(len, clouds))) > _MAX_POINTS:
+        raise InputError("too many points for one view", expected=f"<= {_MAX_POINTS}", got=str(total))
+    depth, index = draw_points(layers, view, DrawLimits(config.near_m, config.far_m))
+    if config.occluder_m > 0:
+        limits = DrawLimits(config.near_m, config.far_m, config.occluder_m, config.occluder_max_px)
+        nearest, _ = draw_points(layers, view, limits)
+        hidden = RULES["drawn"].hides(nearest, depth)
+        depth[hidden], index[hidden] = 0.0, -1
+    color, first, library = np.zeros((3, camera.height, camera.width), np.float32), 0, native.library()
+    for points in clouds:
+        table, count = np.ascontiguousarray(points.rgb), ctypes.c_int64
+        if library is not None:
+            size, numbers = count(index.size), (count(first), count(len(table)))
+            library.mudg_zbuffer_color(pointer(index), size, pointer(table), *numbers, pointer(color))
+        else:
+            mine = (index >= first) & (index < first + len(table))
+            color[:, mine] = (table[index[mine] - first].astype(np.float32) / np.float32(255)).T
+        first += len(table)
+    drawn, valid = torch.from_numpy(color), index >= 0
+    rgb = cloud.colors.image_of(camera.name, drawn)
+    rgb = drawn if rgb is drawn else rgb.clamp(0, 1) * torch.from_numpy(valid)
     unknown = np.uint8(UNLABELLED)
     ids = [np.full(len(c), unknown) if c.semantics is None else c.semantics for c in clouds]
-    table = torch.from_numpy(np.append(np.concatenate(ids), unknown))  # index -1 finds the appended one
-    moving = (seen.index >= len(cloud.static)) & valid
-    return ProjectedPoints(seen.color, seen.depth[0], valid, moving, table[seen.index.long()])
+    semantics = np.append(np.concatenate(ids), unknown)[index]  # index -1 finds the appended one
+    valid = seen_pixels(depth, valid, RULES["condition"]) if hide else valid
+    moving = (index >= len(cloud.static)) & valid
+    return ProjectedPoints(rgb, *map(torch.from_numpy, (depth, valid, moving, semantics)))

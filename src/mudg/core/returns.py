@@ -30,12 +30,8 @@ BEHIND: Final = 1.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Returns:
-    """Returns of one sweep in one frame, and beams that were lost.
-
-    Args:
-        xyz: f64[N, 3] metres. seen_from: f64[3], where the sensor was. intensity: f32[N] in [0, 1], NaN where a beam
-            was lost.
-    """
+    """Returns f64[N, 3] metres of one sweep in one frame, where the sensor was, and intensities f32[N] in [0, 1], NaN
+    where a beam was lost."""
 
     xyz: Floats
     seen_from: Floats
@@ -51,15 +47,10 @@ class Returns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Met:
-    """What B beams met.
-
-    Args:
-        range_m: f64[B], NaN where no return is within reach. facing: f64[B], cosine between beam and surface.
-        nearest_rad: f64[B], angle to the nearest return, infinite where there is none. spacing_rad: f64[B], the middle
-            angle to the neighbours. one_sided: f64[B] in [0, 1], how much they lie to one side of the beam.
-        heard, lost: f64[B], how many returns and lost beams are around, each counted by its angle. intensity: f64[B].
-        nearest: i64[B], number of the return that counts most, -1: none.
-    """
+    """What B beams met, an entry for each: range (NaN where no return is within reach), cosine between beam and
+    surface, angle to the nearest return (infinite where there is none), the middle angle to the neighbours, how much
+    they lie to one side of the beam (0 to 1), how many returns and lost beams are around, each counted by its angle,
+    intensity, and the number of the return that counts most (-1: none)."""
 
     range_m: Floats
     facing: Floats
@@ -90,12 +81,8 @@ class Met:
 
 
 def first_surface(beams: Floats, xyz: Floats, intensity: Floats, trust: Floats) -> Met:
-    """What beams meet first.
-
-    Args:
-        beams: unit directions f64[B, 3] from the origin. xyz: returns f64[N, 3] in the same frame, none at the origin.
-        intensity: f64[N], NaN where a beam was lost. trust: f64[N], how much each counts.
-    """
+    """What beams (unit directions f64[B, 3] from the origin) meet first among returns f64[N, 3] in the same frame, none
+    at the origin. ``intensity`` f64[N]: NaN where a beam was lost; ``trust`` f64[N]: how much each counts."""
     heard = np.flatnonzero(np.isfinite(intensity))
     met = _surface(beams, xyz[heard], intensity[heard], trust[heard])
     met.nearest[:] = np.where(met.nearest >= 0, np.append(heard, -1)[met.nearest], -1)
@@ -240,12 +227,8 @@ MOST_RETURNS: Final = 20_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
-    """Rows of a sensor.
-
-    Args:
-        turn: f64[3, 3], rows-from-sensor rotation. heights_m: where the lower and the upper block start, along the
-            axis. split_deg: elevation between the blocks. elevations_deg: f64[R], rising.
-    """
+    """Rows of a sensor: rows-from-sensor rotation f64[3, 3], where the lower and the upper block start along the axis,
+    elevation between the blocks, and the elevations f64[R] of the rows, rising."""
 
     turn: Floats
     heights_m: tuple[float, float]

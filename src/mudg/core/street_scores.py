@@ -142,10 +142,7 @@ def bright_stripes(rgb: NDArray[np.floating], road: Mask) -> Mask:
 
     The image is blurred a little; a pixel of the road is a marking if it is brighter by ``CONTRAST`` than what an
     opening along its row, an eighth of the image wide, leaves of it; specks are left out. Only pixels of the road are
-    looked at: beside a dark car it is no marking.
-
-    Args:
-        rgb: colours ``[3, H, W]`` in [0, 1]. road: pixels where markings are looked for.
+    looked at: beside a dark car it is no marking. ``rgb``: colours ``[3, H, W]`` in [0, 1].
     """
     rows = rows_of(road, SMOOTH_REACH_PX)
     if rows.stop - rows.start < len(road):  # what lies above and below the road changes nothing on it
@@ -281,12 +278,8 @@ def clipped_box(view: View, world_from_box: NDArray[np.float64], size_m: NDArray
 
 def nta_truths(view: View, tracks: Sequence[Track]) -> list[tuple[Track, ImageBox]]:
     """Boxes of the vehicles that a view shows, in whole pixels of an image of 480 x 320; only those that lie inside it
-    whole.
-
-    Args:
-        tracks: candidates; those without a pose at the view's time or that are no vehicles are left out. Nothing is
-            asked about what hides them.
-    """
+    whole. Tracks without a pose at the view's time or that are no vehicles are left out; nothing is asked about what
+    hides them."""
     scale = np.array([NTA_WIDTH_PX / view.camera.width, NTA_HEIGHT_PX / view.camera.height] * 2)
     limit = np.array([NTA_WIDTH_PX, NTA_HEIGHT_PX])
     found = []
@@ -330,6 +323,25 @@ class VisibleAgent:
     outline: ImageBox
     visible: ImageBox
 
+    def iou(self, vehicle: Mask) -> float:
+        """IoU of the visible box with that of the largest connected region of vehicle pixels bool[H, W] near it; 0 if
+        there is none or its centre is off by more than 10 pixels in an image 480 pixels wide.
+
+        Near means: inside the outline of the true 3-D box, made 1.2 times as large.
+        """
+        height, width = vehicle.shape
+        half, centre = (
+            AGENT_GROWTH * (self.outline[2:] - self.outline[:2]) / 2,
+            (self.outline[2:] + self.outline[:2]) / 2,
+        )
+        left, top = np.maximum(np.floor(centre - half), 0).astype(int)
+        right, bottom = np.minimum(np.ceil(centre + half), (width, height)).astype(int)
+        labelled: Any = ndimage.label(vehicle[top:bottom, left:right])
+        regions, count = labelled
+        box = tight_box(regions == np.bincount(regions.ravel())[1:].argmax() + 1) if count else None
+        found = [] if box is None else [box + np.array([left, top, left, top], np.float64)]
+        return _matched(self.visible, found, NTA_REACH_PX * width / NTA_WIDTH_PX)
+
 
 def tight_box(mask: NDArray[np.bool_]) -> ImageBox | None:
     """Left, top, right, bottom edges of the pixels that are set in bool[H, W]; None if there are none."""
@@ -341,10 +353,7 @@ def visible_agents(
     view: View, tracks: Sequence[tuple[int, Track]], instance: NDArray[np.integer]
 ) -> tuple[VisibleAgent, ...]:
     """The vehicles that count: at least 100 visible pixels, which are at least 30 % of their outline in the image.
-
-    Args:
-        tracks: number in ``instance`` and track. instance: i32[H, W], what each pixel shows.
-    """
+    ``tracks``: number in ``instance`` i32[H, W], what each pixel shows, and track."""
     camera = view.camera
     edge = np.array([camera.width, camera.height], np.float64)
     counts = dict(zip(*(part.tolist() for part in np.unique(instance, return_counts=True)), strict=True))
@@ -363,28 +372,6 @@ def visible_agents(
 
 
 def agent_ious(agents: Sequence[VisibleAgent], classes: NDArray[np.integer]) -> list[float]:
-    """For each vehicle the IoU of its visible box with that of the largest connected region of vehicle pixels near it;
-    0 if there is none or its centre is off by more than 10 pixels in an image 480 pixels wide.
-
-    Near means: inside the outline of the true 3-D box, made 1.2 times as large. ``classes``: train ids ``[H, W]`` of
-    the image that is judged.
-    """
+    """``VisibleAgent.iou`` of each vehicle, in an image of train ids ``[H, W]``."""
     vehicle = np.isin(classes, VEHICLE_IDS)
-    height, width = vehicle.shape
-    reach_px = NTA_REACH_PX * width / NTA_WIDTH_PX
-    values = []
-    for agent in agents:
-        half = AGENT_GROWTH * (agent.outline[2:] - agent.outline[:2]) / 2
-        centre = (agent.outline[2:] + agent.outline[:2]) / 2
-        left, top = np.maximum(np.floor(centre - half), 0).astype(int)
-        right, bottom = np.minimum(np.ceil(centre + half), (width, height)).astype(int)
-        labelled: Any = ndimage.label(vehicle[top:bottom, left:right])
-        regions, count = labelled
-        if not count:
-            values.append(0.0)
-            continue
-        largest = int(np.bincount(regions.ravel())[1:].argmax()) + 1
-        box = tight_box(regions == largest)
-        found = [] if box is None else [box + np.array([left, top, left, top], np.float64)]
-        values.append(_matched(agent.visible, found, reach_px))
-    return values
+    return [agent.iou(vehicle) for agent in agents]

@@ -3,40 +3,18 @@ order, and row operations move them together."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
 from mudg.base.errors import InputError
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class AdamColumn:
-    """One column of a step of Adam: four tensors of one shape [N, ...] (all but ``gradient`` are updated) and the
-    learning rate."""
-
-    parameter: Tensor
-    gradient: Tensor
-    moment1: Tensor
-    moment2: Tensor
-    rate: float
-
-
-AdamKernel = Callable[[Sequence[AdamColumn], int, Tensor | None], None]
-"""(columns with the same rows, step from 1, rows bool[N] to update or None = all): update in place."""
-
-BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
+from mudg.core.native_ops import AdamColumn, adam_columns
 
 
 class Table:
-    """Parameters ``[N, ...]`` with Adam moments, plus integer or float counters ``[N, ...]`` that are not optimised.
-
-    Args:
-        columns: name -> raw parameter, float, all with the same first dimension N. They become leaves with gradients.
-        labels: name -> per-row facts (e.g. the node index), any dtype, carried along, never optimised.
-    """
+    """Parameters ``[N, ...]`` by name with Adam moments, leaves with gradients, plus facts ``labels [N, ...]`` of the
+    rows of any type (e.g. the node index), carried along, never optimised."""
 
     def __init__(self, columns: Mapping[str, Tensor], labels: Mapping[str, Tensor] | None = None) -> None:
         self.columns = {name: _leaf(value) for name, value in columns.items()}
@@ -122,24 +100,15 @@ class Table:
         for value in self.columns.values():
             value.grad = None
 
-    def adam_step(self, step: int, rates: Mapping[str, float], kernel: AdamKernel, rows: Tensor | None = None) -> None:
-        """One Adam step on every column that has a gradient and a rate above 0.
-
-        Args:
-            step: number of this step, from 1 (bias correction).
-            rates: learning rate per column; a column that is not named stays as it is.
-            kernel: ``torch_adam_columns`` or ``native_ops.adam_columns``.
-            rows: bool[N]: update these rows only, parameters and moments (the others wait); None = all.
-        """
-        kernel(
-            [
-                AdamColumn(value.detach(), value.grad, self.moment1[name], self.moment2[name], rates[name])
-                for name, value in self.columns.items()
-                if value.grad is not None and rates.get(name, 0.0) > 0
-            ],
-            step,
-            rows,
-        )
+    def adam_step(self, step: int, rates: Mapping[str, float], rows: Tensor | None = None) -> None:
+        """Adam step number ``step`` (from 1, for the bias correction) on every column that has a gradient and a rate
+        above 0 in ``rates``. ``rows`` bool[N]: update these only, parameters and moments (the others wait)."""
+        columns = [
+            AdamColumn(value.detach(), value.grad, self.moment1[name], self.moment2[name], rates[name])
+            for name, value in self.columns.items()
+            if value.grad is not None and rates.get(name, 0.0) > 0
+        ]
+        adam_columns(columns, step, rows)
 
     # -- state -------------------------------------------------------------------------------------
 
@@ -166,24 +135,6 @@ class Table:
                     raise InputError("a moment does not fit its column", where=name)
                 moments[name] = value.clone()
         return table
-
-
-def torch_adam_columns(columns: Sequence[AdamColumn], step: int, rows: Tensor | None = None) -> None:
-    """Adam (Kingma & Ba 2015), betas 0.9 and 0.999, epsilon 1e-15, in place: the plain-torch kernel of
-    ``Table.adam_step``."""
-    for one in columns:
-        whole = (one.parameter, one.moment1, one.moment2)
-        parameter, moment1, moment2 = whole if rows is None else (values.clone() for values in whole)
-        gradient = one.gradient
-        moment1.mul_(BETA1).add_(gradient, alpha=1 - BETA1)
-        moment2.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
-        denominator = (moment2 / (1 - BETA2**step)).sqrt_().add_(EPSILON)
-        parameter.addcdiv_(moment1, denominator, value=-one.rate / (1 - BETA1**step))
-        if rows is not None:
-            # chosen by a mask: counting rows would wait for the device
-            chosen = rows.view(-1, *[1] * (gradient.ndim - 1))
-            for values, updated in zip(whole, (parameter, moment1, moment2)):
-                values.copy_(torch.where(chosen, updated, values))
 
 
 def _leaf(value: Tensor) -> Tensor:

@@ -49,18 +49,9 @@ def recorded(scene: Scene, camera: str) -> Trajectory:
 
 
 def shifted(scene: Scene, camera: str, shift_m: float) -> Trajectory:
-    """The drive of one camera with the vehicle moved sideways; camera orientation kept. UsageError: unknown camera or a
-    number that is not finite. InputError: no ego pose at a frame's time.
-
-    Args:
-        scene: the log; its ego path gives the left direction at each frame's time.
-        camera: camera name, any mounting direction.
-        shift_m: signed distance, positive to the left of the direction of travel.
-
-    Returns:
-        Trajectory of origin "shifted" with one view per recorded frame. Each camera centre moves by exactly
-        ``shift_m``.
-    """
+    """The drive of one camera, of any mounting direction, with the vehicle moved sideways, one view per recorded frame:
+    each camera centre moves by exactly ``shift_m``, positive to the left of the direction of travel; orientation is
+    kept. UsageError: unknown camera or a number that is not finite. InputError: no ego pose at a frame's time."""
     if not np.isfinite(shift_m):
         raise UsageError("shift_m must be a finite number", got=str(shift_m))
     views = []
@@ -78,18 +69,13 @@ def at_shift(scene: Scene, camera: str, shift_m: float) -> Trajectory:
 
 
 def named(scene: Scene, camera: str, name: str) -> Trajectory:
-    """A path by its name; tables of papers use them.
+    """A path by its name (kind, sign and metres; tables of papers use them), with one view per recorded frame, at its
+    time and with its orientation.
 
     ``up+1``: the drive raised by 1 m. ``lane+0.1``: a lane change, with every frame 0.1 m further to the left of where
     the recorded vehicle is, along the left axis of the first frame. ``speed+0.1``: a faster drive, with every frame 0.1
     m further ahead, along the forward axis of the first frame. A minus means down, right, slower. UsageError: a
     malformed name, or an unknown camera. InputError: no ego pose at the first frame's time.
-
-    Args:
-        scene: the log. camera: camera name. name: kind, sign and metres.
-
-    Returns:
-        Trajectory ``<camera>_<name>`` with one view per recorded frame, at its time and with its orientation.
     """
     found = _NAMED.fullmatch(name)
     if found is None:

@@ -118,10 +118,15 @@ def as_dataset(
     **settings: Any,
 ) -> LabelledViews:
     """Labelled views of a reconstruction for a ``DataLoader`` (see ``LabelledViews``; batches need ``mudg.collate``).
-    ``run``: folder of a run, or of a fit with its ``scene``. ``edits``: an edit script to carry out before. ``path``:
-    file of a camera path that stands for the shifts. ``settings``: those of ``mudg dataset``, such as
-    ``cameras="front"``, ``shifts_m=(0, 2)``, ``width_px=480``. UsageError: an unknown setting, or a value that is none.
-    InputError: no such run."""
+
+    Args:
+        run: folder of a run, or of a fit with its ``scene``. edits: an edit script to carry out before.
+        path: file of a camera path that stands for the shifts.
+        settings: those of ``mudg dataset``, such as ``cameras="front"``, ``shifts_m=(0, 2)``, ``width_px=480``.
+
+    Raises:
+        UsageError: an unknown setting, or a value that is none. InputError: no such run.
+    """
     if isinstance(settings.get("cameras"), str):
         settings["cameras"] = (settings["cameras"],)
     return LabelledViews(run, scene, edits, configuration.load(DatasetConfig, overrides=settings), path)

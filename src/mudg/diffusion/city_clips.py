@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from mudg import native
 from mudg.base import geometry, seeds
 from mudg.base.config import result_settings
-from mudg.base.log import progress
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Clip, Condition, FinePatch, FusedCloud, Photo, Track, View
 from mudg.city.config import CityConfig
@@ -47,8 +46,8 @@ from mudg.city.sensors import (
 from mudg.city.world import CityTruth, CityWorld
 from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
 from mudg.core.trajectory import ego_left_world
-from mudg.diffusion.clips import FAR_M, shard_path, write_shard
-from mudg.diffusion.condition import ConditionRules, RenderAt, WarpSource, build_conditions
+from mudg.diffusion.clips import FAR_M, write_shard
+from mudg.diffusion.condition import ConditionRules, DriveInputs, RenderAt, WarpSource, build_conditions
 from mudg.gaussians import fit
 from mudg.gaussians.rendering import render_planes
 from mudg.gaussians.schedule import short_fit
@@ -93,14 +92,8 @@ def sized(width: int, height: int, city: int, multiple: int = 16) -> tuple[int, 
 def draw_city(
     seed: int, city: int, plain: CityConfig, textures: str = "", side_cameras: float = SIDE_CAMERAS
 ) -> CityConfig:
-    """Configuration of a training city.
-
-    Args:
-        seed, city: fix everything.
-        plain: seed, length and image size; the rest is drawn here.
-        textures: folder of photographs for `CityConfig.textures`; four fifths of the cities use it.
-        side_cameras: share of the cities with two cameras beside the front one.
-    """
+    """Configuration of a training city: `plain` fixes seed, length and image size; the rest is drawn from (seed, city).
+    Four fifths of the cities use `textures`, a folder of photographs."""
     rng = seeds.numpy_rng(seed, city, "varied city")
     beams, lower, upper = LIDARS[int(rng.choice(len(LIDARS), p=LIDAR_SHARES))]
     beside = rng.random() < side_cameras
@@ -202,10 +195,8 @@ def _lidar_faults(rng: np.random.Generator) -> LidarFaults:
 @dataclass(frozen=True)
 class CityLog:
     """A generated log as its training clips need it: world, fused cloud, recorded images of all frames and cameras.
-
     ``sweeps``: what was fused. ``boxes``: the annotated tracks (None = the exact ones); ``errors`` f64[frames, 4, 4]:
-    recorded pose = true pose @ error.
-    """
+    recorded pose = true pose @ error."""
 
     world: CityWorld
     cloud: FusedCloud
@@ -219,10 +210,6 @@ class CityLog:
         """The boxes as annotated."""
         return self.world.tracks() if self.boxes is None else self.boxes
 
-    def claimed(self, view: View) -> View:
-        """A true view of a frame's time with the pose that the log's poses make of it."""
-        return claimed_view(self.world, self.errors, view)
-
     def truth(self, view: View) -> CityTruth:
         """The truth at a true view, with the look of its camera."""
         found = self.world.render(view)
@@ -231,7 +218,7 @@ class CityLog:
 
 
 def claimed_view(world: CityWorld, errors: NDArray[np.float64] | None, view: View) -> View:
-    """`CityLog.claimed` for the errors of a log's poses."""
+    """A true view of a frame's time with the pose that a log's poses, which have errors, make of it."""
     if errors is None:
         return view
     ego = world.frame_pose(view.time_s)
@@ -476,8 +463,9 @@ def make_clips(
         if shift_m == 0.0 and not rules.fitted:
             given, cache = _split_moments(log.recorded, int(rng.integers(2, 5)), rng)[0], {}
         given = log.recorded if rules.published else given  # for the reference only
-        claimed = [log.claimed(view) for view in views]
-        condition, fine = build_conditions(log.cloud, tracks, claimed, given, conditions, cache, render_at)
+        claimed = [claimed_view(log.world, log.errors, view) for view in views]
+        drive = DriveInputs(log.cloud, tracks, given, render_at)
+        condition, fine = build_conditions(drive, claimed, conditions, cache)
         truths = [log.truth(view.resized(*size)) for view in views]
         clip = replace(clip_from_truth(condition, truths), shift_m=shift_m)
         if rules.fitted:
@@ -541,13 +529,6 @@ def write_city(rules: CityClipRules, city: int, folder: Path) -> int:
     clips = make_clips(rules, city, log, fit_city(rules, city, log) if rules.fitted else None)
     write_shard(folder, city, clips)
     return len(clips)
-
-
-def write_missing(rules: CityClipRules, cities: Sequence[int], folder: Path) -> None:
-    """Make the shards of those cities that have none in `folder` yet, one after another."""
-    missing = [city for city in cities if not shard_path(folder, city).is_file()]
-    for city in progress(missing, len(missing), "generating cities"):
-        write_city(rules, city, folder)
 
 
 # fits to cities -----------------------------------------------------------------------------------

@@ -62,11 +62,9 @@ _PER_FRAME = [n for n, (_, axes) in _ARRAYS.items() if axes[:2] == "KT" and n no
 
 
 def pack_clips(clips: Sequence[Clip], *, gaps: bool = False) -> dict[str, NDArray[np.generic]]:
-    """Arrays of a shard from clips of one size.
-
-    Depth that is not valid is stored as far away, as is right for a generated sky. With `gaps` it is stored as it is,
-    and marked as unknown. A condition's depth of 0 (nothing seen; points alone) stays 0.
-    """
+    """Arrays of a shard from clips of one size. Depth that is not valid is stored as far away, as is right for a
+    generated sky. With `gaps` it is stored as it is, and marked as unknown. A condition's depth of 0 (nothing seen;
+    points alone) stays 0."""
     rendered = any(clip.condition.renders is not None for clip in clips)
     weighed = any(clip.depth_confidence is not None for clip in clips)
     rows = [_packed(clip, gaps, rendered, weighed) for clip in clips]
@@ -250,12 +248,10 @@ def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int], path: 
 
 def vary(clip: Clip, rng: np.random.Generator) -> Clip:
     """Random mirror image, one random colour curve for truth and condition alike, and worse or no given classes.
-
     Curves: gain 0.7-1.4, gamma 0.75-1.35, contrast 0.75-1.35 about the clip's mean, saturation 0.5-1.4, white balance
     +-8 %; the condition gets a further exposure error of +-3 %. Given classes: see `class_mistakes`. A mirrored clip
-    keeps its poses and intrinsics: they then describe the mirror image of the place.
-
-    clip: as read from a shard, with warped colours, backdrop and classes. Its patch is varied in the same way."""
+    keeps its poses and intrinsics: they then describe the mirror image of the place. clip: as read from a shard, with
+    warped colours, backdrop and classes. Its patch is varied in the same way."""
     gain = rng.uniform(0.7, 1.4) * (1 + rng.uniform(-0.08, 0.08, 3))
     gamma, contrast, saturation = rng.uniform(0.75, 1.35), rng.uniform(0.75, 1.35), rng.uniform(0.5, 1.4)
     middle = float(clip.rgb.numpy().mean(dtype=np.float64))  # the same by any number of threads
@@ -301,10 +297,8 @@ NO_RENDERS = 0.1
 
 def class_mistakes(rng: np.random.Generator) -> Callable[[Tensor], Tensor]:
     """What makes of true classes u8[T,1,H,W] those that a labeller might have given: exact ones, none at all, or with
-    mistakes.
-
-    Mistakes: a class is unknown (15 %) or taken for another one (8 %) throughout, and blocks of 8x8 pixels are unknown.
-    """
+    mistakes. Mistakes: a class is unknown (15 %) or taken for another one (8 %) throughout, and blocks of 8x8 pixels
+    are unknown."""
     draw, table, share, seed = rng.random(), np.arange(256), 0.0, 0
     if draw < NO_IDS:
         return lambda ids: torch.full_like(ids, UNLABELLED)
@@ -382,10 +376,8 @@ class ShardFolder(Shards):
 
 @dataclass(frozen=True, eq=False)
 class TrainingClips:
-    """The clips that a training draws from, in numbered shards.
-
-    What is drawn for a clip depends on (seed, step, purpose) and the clip's place in the batch of a step: not on which
-    part of that batch is drawn here.
+    """The clips that a training draws from, in numbered shards. What is drawn for a clip depends on (seed, step,
+    purpose) and the clip's place in the batch of a step: not on which part of that batch is drawn here.
 
     config: of the training. shards: where the clips are. size: width and height, as the settings come to. sizes: of the
     clips: shard number n has the n-th, counted round. All clips of a step have that of its first. numbers: of the
@@ -471,10 +463,8 @@ class TrainingClips:
 
 
 def class_weights(shards: Shards, numbers: Iterable[int], balance: float) -> Tensor:
-    """Weights f32[19] of the classes in the semantic loss: share^-balance, counted over some shards.
-
-    Scaled so that the mean over labelled pixels is 1; a class that never occurs weighs as much as the rarest that does.
-    """
+    """Weights f32[19] of the classes in the semantic loss: share^-balance, counted over some shards. Scaled so that the
+    mean over labelled pixels is 1; a class that never occurs weighs as much as the rarest that does."""
     counts = torch.zeros(256, dtype=torch.float64)
     for number in numbers:
         counts += torch.bincount(shards.clip(number, 0, range(1)).semantics.flatten(), minlength=256)

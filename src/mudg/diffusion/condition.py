@@ -6,7 +6,7 @@
 2. far points that shine through gaps between near ones are removed (`core.project`, rule `condition`);
 3. pixels without a measured depth get the nearest measured one; the mask of what was measured is kept;
 4. every pixel is carried by its depth into recorded images taken at about the same time, and takes their colour if it
-   falls inside and is not hidden there (`warp`); elsewhere it keeps the colour of its point, or of the nearest point;
+   falls inside and is not hidden there; elsewhere it keeps the colour of its point, or of the nearest point;
 5. the nearest recorded image is also carried over as if everything in it were far away, for what lies above the LiDAR;
 6. the classes of labelled points and images travel with their colours;
 7. renders of a scene fitted to the recorded images, if there is one, are given too, and in steps 3 to 5 tell the depth
@@ -21,7 +21,7 @@ Training clips are made of these in `city_clips.py` and `log_clips.py`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +38,8 @@ from mudg.base.types import Condition, FusedCloud, Photo, RenderPlanes, SparseDe
 from mudg.base.weather_settings import Conditions
 from mudg.core import weather
 from mudg.core.pictures import resize_area, to_bytes
-from mudg.core.project import ProjectConfig, ProjectedPoints, project_sparse
-from mudg.core.weather import DriveFacts, ShownView
+from mudg.core.project import ProjectConfig, ProjectedPoints, project_cloud
+from mudg.core.weather import ShownView, Surroundings
 
 # vacated ------------------------------------------------------------------------------------------
 #
@@ -151,12 +151,10 @@ class ConditionRules:
     occluder_m: float = 0.2
     """Side of the square with which points hide what lies behind them."""
     published: bool = False
-    """The published system's condition: points only, 0 where nothing was seen, no filling, no warping.
-
-    With a fine size it is projected at that size (the camera's) and brought down as the published training did: colour
-    by the nearest pixel, depth and reference bilinearly, zeros of missing depth mixed in. What the points measured goes
-    beside it (`Condition.measured`).
-    """
+    """The published system's condition: points only, 0 where nothing was seen, no filling, no warping. With a fine size
+    it is projected at that size (the camera's) and brought down as the published training did: colour by the nearest
+    pixel, depth and reference bilinearly, zeros of missing depth mixed in. What the points measured goes beside it
+    (`Condition.measured`)."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -171,7 +169,8 @@ class ConditionRules:
     def project(self, cloud: FusedCloud, tracks: Sequence[Track], view: View) -> ProjectedPoints:
         """The cloud's points in a view of the condition's resolution."""
         drawn = ProjectConfig(near_m=1.0, far_m=FAR_M, occluder_m=0.0 if self.published else self.occluder_m)
-        return project_sparse(cloud, tracks, view, drawn, hide=not self.published)
+        poses = {track.id: track.pose_at(view.time_s) for track in tracks}
+        return project_cloud(cloud, poses, view, drawn, hide=not self.published)
 
 
 OVERLAP_GRID = 24, 16
@@ -184,25 +183,28 @@ RenderAt = Callable[[View], RenderPlanes]
 """What a fitted scene shows at a view, without the leading dimension."""
 
 
-@dataclass(frozen=True, slots=True)
-class DrawnCloud:
-    """A fused cloud ready to be drawn; renders of a fitted scene; where something stood that an edit took away."""
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveInputs:
+    """What conditions of a drive are made of: its fused cloud (static points in the world, objects in their boxes,
+    posed by ``tracks`` at each view's time), recorded images of any cameras, and renders of a fitted scene, if there is
+    one; of an edited drive also where something stood that is not there any more, and, for published-type models, its
+    weather. ``images``: the recorded ones, as they have been prepared for views of a size."""
 
     cloud: FusedCloud
     tracks: Sequence[Track]
-    rules: ConditionRules
-    render_at: RenderAt | None
+    recorded: Sequence[Photo]
+    render_at: RenderAt | None = None
     vacated_at: VacatedAt | None = None
+    weather: InWeather | None = None
+    images: dict[tuple[int, int], PreparedImages] = field(default_factory=dict)
 
-    def look(self, view: View, far_ids: Tensor, render: RenderPlanes | None = None) -> Surfaces:
+    def look(self, view: View, rules: ConditionRules, far_ids: Tensor, render: RenderPlanes | None = None) -> Surfaces:
         """The surfaces at a view: measured ones, and between them those of the render (None: of `render_at`) or else of
-        the nearest measured pixel.
-
-        What the render does not cover is taken for sky, unless it lies below the horizon or `far_ids` u8[H,W], the
-        classes of what a recorded image shows in the same direction (255 = unknown), are something else: there a
-        surface stands that no image shows, and the nearest measured pixel stands for it, in the render too.
-        """
-        sparse = self.rules.project(self.cloud, self.tracks, view)
+        the nearest measured pixel. What the render does not cover is taken for sky, unless it lies below the horizon or
+        `far_ids` u8[H,W], the classes of what a recorded image shows in the same direction (255 = unknown), are
+        something else: there a surface stands that no image shows, and the nearest measured pixel stands for it, in the
+        render too."""
+        sparse = rules.project(self.cloud, self.tracks, view)
         valid, nearest = sparse.valid, nearest_pixels(sparse.valid)
         color, moving, ids = sparse.rgb, sparse.moving, sparse.semantics
         depth = torch.full_like(sparse.depth, FAR_M)
@@ -261,6 +263,23 @@ class DrawnCloud:
                 inside_one |= (np.abs(own) <= 0.5 * track.size_m + BOX_MARGIN_M).all(1)
         found[rows, columns] = torch.from_numpy(inside_one)
         return found
+
+    def weathered_points(self, view: View, seen: ProjectedPoints) -> Tensor:
+        """Colours f32[3,H,W] of projected points, for the published system: in the drive's weather, each at its own
+        distance, with the surfaces of the fitted scene between and behind them. Meaningless where there are none."""
+        if self.weather is None or self.render_at is None:
+            return seen.rgb
+        shown = self.render_at(view)
+        ids = torch.where(seen.valid & (shown.semantics == palette.ID["sky"]), palette.UNLABELLED, shown.semantics)
+        depth = torch.where(seen.valid, seen.depth, shown.depth)
+        return self.weather.image(view, torch.where(seen.valid, seen.rgb, shown.color), depth, ids.to(torch.uint8))
+
+    def weathered_photo(self, view: View, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """A recorded image u8[H,W,3] in the drive's weather."""
+        if self.weather is None or self.render_at is None:
+            return rgb
+        shown = self.render_at(view)
+        return to_bytes(self.weather.image(view, image_tensor(rgb), shown.depth, shown.semantics))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -330,10 +349,8 @@ def turned_rays(view: View, turn: NDArray[np.float64]) -> list[Tensor]:
 
 
 def carry(view: View, depth: Tensor, other: View) -> tuple[Tensor, Tensor, Tensor]:
-    """Where the pixels of `view`, at `depth` f32[K,H,W] metres, lie in another view.
-
-    Returns x, y f32[K,H,W] in pixels of the other view and z f32[K,H,W] metres (not positive = behind it).
-    """
+    """Where the pixels of `view`, at `depth` f32[K,H,W] metres, lie in another view. Returns x, y f32[K,H,W] in pixels
+    of the other view and z f32[K,H,W] metres (not positive = behind it)."""
     moved = other.cam_from_world @ view.world_from_cam
     rays, shift = turned_rays(view, moved[:3, :3]), torch.from_numpy(moved[:3, 3].astype(np.float32))
     px, py, pz = (ray * depth + shift[i] for i, ray in enumerate(rays))
@@ -364,22 +381,6 @@ def inside(view: View, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     return (z > 0.1) & (x >= 0.5) & (x <= view.camera.width - 0.5) & (y >= 0.5) & (y <= view.camera.height - 0.5)
 
 
-def warp(
-    view: View, depth: Tensor, source: WarpSource, surface: Tensor, hidden_share: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Colours and classes that the pixels of `view`, at `depth` f32[H,W], have in a recorded image.
-
-    `surface` f32[h,w]: depth of the nearest surface at the pixels of the recorded image. Returns rgb f32[3,H,W]
-    (bilinear), semantics u8[H,W] (nearest) and found bool[H,W]: inside the image, usable and not hidden in it.
-    """
-    x, y, z = carry(view, depth[None], source.view)
-    in_front = look_up(surface[None], x, y, "nearest")[0, 0]
-    found = inside(source.view, x, y, z)[0] & (in_front >= z[0] * (1 - hidden_share) - 0.3)
-    if source.usable is not None:
-        found &= look_up_ids(source.usable, x, y)[0]
-    return look_up(source.rgb, x, y)[0], look_up_ids(source.semantics, x, y)[0], found
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class WarpSource:
     """A recorded image made ready for warping: rgb f32[3,h,w] in common colours (of 0..1 or a little beyond), depth
@@ -392,58 +393,44 @@ class WarpSource:
     semantics: Tensor
     usable: Tensor | None = None
 
+    def warped(self, view: View, depth: Tensor, surface: Tensor, hidden_share: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Colours and classes that the pixels of another view, at `depth` f32[H,W], have in the image. `surface`
+        f32[h,w]: depth of the nearest surface at its pixels. Returns rgb f32[3,H,W] (bilinear), semantics u8[H,W]
+        (nearest) and found bool[H,W]: inside the image, usable and not hidden in it."""
+        x, y, z = carry(view, depth[None], self.view)
+        in_front = look_up(surface[None], x, y, "nearest")[0, 0]
+        found = inside(self.view, x, y, z)[0] & (in_front >= z[0] * (1 - hidden_share) - 0.3)
+        if self.usable is not None:
+            found &= look_up_ids(self.usable, x, y)[0]
+        return look_up(self.rgb, x, y)[0], look_up_ids(self.semantics, x, y)[0], found
+
 
 def build_conditions(
-    cloud: FusedCloud,
-    tracks: Sequence[Track],
+    drive: DriveInputs,
     views: Sequence[View],
-    recorded: Sequence[Photo],
     rules: ConditionRules,
-    sources: dict[int, WarpSource] | None = None,
-    render_at: RenderAt | None = None,
-    vacated_at: VacatedAt | None = None,
+    kept: dict[int, WarpSource] | None = None,
     *,
-    recolor: WeatheredPoints | None = None,
     among: Sequence[Sequence[int]] | None = None,
 ) -> tuple[Condition, Condition]:
     """The model's condition for `views` (any path, any size; resized to the rules' size), and the same on the fine
-    grid: the same object if there is none.
-
-    1. The cloud is projected into every view; far points that shine through gaps between near ones are removed.
-    2. Pixels without a measured depth get the nearest measured one, or that of the render.
-    3. Every pixel is carried by its depth into recorded images of about the same time, and takes their colour where it
-       is not hidden there (`warp`); elsewhere it keeps that of its point, or of the nearest one. Classes travel along.
-    4. The backdrop is the nearest recorded image, carried over as if everything in it were far away.
-
-    The published system's (`ConditionRules.published`) are points alone, zero where nothing is known.
-
-    Args:
-        cloud: fused points: static ones in the world, objects in their boxes, posed by `tracks` at each view's time.
-        recorded: images of any cameras; may be empty. The reference is that of the first view's camera that is nearest
-            in time (black if there is none).
-        sources: cache of prepared images (index into `recorded` -> WarpSource); pass the same dict again for further
-            views with the same renders. Of `PreparedImages` with a folder, fine conditions of large views lie in files.
-        render_at: renders of a fitted scene, which become part of the condition (not with `published`).
-        vacated_at: of an edited drive: where something stood that is not there any more (not with `published`).
-        among: for each view the numbers of the recorded images that it may know (None: all).
-        recolor: with `published`: changes the colours of the points, at the camera's size, and of the reference.
-
-    Raises:
-        InputError: no views.
-    """
+    grid: the same object if there is none. The reference is the recorded image of the first view's camera that is
+    nearest in time, black if there is none. InputError: no views. kept: cache of prepared images, by their numbers;
+    pass the same dict again for further views with the same renders. Of `PreparedImages` with a folder, fine conditions
+    of large views lie in files. among: for each view the numbers of the recorded images that it may know (None:
+    all)."""
     if not views:
         raise InputError("a condition needs at least one view", where="build_conditions")
     small = [view.resized(*rules.size) for view in views]
-    among = [range(len(recorded))] * len(views) if among is None else among
-    reference = _reference(small[0], [recorded[n] for n in among[0]], rules, recolor)
+    among = [range(len(drive.recorded))] * len(views) if among is None else among
+    reference = _reference(drive, small[0], among[0], rules)
     if rules.published:
-        condition = _published_condition(cloud, tracks, small, reference, rules, recolor)
+        condition = _published_condition(drive, small, reference, rules)
         return condition, condition
-    sources = {} if sources is None else sources
+    kept = {} if kept is None else kept
     fine_views = tuple(view.resized(*rules.fine) for view in views)
-    points = DrawnCloud(cloud, tracks, rules, render_at, vacated_at)
-    folder = sources.folder if isinstance(sources, PreparedImages) else None
-    made = (_condition_of_view(points, view, recorded, own, sources) for view, own in zip(fine_views, among))
+    folder = kept.folder if isinstance(kept, PreparedImages) else None
+    made = (_condition_of_view(drive, view, rules, own, kept) for view, own in zip(fine_views, among))
     rows = ((*part, *(getattr(r, x.name) for x in fields(RenderPlanes) if r is not None)) for part, r in made)
     color, depth, valid, warped, backdrop, ids, far_ids, *planes = stacked(rows, len(fine_views), folder)
     renders = RenderPlanes(*planes) if planes else None
@@ -458,9 +445,10 @@ def build_conditions(
         planes = {x.name: how.get(x.name, reduced)(getattr(renders, x.name)) for x in fields(RenderPlanes)}
         renders = RenderPlanes(**planes)
     warped, ids, far_ids = reduced(warped) > 0.5, picked(ids), picked(far_ids)
-    points, own = replace(points, render_at=None), []
+    without_renders, own = replace(drive, render_at=None), []
     for n, (view, there, found) in enumerate(zip(small, far_ids, warped, strict=True)):
-        here = points.look(view, there[0], None if renders is None else renders.map(lambda x, n=n: x[n]))
+        render = None if renders is None else renders.map(lambda x, n=n: x[n])
+        here = without_renders.look(view, rules, there[0], render)
         own.append(here.with_hole(here.color, here.ids, found[0])[0])
     memory.rest_mapped()
     depth, valid = (torch.stack([getattr(o, name) for o in own])[:, None] for name in ("depth", "measured"))
@@ -469,19 +457,19 @@ def build_conditions(
 
 
 def _condition_of_view(
-    points: DrawnCloud, view: View, recorded: Sequence[Photo], among: Sequence[int], sources: dict[int, WarpSource]
+    drive: DriveInputs, view: View, rules: ConditionRules, among: Sequence[int], kept: dict[int, WarpSource]
 ) -> tuple[tuple[Tensor, ...], RenderPlanes | None]:
     """Colour f32[3,H,W], depth f32[1,H,W], valid and warped bool[1,H,W], backdrop f32[3,H,W], classes of the colour and
     of the backdrop u8[1,H,W] of one view, at its size; and its render. Images `among` the recorded ones are used."""
 
     def source(number: int) -> WarpSource:
-        if number not in sources:
-            sources[number] = _prepare_source(points, recorded[number], view)
-        return sources[number]
+        if number not in kept:
+            kept[number] = _prepare_source(drive, drive.recorded[number], rules, view)
+        return kept[number]
 
-    rules, shape = points.rules, (view.camera.height, view.camera.width)
+    recorded, shape = drive.recorded, (view.camera.height, view.camera.width)
     if not (rules.warp and among):
-        here = points.look(view, torch.full(shape, palette.UNLABELLED, dtype=torch.uint8))
+        here = drive.look(view, rules, torch.full(shape, palette.UNLABELLED, dtype=torch.uint8))
         found = torch.zeros_like(here.measured)
         here, color, own_ids, found = here.with_hole(here.color, here.ids, found)
         ids = own_ids[None]
@@ -491,15 +479,15 @@ def _condition_of_view(
     backdrop, far_ids = look_up(nearest.rgb, x, y)[0], look_up_ids(nearest.semantics, x, y)
     known = None if nearest.usable is None else look_up_ids(nearest.usable, x, y)
     far_ids = far_ids if known is None else torch.where(known, far_ids, palette.UNLABELLED)
-    here = points.look(view, far_ids[0])
+    here = drive.look(view, rules, far_ids[0])
     color, depth, ids, found = here.color, here.depth, here.ids, torch.zeros_like(here.measured)
-    shown = points.cloud.colors
+    shown = drive.cloud.colors
     backdrop = shown.image_of(view.camera.name, backdrop).clamp(0, 1) if shown.to_common else backdrop
     for number in _order_of_images(view, depth, recorded, among, rules):
         image = source(number)
         fresh = abs(image.view.time_s - view.time_s) <= SAME_TIME_S
         surface = image.depth if fresh else torch.where(image.moving, torch.zeros_like(image.depth), image.depth)
-        rgb, labels, new = warp(view, depth, image, surface, rules.hidden_share)
+        rgb, labels, new = image.warped(view, depth, surface, rules.hidden_share)
         rgb = shown.image_of(view.camera.name, rgb).clamp(0, 1) if shown.to_common else rgb
         new = new & ~found if fresh else new & ~found & ~here.moving
         color = torch.where(new, rgb, color)
@@ -535,43 +523,31 @@ def _among_measured(sparse: ProjectedPoints, depth: Tensor) -> Tensor:
 
 
 def _published_condition(
-    cloud: FusedCloud,
-    tracks: Sequence[Track],
-    views: Sequence[View],
-    reference: Tensor,
-    rules: ConditionRules,
-    recolor: WeatheredPoints | None,
+    drive: DriveInputs, views: Sequence[View], reference: Tensor, rules: ConditionRules
 ) -> Condition:
     own, native = rules.size, rules.fine
     seen = views if native == own else [view.resized(*native) for view in views]
-    sparse = [rules.project(cloud, tracks, view) for view in seen]
+    sparse = [rules.project(drive.cloud, drive.tracks, view) for view in seen]
     valid = torch.stack([s.valid for s in sparse])[:, None]
-    colors = [s.rgb if recolor is None else recolor.points(view, s) for view, s in zip(seen, sparse, strict=True)]
-    color = torch.stack(colors) * valid
+    color = torch.stack([drive.weathered_points(view, s) for view, s in zip(seen, sparse, strict=True)]) * valid
     depth = torch.stack([s.depth for s in sparse])[:, None] * valid
     if native != own:
         color = functional.interpolate(color, size=own[::-1], mode="nearest")
         depth = functional.interpolate(depth, size=own[::-1], mode="bilinear", align_corners=False)
         valid = (color > 0).any(1, keepdim=True) | (depth > 0)
-    return Condition(tuple(views), color, depth, valid, reference, measured=_measured(cloud, tracks, views, rules))
-
-
-def _measured(cloud: FusedCloud, tracks: Sequence[Track], views: Sequence[View], rules: ConditionRules) -> SparseDepth:
-    """What visible points measure at views of the condition's size.
-
-    Points are drawn on a grid at least as fine as the camera's and the condition's, without those that others hide, and
-    each pixel takes the cell in its middle: depth is never mixed, and the nearest of many points in a coarse pixel is
-    not preferred.
-    """
-    own, seen = rules.size, replace(rules, published=False)
-    grid = max(own[0], rules.fine_width), max(own[1], rules.fine_height)
-    points = [seen.project(cloud, tracks, view if grid == own else view.resized(*grid)) for view in views]
+    # what visible points measure, on a grid at least as fine as the camera's and the condition's; each pixel takes the
+    # cell in its middle: depth is never mixed, and the nearest of many points in a coarse pixel is not preferred
+    visible, grid = replace(rules, published=False), (max(own[0], rules.fine_width), max(own[1], rules.fine_height))
+    finer = views if grid == own else [view.resized(*grid) for view in views]
+    points = [visible.project(drive.cloud, drive.tracks, view) for view in finer]
     whole = SparseDepth(*(torch.stack([getattr(p, name) for p in points])[:, None] for name in ("depth", "valid")))
-    return whole.map(lambda x: functional.interpolate(x.float(), size=own[::-1], mode="nearest-exact").to(x.dtype))
+    picked = lambda x: functional.interpolate(x.float(), size=own[::-1], mode="nearest-exact").to(x.dtype)
+    return Condition(tuple(views), color, depth, valid, reference, measured=whole.map(picked))
 
 
-def _reference(view: View, recorded: Sequence[Photo], rules: ConditionRules, recolor: WeatheredPoints | None) -> Tensor:
-    own = [r for r in recorded if r.view.camera.name == view.camera.name] or list(recorded)
+def _reference(drive: DriveInputs, view: View, among: Sequence[int], rules: ConditionRules) -> Tensor:
+    recorded = [drive.recorded[number] for number in among]
+    own = [r for r in recorded if r.view.camera.name == view.camera.name] or recorded
     if not own:
         return torch.zeros(3, *rules.size[::-1])
     nearest = min(own, key=lambda r: abs(r.view.time_s - view.time_s))
@@ -579,8 +555,8 @@ def _reference(view: View, recorded: Sequence[Photo], rules: ConditionRules, rec
     if nearest.usable is not None and not nearest.usable.all():
         rows, columns = nearest_pixels(torch.from_numpy(nearest.usable))
         rgb = rgb[rows.numpy(), columns.numpy()]
-    if recolor is not None:
-        rgb = to_bytes(recolor.photo(nearest.view, image_tensor(rgb)))
+    if rules.published:
+        rgb = drive.weathered_photo(nearest.view, rgb)
     if rules.published and rules.fine_width:
         size = rules.size[::-1]
         return functional.interpolate(image_tensor(rgb)[None], size=size, mode="bilinear", align_corners=False)[0]
@@ -623,7 +599,7 @@ def _order_of_images(
     return chosen
 
 
-def _prepare_source(points: DrawnCloud, recorded: Photo, target: View) -> WarpSource:
+def _prepare_source(drive: DriveInputs, recorded: Photo, rules: ConditionRules, target: View) -> WarpSource:
     """A recorded image brought to about as many pixels as the target view, with its depth."""
     camera = recorded.view.camera
     scale = (target.camera.width * target.camera.height / (camera.width * camera.height)) ** 0.5
@@ -632,9 +608,9 @@ def _prepare_source(points: DrawnCloud, recorded: Photo, target: View) -> WarpSo
     own = np.full((height, width), palette.UNLABELLED) if recorded.semantics is None else recorded.semantics
     own = torch.from_numpy(own.astype(np.uint8))[None, None]
     ids = functional.interpolate(own, size=(height, width), mode="nearest-exact")[0, 0]
-    here = points.look(view, ids)
+    here = drive.look(view, rules, ids)
     rgb = image_tensor(resize_area(recorded.rgb, width, height))
-    common = points.cloud.colors.image_to_common(camera.name, rgb)
+    common = drive.cloud.colors.image_to_common(camera.name, rgb)
     usable = None
     if recorded.usable is not None:  # pixels that show nothing but usable ones
         spoilt = torch.from_numpy(~recorded.usable).float()[None, None]
@@ -651,7 +627,7 @@ class InWeather:
     velocity of the cameras at a time."""
 
     settings: Conditions
-    drive: DriveFacts
+    drive: Surroundings
     seed: int
     velocity_at: Callable[[float], tuple[float, float, float]]
 
@@ -661,28 +637,6 @@ class InWeather:
         shown = ShownView(view, rgb.permute(1, 2, 0).numpy(), metres, ids[0].numpy())
         made = weather.edited_view(shown, self.settings, self.seed, self.drive, self.velocity_at(view.time_s))
         return torch.from_numpy(np.ascontiguousarray(made.transpose(2, 0, 1), np.float32)).clamp(0, 1)
-
-
-@dataclass(frozen=True, eq=False)
-class WeatheredPoints:
-    """What the published system is given of a drive in weather: points and recorded images, edited at the camera's
-    size, with the surfaces of a fitted scene between and behind them. Geometry and classes stay."""
-
-    how: InWeather
-    render_at: RenderAt
-
-    def points(self, view: View, seen: ProjectedPoints) -> Tensor:
-        """Colours f32[3,H,W] of projected points in this weather, each at its own distance; meaningless where there are
-        none."""
-        shown = self.render_at(view)
-        ids = torch.where(seen.valid & (shown.semantics == palette.ID["sky"]), palette.UNLABELLED, shown.semantics)
-        depth = torch.where(seen.valid, seen.depth, shown.depth)
-        return self.how.image(view, torch.where(seen.valid, seen.rgb, shown.color), depth, ids.to(torch.uint8))
-
-    def photo(self, view: View, rgb: Tensor) -> Tensor:
-        """A recorded image f32[3,H,W] in this weather."""
-        shown = self.render_at(view)
-        return self.how.image(view, rgb, shown.depth, shown.semantics)
 
 
 # planes of all views, in memory or in files -------------------------------------------------------

@@ -48,7 +48,7 @@ def run(config: ConvertConfig, checkpoint: Path, to: Path, conversion: Conversio
     InputError: not such a checkpoint; nothing is written. ResourceError: memory limit or disk."""
     checkpoint, to = Path(checkpoint), Path(to)
     refuse_overlap(to, {"checkpoint": checkpoint})
-    replacement = Replacement.at(to)
+    replacement = Replacement(to)
     replacement.recover(lambda folder: bool(own_names(folder)), own_names)
     replaces = to.exists()
     if replaces and not overwrite:
@@ -114,11 +114,8 @@ def resolution(config: ConvertConfig, checkpoint: Path) -> tuple[int, int]:
 
 
 def memory_limit(config: ConvertConfig, *files: Path) -> int:
-    """Address space in bytes that conversion may add to what a process with torch has.
-
-    The files, mapped (or read, and then copied once, where their format cannot be mapped), twice the largest weight
-    file written, 3 GiB for working.
-    """
+    """Address space in bytes that conversion may add to what a process with torch has. The files, mapped (or read, and
+    then copied once, where their format cannot be mapped), twice the largest weight file written, 3 GiB for working."""
     if config.memory_gb:
         return int(config.memory_gb * 1e9)
     read = sum(path.stat().st_size * (1 if zipfile.is_zipfile(path) else 2) for path in files)
@@ -150,12 +147,9 @@ def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: Pub
 
 def widen(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
     """A checkpoint with 8 input channels made one with 12 and a modality label; others unchanged. Also says what was
-    done.
-
-    The condition's four input channels are used twice, for colour and for depth, and the whole kernel, noise channels
-    included, is halved; the label's embedding starts as a copy of that of the noise step. Both as in the published
-    training.
-    """
+    done. The condition's four input channels are used twice, for colour and for depth, and the whole kernel, noise
+    channels included, is halved; the label's embedding starts as a copy of that of the noise step. Both as in the
+    published training."""
     tensors = dict(state)
     kernel = tensors.get(_ENTER)
     if kernel is None or kernel.ndim != 4 or kernel.shape[1] % 2 or any(".class_embed." in name for name in tensors):

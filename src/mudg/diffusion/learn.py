@@ -32,8 +32,9 @@ from mudg.diffusion import city_clips, log_clips, model_files, models, parallel
 from mudg.diffusion.city_clips import CityClipRules
 from mudg.diffusion.clips import ShardFolder, TrainingClips, class_weights, counts_at, shard_path
 from mudg.diffusion.log_clips import LogClipRules, LogSource
-from mudg.diffusion.model import MDM, BatchPart, LossSettings
-from mudg.diffusion.models import Model, starting_model
+from mudg.diffusion.model import MDM, BatchPart
+from mudg.diffusion.model_files import Model
+from mudg.diffusion.models import starting_model
 from mudg.diffusion.parallel import (
     SAME_SIGNAL_S,
     Ranks,
@@ -53,13 +54,11 @@ WEIGHT_DECAY = 0.01
 
 
 def train(config: LearnConfig, out: Path, output: VerbOutput, open_work: Callable[[], RunDir]) -> Path:
-    """Train a model, from nothing or from an earlier one, and export it to `OUT/model`, which is returned.
-
-    Under `torchrun` every process calls this with the same arguments; `out` lies on a file system that all see.
-
-    open_work: opens the folder, in the leader alone; a finished result is verified and used again. NumericsError: a
-    loss or gradient is not finite (names the term, the step and the process; parameters are untouched). InputError:
-    logs or clips that cannot be used. ResourceError, UsageError: see `RunDir.open`."""
+    """Train a model, from nothing or from an earlier one, and export it to `OUT/model`, which is returned. Under
+    `torchrun` every process calls this with the same arguments; `out` lies on a file system that all see. open_work:
+    opens the folder, in the leader alone; a finished result is verified and used again. NumericsError: a loss or
+    gradient is not finite (names the term, the step and the process; parameters are untouched). InputError: logs or
+    clips that cannot be used. ResourceError, UsageError: see `RunDir.open`."""
     torch.set_num_threads(config.threads)
     with parallel.join_processes(config.compute.device) as ranks:
         model, fresh = starting_model(config)
@@ -232,9 +231,7 @@ def making_clips(source: TrainingClips, folder: Path, rules: CityClipRules) -> c
 
 def log_rules(config: LearnConfig, multiple: int, points_alone: bool = False) -> LogClipRules:
     """How clips are cut from logs: of the configuration's area, in the aspect of the first log's first camera.
-
-    `points_alone`: with the published system's condition, and of the configuration's very size, whatever the aspect.
-    """
+    `points_alone`: with the published system's condition, and of the configuration's very size, whatever the aspect."""
     data, scene = config.data, read_scene(log_clips.log_source(config.data.scenes[0]).scene)
     names = data.cameras or tuple(scene.cameras)
     if names[0] not in scene.cameras:
@@ -243,10 +240,10 @@ def log_rules(config: LearnConfig, multiple: int, points_alone: bool = False) ->
     camera, size = scene.cameras[names[0]], (data.width, data.height)
     if not points_alone:
         size = sized_to_area(data.width * data.height, camera.width / camera.height, multiple)
-    return rules_of_size(config, size, data.held_out_every, points_alone)
+    return rules_of_size(config, size, points_alone)
 
 
-def rules_of_size(config: LearnConfig, size: tuple[int, int], held_out_every: int, points_alone: bool) -> LogClipRules:
+def rules_of_size(config: LearnConfig, size: tuple[int, int], points_alone: bool) -> LogClipRules:
     """How clips of a size are cut from logs."""
     data = config.data
     return LogClipRules(
@@ -254,7 +251,7 @@ def rules_of_size(config: LearnConfig, size: tuple[int, int], held_out_every: in
         window=data.window,
         stride=data.stride,
         cameras=data.cameras,
-        held_out_every=held_out_every,
+        held_out_every=data.held_out_every,
         seed=config.seed,
         published=points_alone,
         least_points=1.0 if points_alone else LogClipRules.least_points,
@@ -307,7 +304,7 @@ def listed_clips(config: LearnConfig, multiple: int, points_alone: bool, out: Pa
         f"({shares}). {len(scenes.scored)} scenes were held out for scoring."
     )
     cache = ShardCache(Path(compute.cache) if compute.cache else out / CACHE, int(compute.cache_gb * 1e9))
-    shards = ListedShards(scenes, cache, rules_of_size(config, size, 0, points_alone), data.bad_scenes)
+    shards = ListedShards(scenes, cache, rules_of_size(config, size, points_alone), data.bad_scenes)
     return ListedClips(config, shards, size, [size], range(0), 0, (), about)
 
 
@@ -393,7 +390,7 @@ def _train_network(model: Model, source: TrainingClips, run_dir: RunDir, bf16: b
     config, out = source.config, run_dir.path / "steps"
     state, network = _begin(model, config, out, ranks)
     balance = class_weights(source.shards, source.weighed(), config.loss.class_balance).to(ranks.device)
-    settings = LossSettings(balance, config.loss.refined_share, config.data.reference_dropout)
+    rules = balance, config.loss.refined_share, config.data.reference_dropout
     picture_of = lambda step: run_dir.path / "samples" / f"{step:07d}.png"
 
     def draw(step: int) -> Drawn:
@@ -432,7 +429,7 @@ def _train_network(model: Model, source: TrainingClips, run_dir: RunDir, bf16: b
                 clips = [clip.to(ranks.device) for clip in drawn]
                 with parallel.portion(network, last=part is parts[-1]):
                     with torch.autocast(ranks.device.type, torch.bfloat16, enabled=bf16):
-                        loss = network(clips, BatchPart(config.seed, step, part.start, count), settings)
+                        loss = network(clips, BatchPart(config.seed, step, part.start, count, *rules))
                     (loss.total / len(parts)).backward()
                 for name, value in {**loss.terms, "total": float(loss.total.detach())}.items():
                     terms[name] = terms.get(name, 0.0) + value

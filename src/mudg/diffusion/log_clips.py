@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,9 +23,16 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Clip, Condition, Frame, FusedCloud, Photo, PointCloud, Scene, Sweep, View
 from mudg.core.pictures import resize_area, resize_nearest
 from mudg.core.project import RULES as HIDING_RULES
-from mudg.core.project import project_points, seen_pixels
+from mudg.core.project import DrawLimits, PointLayer, draw_points, seen_pixels
 from mudg.diffusion.clips import FAR_M, shard_path, write_shard
-from mudg.diffusion.condition import SAME_TIME_S, ConditionRules, build_conditions, filled_depth, image_tensor
+from mudg.diffusion.condition import (
+    SAME_TIME_S,
+    ConditionRules,
+    DriveInputs,
+    build_conditions,
+    filled_depth,
+    image_tensor,
+)
 from mudg.scene.clouds import read_fused
 from mudg.scene.labels import photographs, read_label, read_trusted_classes
 from mudg.scene.read import read_image, read_points, read_scene
@@ -57,12 +65,30 @@ class LogClipRules:
     """The published system's condition: points alone, 0 where nothing was seen, projected at the camera's size; the
     reference is the window's first image."""
 
+    def windows(self, scene: Scene) -> list[LogWindow]:
+        """All windows of a scene, camera by camera in time order. Frames held out for scoring the scene, and images
+        that are rendered in part (of an edited drive), are passed over. InputError: unknown camera, or no camera has
+        enough frames."""
+        usable = {frame.id for frame in photographs(scene)}
+        found: list[LogWindow] = []
+        for camera in self.cameras or tuple(scene.cameras):
+            frames = sorted((f for f in scene.frames_of(camera) if f.id in usable), key=lambda f: f.view.time_s)
+            for start in range(0, len(frames) - self.window + 1, self.stride):
+                number = start // self.stride
+                kept = self.held_out_every > 0 and number % self.held_out_every == self.held_out_every // 2
+                found.append(LogWindow(tuple(f.id for f in frames[start : start + self.window]), kept))
+        if not found:
+            what = "a log is too short for a training clip"
+            remedy = "give a shorter --data.window, or ingest with --test-every 0"
+            raise InputError(what, where=scene.root, expected=f"{self.window} frames of a camera", remedy=remedy)
+        time_of = {frame.id: frame.view.time_s for frame in scene.frames}
+        scored = {time_of[name] for window in found if window.held_out for name in window.frames}
+        return [w for w in found if w.held_out or not scored & {time_of[name] for name in w.frames}]
 
-@dataclass(frozen=True)
-class LogWindow:
+
+class LogWindow(NamedTuple):
     """One clip to be: the frames of one camera (their ids), and whether it is for scoring."""
 
-    camera: str
     frames: tuple[str, ...]
     held_out: bool
 
@@ -89,27 +115,6 @@ def log_source(text: str) -> LogSource:
         what, remedy = "no scene with a fused cloud here", "make the cloud with `mudg fuse`"
         raise InputError(what, where=text, expected="SCENE=FUSED, or an output folder of mudg run", remedy=remedy)
     return found
-
-
-def log_windows(scene: Scene, rules: LogClipRules) -> list[LogWindow]:
-    """All windows of a scene, camera by camera in time order. Frames held out for scoring the scene, and images that
-    are rendered in part (of an edited drive), are passed over. InputError: unknown camera, or no camera has enough
-    frames."""
-    usable = {frame.id for frame in photographs(scene)}
-    found: list[LogWindow] = []
-    for camera in rules.cameras or tuple(scene.cameras):
-        frames = sorted((f for f in scene.frames_of(camera) if f.id in usable), key=lambda f: f.view.time_s)
-        for start in range(0, len(frames) - rules.window + 1, rules.stride):
-            number = start // rules.stride
-            kept = rules.held_out_every > 0 and number % rules.held_out_every == rules.held_out_every // 2
-            found.append(LogWindow(camera, tuple(f.id for f in frames[start : start + rules.window]), kept))
-    if not found:
-        what = "a log is too short for a training clip"
-        remedy = "give a shorter --data.window, or ingest with --test-every 0"
-        raise InputError(what, where=scene.root, expected=f"{rules.window} frames of a camera", remedy=remedy)
-    time_of = {frame.id: frame.view.time_s for frame in scene.frames}
-    scored = {time_of[name] for window in found if window.held_out for name in window.frames}
-    return [w for w in found if w.held_out or not scored & {time_of[name] for name in w.frames}]
 
 
 class OpenLog:
@@ -177,7 +182,8 @@ def _condition(log: OpenLog, cloud: FusedCloud, places: Sequence[int], gap: int)
         moments = [log.moment[n] for n in images]
         among = [[n for n, moment in enumerate(moments) if abs(moment - log.moment[place]) >= gap] for place in places]
     views = [images[place].view for place in places]
-    return build_conditions(cloud, log.scene.tracks, views, recorded, conditions, among=among)[0], images
+    drive = DriveInputs(cloud, log.scene.tracks, recorded)
+    return build_conditions(drive, views, conditions, among=among)[0], images
 
 
 def thinned_cloud(cloud: FusedCloud, share: float, rng: np.random.Generator) -> FusedCloud:
@@ -226,9 +232,9 @@ def measured_depth(scene: Scene, view: View) -> tuple[NDArray[np.float32], NDArr
         if other is None or abs(sweep.time_s - view.time_s) < abs(other.time_s - view.time_s):
             nearest[sweep.sensor] = sweep
     places = [geometry.transform_points(s.world_from_lidar, read_points(scene, s).xyz) for s in nearest.values()]
-    seen = project_points(np.concatenate(places).astype(np.float32), None, view, near_m=1.0, far_m=100.0)
-    depth = seen.depth[0].numpy()
-    return depth, seen_pixels(depth, seen.valid[0].numpy(), HIDING_RULES["condition"])
+    layer = PointLayer(np.concatenate(places).astype(np.float32), np.eye(4))
+    depth, index = draw_points([layer], view, DrawLimits(1.0, 100.0))
+    return depth, seen_pixels(depth, index >= 0, HIDING_RULES["condition"])
 
 
 # files --------------------------------------------------------------------------------------------
@@ -242,7 +248,7 @@ def plan_shards(
     rows: list[tuple[int, LogSource, LogWindow]] = []
     counts = {False: 0, True: 0}
     for source in sources:
-        for window in log_windows(read_scene(source.scene), rules):
+        for window in rules.windows(read_scene(source.scene)):
             rows.append((counts[window.held_out] + (first_held_out if window.held_out else 0), source, window))
             counts[window.held_out] += 1
     if not counts[False] or (rules.held_out_every and not counts[True]):

@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from mudg.base import memory, palette, seeds
 from mudg.base.errors import UsageError
-from mudg.base.types import Clip, Condition, FinePatch, RenderPlanes
+from mudg.base.types import Clip, Condition, FinePatch
 from mudg.core import losses, noise
 from mudg.core.depth import align_depth
 from mudg.core.noise import Schedule
@@ -29,6 +29,7 @@ from mudg.diffusion.network import (
     PixelTruth,
     Refined,
     Refiner,
+    Stacked,
     TemporalAttention,
     UNet,
     class_scores,
@@ -58,13 +59,11 @@ SKY = palette.ID["sky"]
 
 @dataclass(frozen=True)
 class ConditionLatents:
-    """A batch of conditions as the network wants them.
-
-    planes f32[B,T,CONDITION_PLANES,h,w]; copy: latents of the condition [B,T,4,h,w] for colour and depth, class shares
-    [B,T,19,h,w] for semantics; backdrop: as copy, of the backdrop's colour; seen: share of the cell that is
-    trustworthy, [B,T,1,h,w] in [0,1], per modality; pixels: the condition at pixel resolution, [B*T,..]. render: of
-    models that use renders, latents of their colour and depth [B,T,4,h,w], and certainty: [B,T,1,h,w].
-    """
+    """A batch of conditions as the network wants them. planes f32[B,T,CONDITION_PLANES,h,w]; copy: latents of the
+    condition [B,T,4,h,w] for colour and depth, class shares [B,T,19,h,w] for semantics; backdrop: as copy, of the
+    backdrop's colour; seen: share of the cell that is trustworthy, [B,T,1,h,w] in [0,1], per modality; pixels: the
+    condition at pixel resolution, [B*T,..]. render: of models that use renders, latents of their colour and depth
+    [B,T,4,h,w], and certainty: [B,T,1,h,w]."""
 
     planes: Tensor
     copy: dict[Modality, Tensor]
@@ -84,17 +83,22 @@ class BatchPart:
     step: int
     first: int
     count: int
+    class_weights: Tensor | None = None
+    """Weights f32[19] of the classes in the cross-entropy (None = all 1)."""
+    refined_share: float = 1.0
+    """Share of each side of the image on which the refiner is trained."""
+    reference_dropout: float = 0.2
+    """Share of the clips that go without their reference image (published kind)."""
 
-
-@dataclass(frozen=True)
-class LossSettings:
-    """What a training run says about the loss: weights f32[19] of the classes in the cross-entropy (None = all 1),
-    share of each side of the image on which the refiner is trained at a step, and share of the clips that go without
-    their reference image (published kind)."""
-
-    class_weights: Tensor | None
-    refined_share: float
-    reference_dropout: float
+    def refined_window(self, height: int, width: int) -> tuple[slice, slice]:
+        """Rows and columns of latent cells on which the refiner is trained: a share of each side, anywhere."""
+        rng = seeds.numpy_rng(self.seed, self.step, "refined window")
+        spans = []
+        for cells in (height, width):
+            size = min(cells, max(8, round(cells * self.refined_share / 8) * 8))
+            start = 2 * int(rng.integers((cells - size) // 2 + 1))
+            spans.append(slice(start, start + size))
+        return spans[0], spans[1]
 
 
 @dataclass(frozen=True)
@@ -127,11 +131,9 @@ LOSS_SHARES: dict[Modality, float] = {"rgb": 1.0, "depth": 1.0, "semantics": 0.3
 
 
 class MDM(nn.Module):
-    """Codec, noise schedule and denoising network, and what may follow them, refiner and finisher.
-
-    The network's input is, per latent cell, the noisy latents of all modalities and `ConditionLatents.planes`. It
-    states the clean latents of all modalities at once, and may copy the condition's own.
-    """
+    """Codec, noise schedule and denoising network, and what may follow them, refiner and finisher. The network's input
+    is, per latent cell, the noisy latents of all modalities and `ConditionLatents.planes`. It states the clean latents
+    of all modalities at once, and may copy the condition's own."""
 
     points_alone = False
     """The condition is filled, and recorded images are warped into it."""
@@ -166,11 +168,9 @@ class MDM(nn.Module):
         check_image_size(height, width, self.config.pixel_multiple)
 
     def encode_condition(self, condition: Condition | Sequence[Condition]) -> ConditionLatents:
-        """Latents and mask planes of one clip's condition, or of several of the same shape (see `ConditionLatents`).
-
-        A condition without warped images, backdrop or classes counts as one with none warped, its own colour as
-        backdrop, and unknown classes.
-        """
+        """Latents and mask planes of one clip's condition, or of several of the same shape (see `ConditionLatents`). A
+        condition without warped images, backdrop or classes counts as one with none warped, its own colour as backdrop,
+        and unknown classes."""
         given = Stacked.of([condition] if isinstance(condition, Condition) else list(condition))
         color, depth, valid, warped, ids = given.color, given.depth, given.valid, given.warped, given.ids
         check_image_size(*color.shape[-2:], self.config.pixel_multiple)
@@ -188,7 +188,7 @@ class MDM(nn.Module):
         far = self.codec.encode_rgb(given.backdrop)
         masks = (functional.pixel_unshuffle(m, factor) for m in (valid, warped))
         planes = [copy["rgb"], copy["depth"], far, *masks, copy["semantics"], seen["semantics"]]
-        pixels = self._pixels_of(given)
+        pixels = ConditionPixels.of(given, self.codec, self.config.renders)
         if not self.config.renders:
             return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels)
         shown = given.renders
@@ -201,24 +201,13 @@ class MDM(nn.Module):
         planes += [render["rgb"], render["depth"], alpha, certainty, classes, classes.sum(2, keepdim=True)]
         return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels, render, certainty)
 
-    def _pixels_of(self, given: Stacked) -> ConditionPixels:
-        """What the refiner sees of a batch of conditions, [B*T,..]."""
-        code, pixels = self.codec.linear_depth_code, [given.color * 2 - 1, given.backdrop * 2 - 1]
-        pixels += [code(given.depth), given.valid, given.warped, given.ids, given.backdrop_ids]
-        if self.config.renders:
-            shown = given.renders
-            pixels += [shown.color * 2 - 1, code(shown.depth), shown.alpha, shown.certainty, shown.semantics]
-        return ConditionPixels(*(x.flatten(0, 1) for x in pixels))
-
     # network --------------------------------------------------------------------------------------
 
     def predict(
         self, x: dict[Modality, Tensor], encoded: ConditionLatents, t: Tensor
     ) -> tuple[dict[Modality, Tensor], Tensor]:
-        """One pass of the network over the noisy latents `x` [B,T,C,h,w] of all modalities at steps `t` i64[B].
-
-        Returns the clean latents it states, and the log-shares of the classes [B,T,19,h,w].
-        """
+        """One pass of the network over the noisy latents `x` [B,T,C,h,w] of all modalities at steps `t` i64[B]. Returns
+        the clean latents it states, and the log-shares of the classes [B,T,19,h,w]."""
         sizes = [x[m].shape[2] for m in MODALITIES]
         given = torch.cat([*(x[m] for m in MODALITIES), encoded.planes], 2)
         out, gates = self.net(given, t).split([sum(sizes), GATES + (RENDER_GATES if encoded.render else 0)], 2)
@@ -236,13 +225,11 @@ class MDM(nn.Module):
 
     # training -------------------------------------------------------------------------------------
 
-    def loss(self, clips: Sequence[Clip], part: BatchPart, settings: LossSettings) -> Losses:
-        """Denoising loss of clips of one size; all that is drawn comes from `part`.
-
-        Squared error of x0 (depth: Huber) times 1 + SNR clipped to [1, 5], which is the v-loss with a clip;
-        cross-entropy for class shares. Steps are stratified over the batch. Where depth is not valid it has no part.
-        With a refiner its terms are added, and their gradient reaches the denoiser.
-        """
+    def loss(self, clips: Sequence[Clip], part: BatchPart) -> Losses:
+        """Denoising loss of clips of one size; all that is drawn comes from `part`. Squared error of x0 (depth: Huber)
+        times 1 + SNR clipped to [1, 5], which is the v-loss with a clip; cross-entropy for class shares. Steps are
+        stratified over the batch. Where depth is not valid it has no part. With a refiner its terms are added, and
+        their gradient reaches the denoiser."""
         with torch.no_grad():
             encoded = self.encode_condition([clip.condition for clip in clips])
             rgb, depth, ids = (torch.stack([getattr(c, name) for c in clips]) for name in ("rgb", "depth", "semantics"))
@@ -251,7 +238,7 @@ class MDM(nn.Module):
                 "depth": self.codec.encode_depth(depth),
                 "semantics": self.codec.encode_semantics(ids),
             }
-            pixels, shares = self.pixel_truth(clips), semantic_shares(ids)
+            pixels, shares = PixelTruth.of(clips, self.codec), semantic_shares(ids)
             known = functional.avg_pool2d(pixels.depth_known, self.codec.factor).unflatten(0, rgb.shape[:2])
         generator = seeds.torch_generator(part.seed, part.step, "noise")
         steps = noise.stratified_steps(part.count, len(self.schedule), generator)
@@ -267,13 +254,17 @@ class MDM(nn.Module):
         errors = {
             "rgb": losses.latent_error(stated["rgb"], latents["rgb"], weight),
             "depth": losses.latent_depth_error(stated["depth"], latents["depth"], weight, known),
-            "semantics": losses.share_cross_entropy(log_shares, shares, settings.class_weights),
+            "semantics": losses.share_cross_entropy(log_shares, shares, part.class_weights),
         }
         terms = {m: float(error.detach()) for m, error in errors.items()}
         total = sum(LOSS_SHARES[m] * errors[m] for m in MODALITIES)
         if self.refiner is not None:
-            errors = self._refiner_terms(stated, encoded, pixels, part, settings)
-            errors |= self._finisher_terms(stated, encoded, clips, settings)
+            cells = part.refined_window(*encoded.planes.shape[-2:])
+            made = {m: z[..., cells[0], cells[1]].flatten(0, 1) for m, z in stated.items()}
+            cut = [slice(s.start * self.codec.factor, s.stop * self.codec.factor) for s in cells]
+            refined = self.refine(made, encoded.pixels.crop(*cut), rgb.shape[1])
+            errors = self._pixel_terms(refined, pixels.crop(*cut), part, "pixel")
+            errors |= self._finisher_terms(stated, encoded, clips, part)
             terms |= {name: float(error.detach()) for name, error in errors.items()}
             total = total + sum(errors.values())
         return Losses(total, terms)
@@ -281,31 +272,8 @@ class MDM(nn.Module):
     forward = loss
     """What `DistributedDataParallel` calls, to exchange gradients behind it."""
 
-    def pixel_truth(self, clips: Sequence[Clip]) -> PixelTruth:
-        """What the refiner should give for clips or patches of one size."""
-        rgb, depth, weight, ids = (
-            torch.cat([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_weight", "semantics")
-        )
-        return PixelTruth(rgb * 2 - 1, self.codec.linear_depth_code(depth), ids, weight)
-
-    def _refiner_terms(
-        self,
-        stated: dict[Modality, Tensor],
-        encoded: ConditionLatents,
-        truth: PixelTruth,
-        part: BatchPart,
-        settings: LossSettings,
-    ) -> dict[str, Tensor]:
-        """Weighted terms of the refiner in a rectangle of the image, at the denoiser's resolution."""
-        frames, (h, w) = encoded.planes.shape[1], encoded.planes.shape[-2:]
-        cells = self._refined_window(part, settings.refined_share, h, w)
-        latents = {m: z[..., cells[0], cells[1]].flatten(0, 1) for m, z in stated.items()}
-        tall, wide = (slice(s.start * self.codec.factor, s.stop * self.codec.factor) for s in cells)
-        made = self.refine(latents, encoded.pixels.crop(tall, wide), frames)
-        return self._pixel_terms(made, truth.crop(tall, wide), settings, "pixel")
-
     def _finisher_terms(
-        self, stated: dict[Modality, Tensor], encoded: ConditionLatents, clips: Sequence[Clip], settings: LossSettings
+        self, stated: dict[Modality, Tensor], encoded: ConditionLatents, clips: Sequence[Clip], part: BatchPart
     ) -> dict[str, Tensor]:
         """Weighted terms of the finisher on the patches that the clips have; denoiser and refiner learn nothing from
         them."""
@@ -316,13 +284,13 @@ class MDM(nn.Module):
         with torch.no_grad():
             enlarged = [self._enlarged(stated, encoded, number, patch) for number, patch in patches]
             made = Made(*(torch.cat([getattr(m, f.name) for m in enlarged]) for f in fields(Made)))
-            given = self._pixels_of(Stacked.of([patch.clip.condition for _, patch in patches]))
-            truth = self.pixel_truth([patch.clip for _, patch in patches])
+            given = ConditionPixels.of(Stacked.of([patch.clip.condition for _, patch in patches]), self.codec, True)
+            truth = PixelTruth.of([patch.clip for _, patch in patches], self.codec)
             scales = [float(patch.scale) for _, patch in patches]
             scale = torch.tensor(scales, device=made.rgb.device).repeat_interleave(frames)
         done = self.finisher(made, given, frames, scale)
         found = Refined(done.rgb, done.depth_code, class_scores(done), done.log_error)
-        return self._pixel_terms(found, truth, settings, "fine")
+        return self._pixel_terms(found, truth, part, "fine")
 
     def _enlarged(
         self, stated: dict[Modality, Tensor], encoded: ConditionLatents, number: int, patch: FinePatch
@@ -350,7 +318,7 @@ class MDM(nn.Module):
         ids = refined.scores.argmax(1, keepdim=True).to(torch.uint8)
         return Made(refined.rgb, refined.depth_code, ids, refined.log_error)
 
-    def _pixel_terms(self, refined: Refined, truth: PixelTruth, settings: LossSettings, name: str) -> dict[str, Tensor]:
+    def _pixel_terms(self, refined: Refined, truth: PixelTruth, part: BatchPart, name: str) -> dict[str, Tensor]:
         """Weighted terms of refined pixels; depth in the sky counts threefold."""
         codec = self.config.codec
         log_per_code = math.log(codec.far_m / codec.near_m) / 2
@@ -359,21 +327,9 @@ class MDM(nn.Module):
         return {
             f"{name}_rgb": losses.image_error(error, square=2.0, gradient=0.5),
             f"{name}_depth": losses.depth_code_error(refined.depth_code, truth.depth_code, counted, log_per_code),
-            f"{name}_semantics": 0.2 * losses.class_error(refined.scores, truth.ids, settings.class_weights),
+            f"{name}_semantics": 0.2 * losses.class_error(refined.scores, truth.ids, part.class_weights),
             f"{name}_error": 0.05 * losses.stated_error(refined.log_error, error),
         }
-
-    @staticmethod
-    def _refined_window(part: BatchPart, share: float, height: int, width: int) -> tuple[slice, slice]:
-        """Rows and columns of latent cells on which the refiner is trained at a step: a share of each side,
-        anywhere."""
-        rng = seeds.numpy_rng(part.seed, part.step, "refined window")
-        spans = []
-        for cells in (height, width):
-            size = min(cells, max(8, round(cells * share / 8) * 8))
-            start = 2 * int(rng.integers((cells - size) // 2 + 1))
-            spans.append(slice(start, start + size))
-        return spans[0], spans[1]
 
     def refine(self, latents: dict[Modality, Tensor], condition: ConditionPixels, frames: int) -> Refined:
         """Pixels from latents [N,C,h,w] of all modalities and the condition (see `network.py`)."""
@@ -412,12 +368,9 @@ class MDM(nn.Module):
 
     @torch.no_grad()
     def sample(self, condition: Condition, request: SampleRequest) -> GeneratedClip:
-        """Generate one clip (see `SampleRequest`).
-
-        Condition and clip are on the model's device. The condition has T views; H and W are multiples of
-        `config.pixel_multiple`. Frames of which `request.known` has latents keep them. Measured depth
-        (`condition.valid`) replaces generated depth.
-        """
+        """Generate one clip (see `SampleRequest`). Condition and clip are on the model's device. The condition has T
+        views; H and W are multiples of `config.pixel_multiple`. Frames of which `request.known` has latents keep them.
+        Measured depth (`condition.valid`) replaces generated depth."""
         self.check_request(request)
         encoded = self.encode_condition(condition)
         drawn, change = self._denoise(encoded, request)
@@ -442,9 +395,7 @@ class MDM(nn.Module):
     @torch.no_grad()
     def finish(self, clip: GeneratedClip, fine: Condition, *, bf16: bool = False) -> GeneratedClip:
         """A generated clip at the size of `fine`, the same views' condition at the camera's resolution (any size).
-
         Measured depth replaces generated depth, as in `sample`; latents and depth fits stay those of the clip.
-
         UsageError: the model has no finisher, or `clip` does not come from `sample`."""
         if self.finisher is None or clip.log_error is None:
             raise UsageError("this model has no finisher, or the clip is another model's", where="MDM.finish")
@@ -455,7 +406,7 @@ class MDM(nn.Module):
             """What the finisher reads of the condition, made tile by tile: all of it is large."""
             part = fine.cropped(rows, columns)
             memory.rest_mapped()
-            return self._pixels_of(Stacked.of([part]))
+            return ConditionPixels.of(Stacked.of([part]), self.codec, True)
 
         with torch.autocast(self.device.type, torch.bfloat16, enabled=bf16):
             made = finish_in_tiles(self.finisher, made, fine.color.shape[-2:], crop, detail=True)
@@ -505,45 +456,6 @@ class MDM(nn.Module):
 def _expected_error(log_error: Tensor) -> Tensor:
     """Expected absolute error of colour in [0, 1] from the logarithm of that of codes in [-1, 1]."""
     return log_error.clamp(-6, 1).exp() / 2
-
-
-# batches of conditions ----------------------------------------------------------------------------
-
-
-NO_RENDER = -1.0
-"""Coverage that stands for: there is no render."""
-
-
-@dataclass(frozen=True)
-class Stacked:
-    """The tensors of conditions of one shape [B,T,..]; what a condition lacks is filled in: none warped, its own colour
-    as backdrop, unknown classes, no render. Masks are f32."""
-
-    color: Tensor
-    depth: Tensor
-    valid: Tensor
-    warped: Tensor
-    backdrop: Tensor
-    ids: Tensor
-    backdrop_ids: Tensor
-    renders: RenderPlanes
-
-    @classmethod
-    def of(cls, batch: Sequence[Condition]) -> Stacked:
-        """Of conditions of one shape."""
-        unknown = torch.full_like(batch[0].valid, palette.UNLABELLED, dtype=torch.uint8)
-        nothing = torch.zeros_like(batch[0].depth)
-        no_render = lambda c: RenderPlanes(c.color, c.depth, nothing + NO_RENDER, nothing, unknown)
-        renders = [no_render(c) if c.renders is None else c.renders for c in batch]
-        return cls(
-            *(torch.stack([getattr(c, name) for c in batch]) for name in ("color", "depth")),
-            torch.stack([c.valid for c in batch]).float(),
-            torch.stack([torch.zeros_like(c.valid) if c.warped is None else c.warped for c in batch]).float(),
-            torch.stack([c.color if c.backdrop is None else c.backdrop for c in batch]),
-            torch.stack([unknown if c.semantics is None else c.semantics for c in batch]),
-            torch.stack([unknown if c.backdrop_semantics is None else c.backdrop_semantics for c in batch]),
-            RenderPlanes(*(torch.stack([getattr(r, f.name) for r in renders]) for f in fields(RenderPlanes))),
-        )
 
 
 def cell_means(mask: Tensor, factor: int) -> Tensor:

@@ -18,11 +18,14 @@ from torch import Tensor
 
 from mudg.base import checkpoint, records, store, weights
 from mudg.base.errors import InputError
+from mudg.base.types import Condition
 from mudg.diffusion.model import MDM
 from mudg.diffusion.network import MDMConfig
 from mudg.diffusion.published import PublishedConfig, PublishedMDM
+from mudg.diffusion.requests import CPU, GeneratedClip, SampleRequest
 from mudg.networks.codec import SHIPPED
 
+Model = MDM | PublishedMDM
 MODEL_FILE = "model.json"
 EMBEDDED: dict[str, Path] = {"embedded": SHIPPED, "embedded-tiny": SHIPPED.with_name("mdm_tiny")}
 """Models that come with the package, by the names that stand for their folders."""
@@ -76,6 +79,11 @@ def is_published(path: Path | str) -> bool:
     where = folder_of(path) / MODEL_FILE
     content = store.read_json(where) if where.is_file() else None
     return isinstance(content, dict) and content.get("kind") == PUBLISHED
+
+
+def generated(model: Model, condition: Condition, request: SampleRequest) -> GeneratedClip:
+    """A clip generated on the model's device; condition and clip are on the CPU."""
+    return model.sample(condition.to(model.device), request).to(CPU)
 
 
 # models -------------------------------------------------------------------------------------------

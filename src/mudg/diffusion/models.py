@@ -1,6 +1,6 @@
 """The models that `learn` can train, what is particular to each, and with which weights a training starts.
 
-Both have what the loop uses: `loss(clips, part, settings)`, also as `forward`, `trained_part()`, and
+Both have what the loop uses: `loss(clips, part)`, also as `forward`, `trained_part()`, and
 `temporal_parameters(which)`, those that a later stage may freeze.
 """
 
@@ -28,14 +28,14 @@ from mudg.diffusion import model_files
 from mudg.diffusion.clips import FAR_M, Shards, TrainingClips, counts_at
 from mudg.diffusion.condition import filled_depth
 from mudg.diffusion.model import MDM
+from mudg.diffusion.model_files import Model, generated
 from mudg.diffusion.network import MDMConfig
 from mudg.diffusion.parallel import Ranks, TrainingState, agreed_terms, mean_of
 from mudg.diffusion.published import PublishedMDM, WorkSplit
-from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated
+from mudg.diffusion.requests import GeneratedClip, SampleRequest
 from mudg.diffusion.settings import LearnConfig
 from mudg.networks.codec import Modality, PatchCodec
 
-Model = MDM | PublishedMDM
 PATCH = 2
 """Side of the squares of latent pixels that the network processes as one cell."""
 
@@ -95,14 +95,12 @@ def model_card(model: Model, source: TrainingClips, scores: Mapping[str, Any]) -
 
 
 def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
-    """The model to train, and which of its parts ("codec", "refiner", "finisher") have no weights yet.
-
-    With `start` the network is that of the earlier model, extended by a refiner, a finisher and inputs for renders
-    where the settings ask for them. If the settings do not describe that network but are the defaults, it is taken as
-    it is. Clips may be of another size and length than before. Inputs for renders and a finisher are learned from
-    generated cities with renders; from other clips no model gets any that it does not have.
-
-    UsageError: the settings ask for another network than the earlier model has, or for clips that it cannot take."""
+    """The model to train, and which of its parts ("codec", "refiner", "finisher") have no weights yet. With `start` the
+    network is that of the earlier model, extended by a refiner, a finisher and inputs for renders where the settings
+    ask for them. If the settings do not describe that network but are the defaults, it is taken as it is. Clips may be
+    of another size and length than before. Inputs for renders and a finisher are learned from generated cities with
+    renders; from other clips no model gets any that it does not have. UsageError: the settings ask for another network
+    than the earlier model has, or for clips that it cannot take."""
     wanted = model_config(config)
     usual = wanted == model_config(LearnConfig(data=config.data))  # the network is left as it is by default
     can_grow = config.data.renders and not config.data.scenes
@@ -254,10 +252,7 @@ def train_codec(codec: PatchCodec, source: TrainingClips, run_dir: RunDir, bf16:
 
 def codec_loss(codec: PatchCodec, clips: Sequence[Clip], generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
     """Reconstruction loss of the decoder on latents with a little noise, drawn on the CPU; modalities are left out at
-    random.
-
-    L1 + half squared error and L1 of gradients for colour, L1 for the depth code, cross-entropy for classes.
-    """
+    random. L1 + half squared error and L1 of gradients for colour, L1 for the depth code, cross-entropy for classes."""
     rgb, depth, known, ids = (
         torch.cat([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_weight", "semantics")
     )
@@ -348,18 +343,12 @@ SCORES = (
 
 
 def score(
-    model: MDM | PublishedMDM,
-    cities: Sequence[int],
-    shards: Shards,
-    request: SampleRequest,
-    *,
-    picture: Path | None = None,
+    model: Model, cities: Sequence[int], shards: Shards, request: SampleRequest, *, picture: Path | None = None
 ) -> dict[str, Any]:
-    """Generate all clips of some cities and compare with the truth.
-
-    Returns {"average": scores over the shifted clips, "by_shift": {shift: scores}, "clips": n, "steps": request.steps}.
-    Keys as in `SCORES`; classes are pooled over all clips before the IoU. Draws a grid of up to 6 clips into `picture`.
-    request: how clips are sampled; the index is put in for each."""
+    """Generate all clips of some cities and compare with the truth. Returns {"average": scores over the shifted clips,
+    "by_shift": {shift: scores}, "clips": n, "steps": request.steps}. Keys as in `SCORES`; classes are pooled over all
+    clips before the IoU. Draws a grid of up to 6 clips into `picture`. request: how clips are sampled; the index is put
+    in for each."""
     rows: dict[str, list[dict[str, float]]] = {}
     counts: dict[str, Tensor] = {}
     pairs: list[tuple[Clip, GeneratedClip]] = []

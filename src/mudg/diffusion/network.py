@@ -14,7 +14,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mudg.base import palette
 from mudg.base.errors import UsageError
+from mudg.base.types import Clip, Condition, RenderPlanes
 from mudg.core.noise import ScheduleConfig
 from mudg.networks.codec import (
     CLASSES,
@@ -58,8 +60,7 @@ class MDMConfig:
     renders: bool = False
     """Whether the condition may hold renders of a fitted scene."""
     finish_widths: tuple[int, ...] = ()
-    """Channels of the finisher at half and at a quarter of the camera's resolution; empty = no
-    finisher."""
+    """Channels of the finisher at half and at a quarter of the camera's resolution; empty = no finisher."""
     finish_blocks: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -97,11 +98,9 @@ def sinusoid(t: Tensor, width: int) -> Tensor:
 
 
 def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-    """Softmax attention of `q` [..,N,C] over `k`, `v` [..,M,C] -> [..,N,C].
-
-    In training as two matrix products (on CPUs the backward pass of the fused kernel costs several times more at these
-    sizes), otherwise through the fused kernel, which never stores the N x M scores.
-    """
+    """Softmax attention of `q` [..,N,C] over `k`, `v` [..,M,C] -> [..,N,C]. In training as two matrix products (on CPUs
+    the backward pass of the fused kernel costs several times more at these sizes), otherwise through the fused kernel,
+    which never stores the N x M scores."""
     if torch.is_grad_enabled():
         scores = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)
         return scores.softmax(-1).to(v.dtype) @ v
@@ -286,6 +285,42 @@ class PixelPlanes:
         return self.map(lambda x: x[..., rows, columns])
 
 
+NO_RENDER = -1.0
+"""Coverage that stands for: there is no render."""
+
+
+@dataclass(frozen=True)
+class Stacked:
+    """The tensors of conditions of one shape [B,T,..]; what a condition lacks is filled in: none warped, its own colour
+    as backdrop, unknown classes, no render. Masks are f32."""
+
+    color: Tensor
+    depth: Tensor
+    valid: Tensor
+    warped: Tensor
+    backdrop: Tensor
+    ids: Tensor
+    backdrop_ids: Tensor
+    renders: RenderPlanes
+
+    @classmethod
+    def of(cls, batch: Sequence[Condition]) -> Stacked:
+        """Of conditions of one shape."""
+        unknown = torch.full_like(batch[0].valid, palette.UNLABELLED, dtype=torch.uint8)
+        nothing = torch.zeros_like(batch[0].depth)
+        no_render = lambda c: RenderPlanes(c.color, c.depth, nothing + NO_RENDER, nothing, unknown)
+        renders = [no_render(c) if c.renders is None else c.renders for c in batch]
+        return cls(
+            *(torch.stack([getattr(c, name) for c in batch]) for name in ("color", "depth")),
+            torch.stack([c.valid for c in batch]).float(),
+            torch.stack([torch.zeros_like(c.valid) if c.warped is None else c.warped for c in batch]).float(),
+            torch.stack([c.color if c.backdrop is None else c.backdrop for c in batch]),
+            torch.stack([unknown if c.semantics is None else c.semantics for c in batch]),
+            torch.stack([unknown if c.backdrop_semantics is None else c.backdrop_semantics for c in batch]),
+            RenderPlanes(*(torch.stack([getattr(r, f.name) for r in renders]) for f in fields(RenderPlanes))),
+        )
+
+
 @dataclass(frozen=True)
 class ConditionPixels(PixelPlanes):
     """The condition at pixel resolution: color, backdrop f32[N,3,H,W] in [-1,1]; depth_code f32[N,1,H,W]; valid, warped
@@ -305,6 +340,16 @@ class ConditionPixels(PixelPlanes):
     alpha: Tensor | None = None
     certainty: Tensor | None = None
     render_ids: Tensor | None = None
+
+    @classmethod
+    def of(cls, given: Stacked, codec: PatchCodec, renders: bool) -> ConditionPixels:
+        """What refiner and finisher see of a batch of conditions."""
+        code, pixels = codec.linear_depth_code, [given.color * 2 - 1, given.backdrop * 2 - 1]
+        pixels += [code(given.depth), given.valid, given.warped, given.ids, given.backdrop_ids]
+        if renders:
+            shown = given.renders
+            pixels += [shown.color * 2 - 1, code(shown.depth), shown.alpha, shown.certainty, shown.semantics]
+        return cls(*(x.flatten(0, 1) for x in pixels))
 
 
 @dataclass(frozen=True)
@@ -373,13 +418,11 @@ class CellNet(nn.Module):
 
 
 class Refiner(CellNet):
-    """From latents and condition to pixels, once per clip, after the last denoising step.
-
-    The latent code has a quarter of the image's places and loses texture; the condition has all of it wherever
-    something was seen. For every pixel this states how much of the condition's colour, depth and class to take over,
-    what to add, and how wrong the colour will probably be. `widths`: channels at the latent resolution and at half of
-    it; `blocks`: residual blocks there. With `renders` it also reads what a fitted scene shows.
-    """
+    """From latents and condition to pixels, once per clip, after the last denoising step. The latent code has a quarter
+    of the image's places and loses texture; the condition has all of it wherever something was seen. For every pixel
+    this states how much of the condition's colour, depth and class to take over, what to add, and how wrong the colour
+    will probably be. `widths`: channels at the latent resolution and at half of it; `blocks`: residual blocks there.
+    With `renders` it also reads what a fitted scene shows."""
 
     SIZES = (12, 4, 4, 4, 4, 4 * CLASSES, 4, 4, 4)
     """Outputs: colour to add, gates of the condition's colour and backdrop, depth to add, gate of depth, scores to add,
@@ -450,6 +493,14 @@ class PixelTruth(PixelPlanes):
     ids: Tensor
     depth_known: Tensor
 
+    @classmethod
+    def of(cls, clips: Sequence[Clip], codec: PatchCodec) -> PixelTruth:
+        """For clips or patches of one size."""
+        rgb, depth, weight, ids = (
+            torch.cat([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_weight", "semantics")
+        )
+        return cls(rgb * 2 - 1, codec.linear_depth_code(depth), ids, weight)
+
 
 # finisher -----------------------------------------------------------------------------------------
 
@@ -506,21 +557,17 @@ class Finished:
         return shares
 
     def ids(self) -> Tensor:
-        """The class with the largest share u8[N,1,H,W]; frame by frame, for the shares of all are large.
-
-        (``max`` finds the first of several equal ones, as ``argmax`` does, in half of the time.)
-        """
+        """The class with the largest share u8[N,1,H,W]; frame by frame, for the shares of all are large. (``max`` finds
+        the first of several equal ones, as ``argmax`` does, in half of the time.)"""
         shares = (self.shares(slice(n, n + 1)) for n in range(len(self.weights)))
         return torch.cat([one.max(1, keepdim=True).indices.to(torch.uint8) for one in shares])
 
 
 class Finisher(CellNet):
-    """From an enlarged clip and the condition at the camera's size to a clip of that size.
-
-    For every pixel it states how much to take of each source, what colour to add, and how wrong it will probably be.
-    It is small, so that a full-size image costs about as much as the clip it comes from. `widths`: channels at half
-    and at a quarter of the resolution; `blocks`: residual blocks there (`CellNet`).
-    """
+    """From an enlarged clip and the condition at the camera's size to a clip of that size. For every pixel it states
+    how much to take of each source, what colour to add, and how wrong it will probably be. It is small, so that a
+    full-size image costs about as much as the clip it comes from. `widths`: channels at half and at a quarter of the
+    resolution; `blocks`: residual blocks there (`CellNet`)."""
 
     SOURCES = 4
     """Of colour: the enlarged clip, images warped in, the backdrop, the render. Of depth and class: the clip, the

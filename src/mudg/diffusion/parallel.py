@@ -76,11 +76,8 @@ class Ranks:
         return json.loads(bytes(letters.cpu().tolist()))
 
     def leader_does(self, work: Callable[[], Any]) -> Any:
-        """Run `work` in the leader alone; all get its JSON result, or raise its error.
-
-        An error that is not one of ours, or an interruption, ends the leader at once; the launcher then ends the
-        others.
-        """
+        """Run `work` in the leader alone; all get its JSON result, or raise its error. An error that is not one of
+        ours, or an interruption, ends the leader at once; the launcher then ends the others."""
         if self.size == 1:
             return work()
         answer: dict[str, Any] = {}
@@ -113,13 +110,10 @@ class Ranks:
 
 @contextlib.contextmanager
 def join_processes(wanted: str) -> Iterator[Ranks]:
-    """This process's place among those that `torchrun` started; alone if it was not started by it.
-
-    A process group that exists already is used and left open. Only the leader's messages are shown.
-
-    wanted: a `DeviceName`. Several processes compute on the CPU, or on one CUDA device each. ResourceError: there is no
-    such device. UsageError: it has no implementation, or is one for several processes; the launcher's variables are not
-    numbers."""
+    """This process's place among those that `torchrun` started; alone if it was not started by it. A process group that
+    exists already is used and left open. Only the leader's messages are shown. wanted: a `DeviceName`. Several
+    processes compute on the CPU, or on one CUDA device each. ResourceError: there is no such device. UsageError: it has
+    no implementation, or is one for several processes; the launcher's variables are not numbers."""
     if dist.is_available() and dist.is_initialized():
         yield _ranks_on_device(dist.get_rank(), dist.get_world_size(), wanted)
         return

@@ -21,7 +21,7 @@ from mudg.base.types import Clip, Condition
 from mudg.core import noise
 from mudg.core.depth import DepthFit, align_depth
 from mudg.core.noise import Schedule, ScheduleConfig
-from mudg.diffusion.model import BatchPart, Losses, LossSettings
+from mudg.diffusion.model import BatchPart, Losses
 from mudg.diffusion.published_network import (
     Autoencoder,
     AutoencoderConfig,
@@ -105,17 +105,14 @@ class PublishedConfig:
     @property
     def pixel_multiple(self) -> int:
         """Image sides must be multiples of this many pixels."""
-        return 2 ** (len(self.codec.multipliers) + len(self.net.multipliers) - 2)
+        return self.codec.factor * 2 ** (len(self.net.multipliers) - 1)
 
 
 @dataclass(frozen=True)
 class PublishedLatents:
-    """A batch of conditions as the network wants them.
-
-    planes f32[B,T,8,h,w]: latents of the colour and the depth condition; features [B,257,D] image tower's output for
-    the reference and grey [1,257,D] for a mid-grey image (the absent reference); seen f32[B,T,1,h,w] share of the cell
-    that was seen.
-    """
+    """A batch of conditions as the network wants them. planes f32[B,T,8,h,w]: latents of the colour and the depth
+    condition; features [B,257,D] image tower's output for the reference and grey [1,257,D] for a mid-grey image (the
+    absent reference); seen f32[B,T,1,h,w] share of the cell that was seen."""
 
     planes: Tensor
     features: Tensor
@@ -156,10 +153,8 @@ MODALITY_SHARES: dict[Modality, float] = {"rgb": 0.5, "semantics": 0.25, "depth"
 
 
 class PublishedMDM(nn.Module):
-    """The model (see the module text). The caption's embedding is a buffer: the text tower is not part of it.
-
-    `split` says how its work is cut into pieces.
-    """
+    """The model (see the module text). The caption's embedding is a buffer: the text tower is not part of it. `split`
+    says how its work is cut into pieces."""
 
     points_alone = True
     """The condition is points, 0 where nothing was seen, and one recorded image, which stands in frame 0."""
@@ -275,10 +270,7 @@ class PublishedMDM(nn.Module):
         self, x: Tensor, planes: Tensor, t: Tensor, names: Sequence[Modality], text: Tensor, tokens: Tensor
     ) -> Tensor:
         """Velocity f32[N,T,4,h,w] of noisy latents `x` of the same shape, modality `names[n]` each, at steps `t`
-        i64[N].
-
-        planes [N,T,8,h,w]; text [N,77,D]; tokens [N,T,16,D].
-        """
+        i64[N]. planes [N,T,8,h,w]; text [N,77,D]; tokens [N,T,16,D]."""
         inputs = torch.cat([x, planes], 2).to(self.dtype)
         label = torch.tensor([LABELS[m] for m in names], device=inputs.device)
         fps = torch.full_like(t, self.config.fps)
@@ -286,10 +278,10 @@ class PublishedMDM(nn.Module):
 
     # training -------------------------------------------------------------------------------------
 
-    def loss(self, clips: Sequence[Clip], part: BatchPart, settings: LossSettings) -> Losses:
+    def loss(self, clips: Sequence[Clip], part: BatchPart) -> Losses:
         """`velocity_loss` of clips of one size; all that is drawn comes from `part`, the autoencoder's posterior clip
         by clip. InputError: the clips' condition is not the published one."""
-        encoded, truths, dropout = [], [], ContextDropout.for_reference(settings.reference_dropout)
+        encoded, truths, dropout = [], [], ContextDropout.for_reference(part.reference_dropout)
         with torch.no_grad():
             for number, clip in enumerate(clips, part.first):
                 if clip.condition.warped is not None and bool(clip.condition.warped.any()):
@@ -338,18 +330,14 @@ class PublishedMDM(nn.Module):
         batch_clips: int = 0,
     ) -> Losses:
         """Mean squared error of the velocity; every clip of the batch shows one modality, drawn by `MODALITY_SHARES`.
-
-        Args:
-            truth: latents of `encode_truth`, each [B,T,4,h,w].
-            encoded: where the reference is left out the image tokens go grey, as in the released code.
-            generator: of all draws.
-            known: f32[B,T,1,h,w] share of the cell whose truth is known; a modality not named is known everywhere.
-            first, batch_clips: number of the first of these clips in the batch of a training step, and clips of that
-                batch (0 = just these). What is drawn for a clip does not depend on how the batch is divided.
+        truth: latents of `encode_truth`, each [B,T,4,h,w]. encoded: where the reference is left out the image tokens go
+        grey, as in the released code. known: f32[B,T,1,h,w] share of the cell whose truth is known; a modality not
+        named is known everywhere. first, batch_clips: number of the first of these clips in the batch of a training
+        step, and clips of that batch (0 = just these). What is drawn for a clip, from the generator, does not depend on
+        how the batch is divided.
 
         Returns a term for each modality that any clip of the batch shows, so that all parts have the same terms; the
-        mean over equal parts is the mean over the clips that show it.
-        """
+        mean over equal parts is the mean over the clips that show it."""
         count = encoded.planes.shape[0]
         batch_clips, own = batch_clips or count, slice(first, first + count)
         steps = noise.stratified_steps(batch_clips, len(self.schedule), generator)
@@ -409,12 +397,9 @@ class PublishedMDM(nn.Module):
     @torch.no_grad()
     def sample(self, condition: Condition, request: SampleRequest) -> GeneratedClip:
         """Generate one clip of exactly `config.window` frames (see `SampleRequest`). Condition and clip are on the
-        model's device.
-
-        Steps run from the noisiest one down. Of frames whose latents are known, the decoded colour takes the place of
-        the sparse colour: the published way to continue a video. Depth and semantics are not continued. Without
-        `align`, depth is what the model says.
-        """
+        model's device. Steps run from the noisiest one down. Of frames whose latents are known, the decoded colour
+        takes the place of the sparse colour: the published way to continue a video. Depth and semantics are not
+        continued. Without `align`, depth is what the model says."""
         frames_at_once = self.split.frames_at_once
         half = request.bf16 and self.dtype == torch.float32
         with torch.autocast(self.device.type, torch.bfloat16) if half else contextlib.nullcontext():
@@ -442,11 +427,8 @@ class PublishedMDM(nn.Module):
     def _denoise(
         self, encoded: PublishedLatents, names: tuple[Modality, ...], tokens: Tensor, request: SampleRequest
     ) -> tuple[dict[Modality, Tensor], Tensor]:
-        """Draw some modalities in one batch; returns their latents [T,4,h,w] and how much the first's still
-        changed [T,1,h,w].
-
-        `tokens` [2,T,16,D]: with the reference and without. Every modality has its own stream of noise.
-        """
+        """Draw some modalities in one batch; returns their latents [T,4,h,w] and how much the first's still changed
+        [T,1,h,w]. `tokens` [2,T,16,D]: with the reference and without. Every modality has its own stream of noise."""
         _, frames, _, h, w = encoded.planes.shape
         shape = (1, frames, self.config.codec.latent_channels, h, w)
         streams = [seeds.torch_generator(request.seed, request.index * 64, f"sample {m}") for m in names]

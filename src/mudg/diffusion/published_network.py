@@ -6,7 +6,7 @@ Source: paper of MuDG; architecture of DynamiCrafter (Xing et al.) with a modali
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -41,6 +41,11 @@ class AutoencoderConfig:
     """Depths are coded linearly from 0 to this distance; the sky is this far."""
     posterior: Literal["sample", "mean"] = "sample"
     """What encoding gives: a draw from the posterior, as in the published training and inference, or its mean."""
+
+    @property
+    def factor(self) -> int:
+        """Pixels per latent cell, along each side."""
+        return 2 ** (len(self.multipliers) - 1)
 
 
 class Block(nn.Module):
@@ -161,7 +166,7 @@ class Autoencoder(nn.Module):
     def __init__(self, config: AutoencoderConfig) -> None:
         super().__init__()
         self.config = config
-        self.factor = 2 ** (len(config.multipliers) - 1)
+        self.factor = config.factor
         self.encoder, self.decoder = Encoder(config), Decoder(config)
         self.to_moments = nn.Conv2d(2 * config.latent_channels, 2 * config.latent_channels, 1)
         self.from_latent = nn.Conv2d(config.latent_channels, config.latent_channels, 1)
@@ -179,10 +184,8 @@ class Autoencoder(nn.Module):
         return mean, log_variance.clamp(-30.0, 20.0)
 
     def encode(self, image: Tensor, generator: torch.Generator | None = None, frames_at_once: int = 1) -> Tensor:
-        """Scaled latent f32[..,4,H/8,W/8] of images [..,3,H,W] in [-1,1].
-
-        With a generator a draw from the posterior (noise made on the generator's device), without one its mean.
-        """
+        """Scaled latent f32[..,4,H/8,W/8] of images [..,3,H,W] in [-1,1]. With a generator a draw from the posterior
+        (noise made on the generator's device), without one its mean."""
         lead = image.shape[:-3]
         parts = []
         for part in image.reshape(-1, *image.shape[-3:]).split(frames_at_once):
@@ -215,10 +218,8 @@ class Autoencoder(nn.Module):
         return (table.to(ids.device)[ids.clamp(0, 255)] / 127.5 - 1.0).movedim(-1, -3)
 
     def decode(self, latents: dict[Modality, Tensor], frames_at_once: int = 1) -> Decoded:
-        """Pixels of scaled latents [..,4,h,w] of all modalities.
-
-        Depth is the mean of the three channels; a class is the nearest palette colour.
-        """
+        """Pixels of scaled latents [..,4,h,w] of all modalities. Depth is the mean of the three channels; a class is
+        the nearest palette colour."""
         images = {m: self.decode_image(z, frames_at_once).clamp(-1.0, 1.0) for m, z in latents.items()}
         depth = (images["depth"].mean(-3, keepdim=True).clamp(-1.0, 1.0) + 1.0) * 0.5 * self.config.far_m
         return Decoded((images["rgb"] + 1) / 2, depth, nearest_class(images["semantics"]))
@@ -372,11 +373,8 @@ class SeededDropout(nn.Module):
         return x * (torch.cat(draws) >= self.share).to(x) / (1 - self.share)
 
 
-class Context(NamedTuple):
-    """What cross-attention looks at: caption tokens [B,77,D] and image tokens [B*T,16,D]."""
-
-    text: Tensor
-    image: Tensor
+Context = tuple[Tensor, Tensor]
+"""What cross-attention looks at: caption tokens [B,77,D] and image tokens [B*T,16,D]."""
 
 
 class Attention(nn.Module):
@@ -399,10 +397,11 @@ class Attention(nn.Module):
         query = self.query(tokens)
         if context is None:
             return self.dropout(self.out(attend(query, self.key(tokens), self.value(tokens), self.heads)))
-        repeats = len(tokens) // len(context.text)
-        key, value = (layer(context.text).repeat_interleave(repeats, 0) for layer in (self.key, self.value))
+        text, image = context
+        repeats = len(tokens) // len(text)
+        key, value = (layer(text).repeat_interleave(repeats, 0) for layer in (self.key, self.value))
         mixed = attend(query, key, value, self.heads)
-        mixed = mixed + attend(query, self.image_key(context.image), self.image_value(context.image), self.heads)
+        mixed = mixed + attend(query, self.image_key(image), self.image_value(image), self.heads)
         return self.dropout(self.out(mixed))
 
 
@@ -581,11 +580,9 @@ def _embedding(width: int) -> nn.Sequential:
 
 class VideoUNet(nn.Module):
     """The denoiser. What modulates the residual blocks is time(t) + label(modality) + fps(rate), all through sinusoids.
-
     Everything except the temporal layers works on frames, [B*T,C,h,w]. A frame sees the others in the convolutions over
     time inside each residual block, in the temporal transformers, and in `first`, one more of these right after the
-    input convolution.
-    """
+    input convolution."""
 
     def __init__(self, config: VideoUNetConfig) -> None:
         super().__init__()
@@ -626,7 +623,7 @@ class VideoUNet(nn.Module):
         wave = lambda value: sinusoid(value, self.config.width).to(x.dtype)
         embedding = self.time(wave(t)) + self.label(wave(label)) + self.fps(wave(fps))
         embedding = embedding.repeat_interleave(frames, 0)
-        context = Context(text, image.flatten(0, 1))
+        context = text, image.flatten(0, 1)
         h = x.flatten(0, 1)
         skips = []
         for number, stage in enumerate(self.down):

@@ -1,7 +1,7 @@
 """The interface that the two diffusion models share: requests, generated clips, and their confidence.
 
-Conditions are made and clips are used on the CPU; `generated` is the border to the model's device. Noise is drawn on
-the CPU, so that it is the same for every device.
+Conditions are made and clips are used on the CPU; `model_files.generated` is the border to the model's device. Noise is
+drawn on the CPU, so that it is the same for every device.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -27,18 +27,13 @@ from mudg.networks.codec import Modality
 
 @dataclass(frozen=True, eq=False)
 class SampleRequest:
-    """How one clip is to be generated.
-
-    Args:
-        steps: denoiser passes; 1 is the regression of the clip on its condition. The published kind needs one pass for
-            each modality, and twice as many with guidance.
-        seed, index: all noise is drawn from (seed, index): same in, same out.
-        eta: noise added between steps, 0 to 1 (None = 1).
-        guidance, guidance_rescale: published kind (None = the model's own): weight of the guided over the unguided
-            prediction (1 = none), and share of it whose spread is pulled back.
-        known: modality -> latents [k,C,h,w] of the clip's first k frames, from the previous window.
-        align: bring each frame's depth to the measured scale. bf16: run the networks in bfloat16.
-    """
+    """How one clip is to be generated. steps: denoiser passes; 1 is the regression of the clip on its condition. The
+    published kind needs one pass for each modality, and twice as many with guidance. seed, index: all noise is drawn
+    from (seed, index): same in, same out. eta: noise added between steps, 0 to 1 (None = 1). guidance,
+    guidance_rescale: published kind (None = the model's own): weight of the guided over the unguided prediction (1 =
+    none), and share of it whose spread is pulled back. known: modality -> latents [k,C,h,w] of the clip's first k
+    frames, from the previous window. align: bring each frame's depth to the measured scale. bf16: run the networks in
+    bfloat16."""
 
     steps: int
     seed: int = 0
@@ -53,13 +48,11 @@ class SampleRequest:
 
 @dataclass(frozen=True, eq=False)
 class GeneratedClip:
-    """A generated clip.
-
-    rgb f32[T,3,H,W] in [0,1]; depth f32[T,1,H,W] metres; semantics i64[T,H,W]; confidence f32[T,1,H,W] in [0,1].
-    `latents`: modality -> [T,C,h,w], to be handed to the next window as `known`. `depth_fits`: one per frame, how depth
-    was brought to the measured scale; empty without `SampleRequest.align`. `log_error`: of small models with a refiner,
-    logarithm of the expected absolute error of colour codes (-1 to 1) f32[T,1,H,W], for `MDM.finish`.
-    """
+    """A generated clip. rgb f32[T,3,H,W] in [0,1]; depth f32[T,1,H,W] metres; semantics i64[T,H,W]; confidence
+    f32[T,1,H,W] in [0,1]. `latents`: modality -> [T,C,h,w], to be handed to the next window as `known`. `depth_fits`:
+    one per frame, how depth was brought to the measured scale; empty without `SampleRequest.align`. `log_error`: of
+    small models with a refiner, logarithm of the expected absolute error of colour codes (-1 to 1) f32[T,1,H,W], for
+    `MDM.finish`."""
 
     rgb: Tensor
     depth: Tensor
@@ -84,7 +77,6 @@ Precision = Literal["auto", "float32", "bfloat16", "float16"]
 
 def half_format(precision: Precision, device: torch.device = CPU, *, float16: bool = False) -> torch.dtype | None:
     """The half precision that convolutions and matrix products run in, None for float32. The choice is announced once.
-
     "auto" gives bfloat16 on CPUs that multiply in it (measured on Zen 4: a training step takes 0.55 of the time of
     float32, a sample 0.7), and on CUDA devices that have it. On other CUDA devices it gives float16 where `float16`
     says that the network bears its range, else, and on MPS, float32. UsageError: float16 where it does not apply."""
@@ -111,25 +103,7 @@ def half_format(precision: Precision, device: torch.device = CPU, *, float16: bo
     return chosen
 
 
-# the border to the device -------------------------------------------------------------------------
-
-
-class Sampling(Protocol):
-    """What `generated` asks of a model."""
-
-    @property
-    def device(self) -> torch.device:
-        """Where the weights lie."""
-        ...
-
-    def sample(self, condition: Condition, request: SampleRequest) -> GeneratedClip:
-        """Generate one clip."""
-        ...
-
-
-def generated(model: Sampling, condition: Condition, request: SampleRequest) -> GeneratedClip:
-    """A clip generated on the model's device; condition and clip are on the CPU."""
-    return model.sample(condition.to(model.device), request).to(CPU)
+# sizes and steps ----------------------------------------------------------------------------------
 
 
 def check_image_size(height: int, width: int, multiple: int) -> None:
@@ -204,7 +178,6 @@ def confidence_of(seen: Tensor, change: Tensor, factor: int) -> Tensor:
 def depth_agreement(depth: Tensor, condition: Condition, slack_px: int = 0) -> Tensor:
     """How far generated depth f32[T,1,H,W] agrees with what was measured nearby, f32[T,1,H,W] in [0.2, 1]: exp(-5
     |log(generated / measured)|) at measured pixels, carried over to those within 2 pixels as the mean; 1 elsewhere.
-
     slack_px: a measurement agrees with every depth between the least and the greatest of the pixels so near. For
     measurements of a finer grid than the image's: near the horizon, and at edges, depth changes within a pixel."""
     pool = lambda x: functional.avg_pool2d(x, 5, stride=1, padding=2, count_include_pad=True)
@@ -221,9 +194,7 @@ def depth_agreement(depth: Tensor, condition: Condition, slack_px: int = 0) -> T
 
 
 def settle_depth(depth: Tensor, condition: Condition, far_m: float) -> Tensor:
-    """Generated depth with measured depth put in wherever a point was seen, f32[T,1,H,W] metres, at most `far_m`.
-
-    The condition's points have passed a visibility test, so they are taken as they are.
-    """
+    """Generated depth with measured depth put in wherever a point was seen, f32[T,1,H,W] metres, at most `far_m`. The
+    condition's points have passed a visibility test, so they are taken as they are."""
     points = condition.measurement
     return torch.where(points.valid, points.depth, depth).clamp(max=far_m)

@@ -25,8 +25,7 @@ class SynthesizeConfig:
     """Denoising steps. More add texture and agree less with the truth pixel by pixel. Use 50 for published-type
     models."""
     eta: float | None = setting(default=None, ge=0, le=1)
-    """Noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not
-    given: 1)."""
+    """Noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given: 1)."""
     condition: Literal["full", "reference", "points", "concat", "repair"] = "full"
     """Which parts of the model's condition are given, to measure what each brings. reference: the nearest recorded
     image alone. points: LiDAR points alone. concat: both, without images warped by depth (published-type models: the

@@ -214,11 +214,9 @@ class _OpenScene(NamedTuple):
 
 
 class ListedShards(Shards):
-    """Clips of the scenes of a list, fetched or made when they are drawn.
-
-    Scenes and shards that are missing or damaged are named once and left out; others are drawn in their place.
-
-    rules: how clips are cut from scenes that are logs. limit: share of the scenes that may be left out."""
+    """Clips of the scenes of a list, fetched or made when they are drawn. Scenes and shards that are missing or damaged
+    are named once and left out; others are drawn in their place. rules: how clips are cut from scenes that are logs.
+    limit: share of the scenes that may be left out."""
 
     def __init__(self, scenes: SceneList, cache: ShardCache, rules: LogClipRules, limit: float) -> None:
         self.scenes, self._cache, self._limit = scenes, cache, limit
@@ -311,7 +309,7 @@ class ListedShards(Shards):
     def _of_log(self, text: str, scored: bool) -> _OpenScene:
         """A log's clips, all made when the first one is wanted, and kept in the cache by the log's content."""
         source, rules = log_clips.log_source(text), self._rules
-        windows = [replace(w, held_out=scored) for w in log_clips.log_windows(read_scene(source.scene), rules)]
+        windows = [window._replace(held_out=scored) for window in rules.windows(read_scene(source.scene))]
         said = store.json_text([store.digest(source.scene), store.digest(source.fused), asdict(rules), scored])
         folder = hashlib.sha256(said.encode()).hexdigest()[:24]
 

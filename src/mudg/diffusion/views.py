@@ -11,7 +11,7 @@ import math
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -27,28 +27,17 @@ from mudg.base.errors import ResourceError, UsageError
 from mudg.base.processes import run_in_processes
 from mudg.base.records import understood
 from mudg.base.run_folder import RunDir
-from mudg.base.types import Condition, FusedCloud, Observation, Photo, RenderPlanes, Scene, Track, Trajectory, View
+from mudg.base.types import Condition, FusedCloud, Observation, Photo, RenderPlanes, Scene, Trajectory, View
 from mudg.core import trajectory
 from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
 from mudg.core.raster.cpu import release_memory
 from mudg.diffusion import model_files, published
-from mudg.diffusion.condition import (
-    FAR_M,
-    ConditionRules,
-    InWeather,
-    PreparedImages,
-    RenderAt,
-    VacatedAt,
-    WarpSource,
-    WeatheredPoints,
-    build_conditions,
-)
+from mudg.diffusion.condition import FAR_M, ConditionRules, DriveInputs, PreparedImages, WarpSource, build_conditions
 from mudg.diffusion.model import MDM
-from mudg.diffusion.model_files import is_published
+from mudg.diffusion.model_files import Model, generated, is_published
 from mudg.diffusion.published import PublishedMDM, WorkSplit
-from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated, half_format
+from mudg.diffusion.requests import GeneratedClip, SampleRequest, half_format
 from mudg.diffusion.settings import SynthesizeConfig
-from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import render_planes
 from mudg.gaussians.storage import load_model
 from mudg.networks.codec import Modality
@@ -70,46 +59,25 @@ COVERED = 0.5
 """Opacity above which a render covers a pixel."""
 
 
-@dataclass(frozen=True, slots=True)
-class ConditionSources:
-    """What conditions of a scene are made of: its clouds and tracks, recorded images, rules, and renders of a fit, if
-    there is one; of an edited drive also where something stood that is not there any more, and, for published-type
-    models, its weather."""
-
-    cloud: FusedCloud
-    tracks: Sequence[Track]
-    recorded: Sequence[Photo]
-    rules: ConditionRules
-    render_at: RenderAt | None = None
-    vacated_at: VacatedAt | None = None
-    weather: InWeather | None = None
-
-
 def conditions_of(
-    sources: ConditionSources, parts: ConditionParts, views: Sequence[View], kept: dict[int, WarpSource]
+    drive: DriveInputs, parts: ConditionParts, views: Sequence[View], rules: ConditionRules, kept: dict[int, WarpSource]
 ) -> tuple[Condition, Condition]:
     """The model's condition for ``views`` with only some of its parts, and the same on the fine grid. kept: recorded
     images that are prepared already (see ``build_conditions``)."""
-    rules = sources.rules
-    cloud, tracks, recorded = sources.cloud, sources.tracks, sources.recorded
     if parts == "full":
-        how, render_at, recolor = sources.weather, sources.render_at, None
-        if rules.published and how is not None and render_at is not None:
-            recolor = WeatheredPoints(how, render_at)
-        return build_conditions(
-            cloud, tracks, views, recorded, rules, kept, render_at, sources.vacated_at, recolor=recolor
-        )
+        return build_conditions(drive, views, rules, kept)
     if parts == "repair":
-        return _of_renders(sources, views, kept)
+        return _of_renders(drive, views, rules, kept)
+    drive = replace(drive, render_at=None, vacated_at=None)
     if rules.published:
-        whole = build_conditions(cloud, tracks, views, recorded, rules, kept)[0]
+        whole = build_conditions(drive, views, rules, kept)[0]
         if parts == "reference":
             whole = replace(whole, valid=torch.zeros_like(whole.valid), measured=None)
         else:
             whole = replace(whole, reference_in="frame" if parts == "concat" else "nowhere")
         return whole, whole
     bare = replace(rules, warp=False) if parts == "points" else replace(rules, images_per_view=0)
-    built = build_conditions(cloud, tracks, views, recorded, bare, kept)
+    built = build_conditions(drive, views, bare, kept)
     if parts != "reference":
         return built
     small, fine = (
@@ -126,18 +94,17 @@ def conditions_of(
 
 
 def _of_renders(
-    sources: ConditionSources, views: Sequence[View], kept: dict[int, WarpSource]
+    drive: DriveInputs, views: Sequence[View], rules: ConditionRules, kept: dict[int, WarpSource]
 ) -> tuple[Condition, Condition]:
     """Renders in the place of points, none of them measured, and the nearest recorded image. Where a render covers a
     pixel it counts as a recorded image that was warped there: it is the picture that is repaired."""
-    if sources.render_at is None:
+    if drive.render_at is None:
         raise UsageError("this condition needs renders of a fitted scene", got="repair")
-    rules, static = replace(sources.rules, images_per_view=1), sources.cloud.static
+    static = drive.cloud.static
     labels = None if static.semantics is None else static.semantics[:0]
-    empty = FusedCloud(
-        replace(static, xyz=static.xyz[:0], rgb=static.rgb[:0], semantics=labels), {}, sources.cloud.colors
-    )
-    built = build_conditions(empty, (), views, sources.recorded, rules, kept, sources.render_at)
+    none = replace(static, xyz=static.xyz[:0], rgb=static.rgb[:0], semantics=labels)
+    empty = replace(drive, cloud=FusedCloud(none, {}, drive.cloud.colors), tracks=(), vacated_at=None)
+    built = build_conditions(empty, views, replace(rules, images_per_view=1), kept)
     renders = [cast("RenderPlanes", c.renders) for c in built]
     small, fine = (
         replace(
@@ -157,7 +124,6 @@ def _of_renders(
 
 
 FEW_STEPS = 20
-DiffusionModel = MDM | PublishedMDM
 
 
 def check_config(config: SynthesizeConfig, fitted: bool, *, weather: bool = False) -> SynthesizeConfig:
@@ -243,13 +209,10 @@ def half_of(config: SynthesizeConfig) -> torch.dtype | None:
     return half_format(config.precision, device, float16=is_published(config.model))
 
 
-def load_any(config: SynthesizeConfig) -> DiffusionModel:
-    """The model of a configuration.
-
-    On another device than the CPU a published-type model has its weights in the number format that `precision` says.
-    Its work is cut to fit `memory_budget_gb`, or, without one, what is free on a CUDA device.
-
-    ResourceError: it does not fit however it is cut, or no such device."""
+def load_any(config: SynthesizeConfig) -> Model:
+    """The model of a configuration. On another device than the CPU a published-type model has its weights in the number
+    format that `precision` says. Its work is cut to fit `memory_budget_gb`, or, without one, what is free on a CUDA
+    device. ResourceError: it does not fit however it is cut, or no such device."""
     device = choose_device(config.device, "diffusion model", NETWORK_KINDS)
     if not is_published(config.model):
         return model_files.load(config.model).to(device)
@@ -324,33 +287,33 @@ def recorded_images(scene: Scene, config: SynthesizeConfig) -> list[Photo]:
 
 
 class ViewMaker:
-    """Conditions, samples and observations of one scene at one size. images: recorded images that were prepared before,
-    for views of this size."""
+    """Conditions, samples and observations of one drive at one size. scratch: a folder for what is large (None: it
+    stays in memory)."""
 
     def __init__(
-        self, model: DiffusionModel, sources: ConditionSources, config: SynthesizeConfig, images: PreparedImages
+        self, model: Model, drive: DriveInputs, rules: ConditionRules, config: SynthesizeConfig, scratch: Path | None
     ) -> None:
-        if not sources.recorded:
+        if not drive.recorded:
             log.warn("synthesize: no recorded image is available; holes are filled with the nearest point's colour")
-        self._model, self._given, self._full_size = model, sources, config.full_size
+        self._model, self._drive, self._rules, self._full_size = model, drive, rules, config.full_size
         self._parts: ConditionParts = config.condition
-        self._images = images
+        self._images = drive.images.setdefault(rules.fine, PreparedImages(scratch))
         self._request = request_of(config, half_of(config) == torch.bfloat16)
 
     def sized(self, view: View) -> View:
         """The view at the size that is written."""
-        return view if self._full_size else view.resized(*self._given.rules.size)
+        return view if self._full_size else view.resized(*self._rules.size)
 
     def make(
         self, views: Sequence[View], number: int, known: dict[Modality, Tensor] | None
     ) -> tuple[GeneratedClip, Condition, list[Observation]]:
         """Sample window `number` at `views`; `known` latents [k,C,h,w] fix its first k frames."""
-        condition, fine = conditions_of(self._given, self._parts, views, self._images)
+        condition, fine = conditions_of(self._drive, self._parts, views, self._rules, self._images)
         release_memory()  # of renders for the condition: the model needs more than they do
         request = replace(self._request, index=number, known=known)
         sample, made, made_views = self._generated(condition, fine, views, request)
         usable = torch.ones_like(made.confidence, dtype=torch.bool)
-        if self._model.points_alone and not recorded_at_pose(views[0], self._given.recorded):
+        if self._model.points_alone and not recorded_at_pose(views[0], self._drive.recorded):
             usable[0] = False
         trust = made.confidence * usable
         source, nothing = source_of(self._parts), [None] * len(made_views)
@@ -383,11 +346,9 @@ def without_sky_depth(clip: GeneratedClip, condition: Condition) -> GeneratedCli
 
 
 def recorded_at_pose(view: View, recorded: Sequence[Photo]) -> bool:
-    """Whether a recorded image was taken where `view` is (to 5 cm and 10 mrad).
-
-    The published model puts the reference, as it was recorded, into frame 0 of a window. On a shifted trajectory that
-    frame is a picture from another place, and must not be used as if it were one from there.
-    """
+    """Whether a recorded image was taken where `view` is (to 5 cm and 10 mrad). The published model puts the reference,
+    as it was recorded, into frame 0 of a window. On a shifted trajectory that frame is a picture from another place,
+    and must not be used as if it were one from there."""
     moves = (image.view.cam_from_world @ view.world_from_cam for image in recorded)
     return any(np.linalg.norm(m[:3, 3]) < 0.05 and np.abs(m[:3, :3] - np.eye(3)).max() < 0.01 for m in moves)
 
@@ -396,12 +357,9 @@ def enlarge(
     clip: GeneratedClip, size: tuple[int, int], conditions: tuple[Condition, Condition] | None
 ) -> GeneratedClip:
     """A clip at the size (height, width): colour bicubic, depth f32[T,1,h,w] (NaN = none) and classes nearest,
-    confidence bilinear.
-
-    With the clip's condition and the same at the new size, detail is put back: in colour by `add_detail`; the fine
-    measured depth where it is within a tenth of the generated one; and the fine class where the clip has it in that
-    pixel or beside it.
-    """
+    confidence bilinear. With the clip's condition and the same at the new size, detail is put back: in colour by
+    `add_detail`; the fine measured depth where it is within a tenth of the generated one; and the fine class where the
+    clip has it in that pixel or beside it."""
     nearest = lambda x: functional.interpolate(x, size=size, mode="nearest-exact")
     depth, ids = nearest(clip.depth), nearest(clip.semantics.unsqueeze(1).float())[:, 0].long()
     if conditions is None:
@@ -433,11 +391,9 @@ def finer_classes(enlarged: Tensor, generated: Tensor, given: Tensor) -> Tensor:
 
 def add_detail(rgb: Tensor, small: Condition, full: Condition) -> Tensor:
     """Enlarge generated colour f32[T,3,h,w] to the size of `full`, with the detail that the warped images have there.
-
     Where the generated colour agrees with the small condition, the finer structure of the full condition (its
     difference from its own reduced copy) is added; the weight falls with the disagreement, to nothing at a difference
-    of 0.12.
-    """
+    of 0.12."""
     size = full.color.shape[-2:]
     larger = lambda x: functional.interpolate(x, size=size, mode="bicubic", align_corners=False)
     reduced = functional.interpolate(full.color, size=rgb.shape[-2:], mode="area")
@@ -462,20 +418,6 @@ lie in files (4.5 GiB before)."""
 WINDOW_FRAMES = 8
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DriveInputs:
-    """What all trajectories are made from, read; ``images``: the recorded ones, as they have been prepared for views of
-    a size."""
-
-    scene: Scene
-    cloud: FusedCloud
-    recorded: list[Photo]
-    fit: SceneModel | None = None
-    vacated: VacatedAt | None = None
-    weather: InWeather | None = None
-    images: dict[tuple[int, int], PreparedImages] = field(default_factory=dict)
-
-
 @dataclass(frozen=True, slots=True)
 class JobInputs:
     """What every trajectory is made from: folders of the scene, its fused clouds and its fit. edited: reads an edited
@@ -491,8 +433,8 @@ class JobInputs:
 def recorded_drive(config: SynthesizeConfig, inputs: JobInputs) -> DriveInputs:
     """The drive as it was recorded; the same for the next trajectory of a run, which forgets it at its end."""
     scene = read_scene(inputs.scene)
-    fit = None if inputs.fitted is None else load_model(inputs.fitted)
-    return DriveInputs(scene, read_fused(inputs.fused), recorded_images(scene, config), fit)
+    render_at = None if inputs.fitted is None else functools.partial(render_planes, load_model(inputs.fitted))
+    return DriveInputs(read_fused(inputs.fused), scene.tracks, recorded_images(scene, config), render_at)
 
 
 def write_views(config: SynthesizeConfig, inputs: JobInputs, loaded: Scene, work: RunDir) -> dict[str, Any]:
@@ -560,7 +502,7 @@ def without_classes(cloud: FusedCloud) -> FusedCloud:
 
 
 def make_trajectory(
-    config: SynthesizeConfig, inputs: JobInputs, out: Path, path: Trajectory, model: DiffusionModel | None = None
+    config: SynthesizeConfig, inputs: JobInputs, out: Path, path: Trajectory, model: Model | None = None
 ) -> int:
     """Generate one trajectory and write its folder; returns the number of views. Continues an interrupted one. `model`:
     that of the configuration, if it is in memory already."""
@@ -616,19 +558,15 @@ def make_trajectory(
 
 
 def view_maker(
-    config: SynthesizeConfig, inputs: JobInputs, views: Sequence[View], model: DiffusionModel, scratch: Path | None
+    config: SynthesizeConfig, inputs: JobInputs, views: Sequence[View], model: Model, scratch: Path | None
 ) -> ViewMaker:
     """What makes the views of one path; ``scratch``: a folder for what is large (None: it stays in memory)."""
     drive = recorded_drive(config, inputs) if inputs.edited is None else inputs.edited(config, inputs)
-    cloud = drive.cloud if config.given_classes else without_classes(drive.cloud)
+    drive = drive if config.given_classes else replace(drive, cloud=without_classes(drive.cloud))
     camera = views[0].camera
     width, height = model.image_size(camera.width, camera.height, config.width_px)
     model.check_clip(min(len(views), model.config.window), height, width)
     fine = (camera.width, camera.height) if config.full_size or model.points_alone else (2 * width, 2 * height)
     rules = ConditionRules(width, height, *fine, published=model.points_alone)
     rules = rules if inputs.edited is None else replace(rules, images_per_view=EDITED_IMAGES_PER_VIEW)
-    render_at = None if drive.fit is None else functools.partial(render_planes, drive.fit)
-    sources = ConditionSources(
-        cloud, drive.scene.tracks, drive.recorded, rules, render_at, drive.vacated, drive.weather
-    )
-    return ViewMaker(model, sources, config, drive.images.setdefault(fine, PreparedImages(scratch)))
+    return ViewMaker(model, drive, rules, config, scratch)

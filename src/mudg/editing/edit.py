@@ -27,10 +27,10 @@ from mudg.core import lidar
 from mudg.core.edit import Motion
 from mudg.core.pictures import to_bytes
 from mudg.core.raster.rasterize import RasterConfig, drawing_device
-from mudg.diffusion.condition import Vacated, VacatedAt, ray_directions
+from mudg.diffusion.condition import DriveInputs, Vacated, VacatedAt, ray_directions
 from mudg.diffusion.model_files import is_published
 from mudg.diffusion.settings import SynthesizeConfig
-from mudg.diffusion.views import DriveInputs, JobInputs, recorded_images
+from mudg.diffusion.views import JobInputs, recorded_images
 from mudg.editing.apply import EditedDrive, carry_out, drawer, some_points, weather_of
 from mudg.editing.model import FLOOR_M, GROUND_CLASSES, STRAY_M
 from mudg.editing.plan import Actor, EditPlan
@@ -38,7 +38,7 @@ from mudg.editing.runs import RunParts
 from mudg.editing.script import EditScript, conditions_of
 from mudg.editing.settings import EditConfig
 from mudg.gaussians.model import SceneModel
-from mudg.gaussians.rendering import raster_of, render_view
+from mudg.gaussians.rendering import raster_of, render_planes, render_view
 from mudg.gaussians.storage import load_model, model_of_scene, save_model
 from mudg.scene.clouds import read_fused, write_fused
 from mudg.scene.labels import read_label
@@ -440,8 +440,7 @@ def edited_scene(script: EditScript, config: SynthesizeConfig, inputs: JobInputs
 
 
 def edited_drive(script: EditScript, config: SynthesizeConfig, inputs: JobInputs) -> DriveInputs:
-    """The drive as the script leaves it: its scene, clouds and fit, recorded images without what they show wrongly, and
-    its weather."""
+    """The drive as the script leaves it: clouds, fit, recorded images without what they show wrongly, and weather."""
     scene, cloud = read_scene(inputs.scene), read_fused(inputs.fused)
     fit = None if inputs.fitted is None else load_model(inputs.fitted)
     drive = carry_out(script, fit, scene, cloud)
@@ -450,7 +449,8 @@ def edited_drive(script: EditScript, config: SynthesizeConfig, inputs: JobInputs
     if conditions is not None and fit is not None and shows_weather(config, script, True):
         weather = weather_of(drawer(fit), conditions, edited)
     recorded, cloud = photos_of_edited(recorded_images(scene, config), drive.plan), drive.cloud or cloud
-    return DriveInputs(edited, cleared_cloud(cloud, drive.plan), recorded, fit, vacated_at(drive.plan), weather)
+    shown, cloud = None if fit is None else functools.partial(render_planes, fit), cleared_cloud(cloud, drive.plan)
+    return DriveInputs(cloud, edited.tracks, recorded, shown, vacated_at(drive.plan), weather)
 
 
 def shows_weather(config: SynthesizeConfig, script: EditScript, fitted: bool) -> bool:

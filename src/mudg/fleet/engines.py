@@ -1,7 +1,7 @@
 """Engines: who runs the scenes of a batch. Threads of this process, tasks of a Ray cluster, or an array job of Slurm,
 through submitit.
 
-Scheduling, retries of lost workers and requeueing belong to the engine. All of them call ``run_scene``, which does only
+Scheduling, retries of lost workers and requeueing belong to the engine. All of them call ``Job.run``, which does only
 what is missing.
 """
 
@@ -21,7 +21,7 @@ from mudg.base.errors import ResourceError, UsageError
 from mudg.fleet.plan import Entry
 from mudg.fleet.records import Ended
 from mudg.fleet.settings import BatchConfig
-from mudg.fleet.work import LOST, Job, Stop, run_scene
+from mudg.fleet.work import LOST, Job, Stop
 
 Tell = Callable[[Ended], None]
 _LOST_NODES: Final = 20
@@ -45,7 +45,7 @@ class LocalRun:
 
     def run(self, tell: Tell) -> None:
         """Do them all. Ctrl-C and SIGTERM stop steps with a checkpoint, a second one at once: KeyboardInterrupt."""
-        steps_of = lambda entry: [] if self.stop.asked else run_scene(self.job, entry, self.stop)
+        steps_of = lambda entry: [] if self.stop.asked else self.job.run(entry, self.stop)
         with concurrent.futures.ThreadPoolExecutor(self.jobs) as pool:
             try:
                 self._scenes = [pool.submit(steps_of, entry) for entry in self.entries]
@@ -110,7 +110,7 @@ def run_on_ray(job: Job, entries: Sequence[Entry], batch: BatchConfig, tell: Tel
 
 def _ray_task(job: Job, entry: Entry) -> list[Ended]:
     log.set_quiet(True)
-    return run_scene(job, entry, Stop(job.grace_s))
+    return job.run(entry, Stop(job.grace_s))
 
 
 # Slurm --------------------------------------------------------------------------------------------

@@ -42,6 +42,32 @@ class Entry:
     source: str
     settings: Mapping[str, str] = field(default_factory=dict)
 
+    @classmethod
+    def of_line(cls, line: str, where: str, folder: Path, settings: Sequence[str]) -> Entry | None:
+        """What a line says; None if it says nothing. where: its place, for messages. folder: that of the list.
+        settings: those that a line may give. InputError: malformed. UsageError: an address."""
+        try:
+            words = shlex.split(line, comments=True)
+        except ValueError as error:
+            raise InputError("cannot parse the line", where=where, got=line[:80]) from error
+        if not words:
+            return None
+        given: dict[str, str] = {}
+        for word in words[1:]:
+            key, separator, value = word.partition("=")
+            if not separator or key not in ("name", *settings):
+                got, expected = word[:80], ", ".join(f"{key}=..." for key in ("name", *settings))
+                remedy = "put quotes around a path with spaces"
+                raise InputError("unknown setting in the line", where=where, got=got, expected=expected, remedy=remedy)
+            given[key] = os.path.abspath(value) if key in ("poses", "boxes") and os.path.exists(value) else value
+        refuse_address(words[0], where)
+        source = CITY if words[0] == CITY else os.path.abspath(folder / Path(words[0]).expanduser())
+        name = given.pop("name", "") or Path(source).name
+        if not NAME_PATTERN.fullmatch(name) or name == BOOKKEEPING:
+            what, remedy = "name cannot be a folder name", "add name=NAME to the line"
+            raise InputError(what, where=where, got=name[:80], remedy=remedy)
+        return cls(name, source, given)
+
 
 def read_list(listed: Path, settings: Sequence[str] = ()) -> list[Entry]:
     """Entries of a list file, or one for each entry of a folder (but for what an earlier run over a list wrote there).
@@ -56,39 +82,14 @@ def read_list(listed: Path, settings: Sequence[str] = ()) -> list[Entry]:
         folder = listed.parent
     entries: dict[str, Entry] = {}
     for where, line in lines:
-        entry = _entry(line, where, folder, settings)
-        if entry is None:
-            continue
-        if (other := entries.setdefault(entry.name, entry)) is not entry:
+        entry = Entry.of_line(line, where, folder, settings)
+        if entry is not None and (other := entries.setdefault(entry.name, entry)) is not entry:
             what = "two entries would write the same folder"
             remedy = f"give one of them another name: SOURCE name={entry.name}-2"
             raise InputError(what, where=str(listed), got=f"{other.source} and {entry.source}", remedy=remedy)
     if not entries:
         raise InputError("the list is empty", where=str(listed), expected="one source per line")
     return list(entries.values())
-
-
-def _entry(line: str, where: str, folder: Path, settings: Sequence[str]) -> Entry | None:
-    try:
-        words = shlex.split(line, comments=True)
-    except ValueError as error:
-        raise InputError("cannot parse the line", where=where, got=line[:80]) from error
-    if not words:
-        return None
-    given: dict[str, str] = {}
-    for word in words[1:]:
-        key, separator, value = word.partition("=")
-        if not separator or key not in ("name", *settings):
-            got, expected = word[:80], ", ".join(f"{key}=..." for key in ("name", *settings))
-            remedy = "put quotes around a path with spaces"
-            raise InputError("unknown setting in the line", where=where, got=got, expected=expected, remedy=remedy)
-        given[key] = os.path.abspath(value) if key in ("poses", "boxes") and os.path.exists(value) else value
-    refuse_address(words[0], where)
-    source = CITY if words[0] == CITY else os.path.abspath(folder / Path(words[0]).expanduser())
-    name = given.pop("name", "") or Path(source).name
-    if not NAME_PATTERN.fullmatch(name) or name == BOOKKEEPING:
-        raise InputError("name cannot be a folder name", where=where, got=name[:80], remedy="add name=NAME to the line")
-    return Entry(name, source, given)
 
 
 def refuse_address(text: str, where: str) -> None:
@@ -142,8 +143,12 @@ class BatchStage:
 
     name: str
     words: tuple[str, ...]
-    needs: tuple[str, ...] = ()
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    needs: tuple[str, ...]
+    settings: Mapping[str, Any]
+
+    def record(self) -> dict[str, Any]:
+        """As JSON values, without devices: results do not depend on them."""
+        return {**asdict(self), "settings": without_devices(self.settings)}
 
 
 @dataclass(frozen=True)
@@ -167,6 +172,25 @@ class Unit:
         """For messages."""
         return f"{self.entry.name} {self.stage.name}"
 
+    def command(self, places: Mapping[str, str], out: str, config: str) -> list[str]:
+        """The command line. places: ``source`` and steps -> where they lie. out: folder to write. config: file of the
+        step's settings, if it has any."""
+        filled, name = {**places, "out": out, "name": self.entry.name}, self.stage.name
+        words = [_PLACEHOLDER.sub(lambda match: filled.get(match[1], match[0]), word) for word in self.stage.words]
+        if name == COMMAND:
+            return words
+        settings = ["--config", config] if config else []
+        words = [sys.executable, "-m", "mudg", *words, "--out", out, "--quiet", *settings]
+        if name not in ("ingest", "run"):
+            return words
+        group = "ingest." if name == "run" else ""
+        for setting, value in self.entry.settings.items():
+            if setting == "cameras":
+                words += [f"--{group}cameras", *value.split(",")]
+            else:
+                words.append(f"--{group}{'city.' if setting == 'seed' else ''}{setting}={value}")
+        return words
+
 
 @dataclass(frozen=True)
 class BatchPlan:
@@ -176,7 +200,7 @@ class BatchPlan:
 
     def record(self) -> dict[str, Any]:
         """As JSON values: what must be the same for all who work on a batch."""
-        stages = [{**asdict(stage), "settings": without_devices(stage.settings)} for stage in self.stages]
+        stages = [stage.record() for stage in self.stages]
         return {"schema": 1, "version": version(), "rules": RULES_VERSION, "stages": stages}
 
     def units(self, entry: Entry) -> Iterator[Unit]:
@@ -224,22 +248,3 @@ def plan_of(
     if len(set(names)) < len(names) or not names:
         raise UsageError("each step at most once, and at least one", where="--stages", got=" ".join(names))
     return BatchPlan(tuple(stages))
-
-
-def command_of(unit: Unit, places: Mapping[str, str], out: str, config: str) -> list[str]:
-    """The command line of a step of a scene. places: ``source`` and steps -> where they lie. out: folder to write.
-    config: file of its settings, if it has any."""
-    filled, name = {**places, "out": out, "name": unit.entry.name}, unit.stage.name
-    words = [_PLACEHOLDER.sub(lambda match: filled.get(match[1], match[0]), word) for word in unit.stage.words]
-    if name == COMMAND:
-        return words
-    words = [sys.executable, "-m", "mudg", *words, "--out", out, "--quiet", *(["--config", config] if config else [])]
-    if name not in ("ingest", "run"):
-        return words
-    group = "ingest." if name == "run" else ""
-    for setting, value in unit.entry.settings.items():
-        if setting == "cameras":
-            words += [f"--{group}cameras", *value.split(",")]
-        else:
-            words.append(f"--{group}{'city.' if setting == 'seed' else ''}{setting}={value}")
-    return words

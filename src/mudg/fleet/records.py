@@ -21,9 +21,8 @@ import re
 import socket
 import subprocess
 import time
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar
 
@@ -269,64 +268,47 @@ def _contents(folder: Path, names: Sequence[str]) -> Iterator[tuple[Path, bytes]
 # how far a batch is --------------------------------------------------------------------------------
 
 _SHOWN: Final = 12
+_NOTHING: Final[Mapping[str, Any]] = dict.fromkeys("done failed left seconds written_bytes peak_bytes".split(), 0) | {
+    "seconds": 0.0,
+    "core_hours": 0.0,
+    "core_hours_left": 0.0,
+}
+"""Figures of a step over all scenes."""
 _HEADS: Final = "step,done,failed,left,seconds each,most memory,written,core-hours,still needed".split(",")
 
 
-@dataclass(slots=True)
-class StageFigures:
-    """Figures of one step over all scenes. left: scenes that can still come to it: all but those that failed before.
-    core_hours: those of attempts that failed as well; core_hours_left: if the rest takes as much as what is done."""
-
-    done: int = 0
-    failed: int = 0
-    left: int = 0
-    seconds: float = 0.0
-    written_bytes: int = 0
-    peak_bytes: int = 0
-    core_hours: float = 0.0
-    core_hours_left: float = 0.0
-
-
 def read_status(folder: BatchFolder) -> dict[str, Any]:
-    """The state of a batch as JSON values. InputError: no batch is there, or a record of it is damaged."""
-    stages = {name: StageFigures() for name in folder.stages()}
+    """The state of a batch as JSON values. Of each step: left: scenes that can still come to it: all but those that
+    failed before. core_hours: those of attempts that failed as well; core_hours_left: if the rest takes as much as what
+    is done. reasons: of failures, with their number and an example, the most frequent first. InputError: no batch is
+    there, or a record of it is damaged."""
+    stages: dict[str, dict[str, Any]] = {name: dict(_NOTHING) for name in folder.stages()}
     drivers, scenes = [str(owner) for owner in folder.owners().values()], len(folder.scenes())
-    failures: list[Ended] = []
-    for kind in ("done", "failed"):
-        for ended in folder.records(kind):
-            if (one := stages.get(ended.stage)) is None:
-                continue
-            one.core_hours += ended.lost_s / 3600
-            if kind == "failed":
-                one.failed += 1
-                failures.append(ended)
-                continue
-            one.done += 1
-            one.seconds += ended.seconds
-            one.core_hours += ended.processor_s / 3600
-            one.written_bytes += ended.written_bytes
-            one.peak_bytes = max(one.peak_bytes, ended.peak_bytes or 0)
-    failed = 0
+    for done in folder.records("done"):
+        if (one := stages.get(done.stage)) is not None:
+            one["done"] += 1
+            one["seconds"] += done.seconds
+            one["written_bytes"] += done.written_bytes
+            one["peak_bytes"] = max(one["peak_bytes"], done.peak_bytes or 0)
+            one["core_hours"] += (done.processor_s + done.lost_s) / 3600
+    reasons: dict[str, list[str]] = {}
+    for failed in sorted(folder.records("failed"), key=lambda one: one.scene):
+        if (one := stages.get(failed.stage)) is not None:
+            one["failed"] += 1
+            one["core_hours"] += failed.lost_s / 3600
+            ended = f"ended by signal {failed.code - 128}" if failed.code > 128 else f"exit code {failed.code}"
+            reason = f"{failed.code} {REASONS.get(failed.code, ended)}: {failed.words.split(';')[0][:80]}"
+            reasons.setdefault(reason, []).append(f"{failed.scene} {failed.stage}")
+    all_failed = 0
     for one in stages.values():
-        failed += one.failed
-        one.left = max(0, scenes - failed - one.done)
-        one.core_hours_left = one.core_hours / one.done * one.left if one.done else 0.0
-    figures = {name: {key: round(value, 4) for key, value in asdict(one).items()} for name, one in stages.items()}
-    left, finished = sum(one.left for one in stages.values()), next(reversed(stages.values())).done
-    state = {"out": str(folder.out), "scenes": scenes, "finished": finished, "left": left, "stages": figures}
-    return {**state, "reasons": _reasons(failures), "drivers": drivers}
-
-
-def _reasons(failures: list[Ended]) -> list[dict[str, Any]]:
-    """Reasons of failures with their number and an example, the most frequent first."""
-    groups: Counter[str] = Counter()
-    examples: dict[str, str] = {}
-    for one in sorted(failures, key=lambda one: one.scene):
-        ended = f"ended by signal {one.code - 128}" if one.code > 128 else f"exit code {one.code}"
-        reason = f"{one.code} {REASONS.get(one.code, ended)}: {one.words.split(';')[0][:80]}"
-        groups[reason] += 1
-        examples.setdefault(reason, f"{one.scene} {one.stage}")
-    return [{"reason": reason, "steps": count, "example": examples[reason]} for reason, count in groups.most_common()]
+        all_failed += one["failed"]
+        one["left"] = max(0, scenes - all_failed - one["done"])
+        one["core_hours_left"] = one["core_hours"] / one["done"] * one["left"] if one["done"] else 0.0
+        one |= {name: round(value, 4) for name, value in one.items()}
+    left, finished = sum(one["left"] for one in stages.values()), next(reversed(stages.values()))["done"]
+    state = {"out": str(folder.out), "scenes": scenes, "finished": finished, "left": left, "stages": stages}
+    listed = [{"reason": reason, "steps": len(of), "example": of[0]} for reason, of in reasons.items()]
+    return {**state, "reasons": sorted(listed, key=lambda one: -one["steps"]), "drivers": drivers}
 
 
 def text_of(state: dict[str, Any]) -> str:

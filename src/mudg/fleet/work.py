@@ -32,7 +32,7 @@ from mudg.base import failures, log, processes, store
 from mudg.base.errors import InputError, IntegrityError, MudgError, ResourceError, UsageError
 from mudg.base.memory import folder_bytes
 from mudg.base.run_folder import fcntl
-from mudg.fleet.plan import COMMAND, BatchPlan, Entry, Unit, command_of
+from mudg.fleet.plan import COMMAND, BatchPlan, Entry, Unit
 from mudg.fleet.records import ASKED_TO_STOP, KILLED, BatchFolder, Ended
 
 # the process of a step: started, watched, asked to stop, and its last words ---------------------------
@@ -193,20 +193,20 @@ class Job:
     threads: int = 1
     grace_s: float = 100.0
 
-
-def run_scene(job: Job, entry: Entry, stop: Stop) -> list[Ended]:
-    """Do the steps of a scene that are not on record yet, until one fails or work is to stop; returns their ends."""
-    ended: list[Ended] = []
-    for unit in job.plan.units(entry):
-        if job.folder.record("done", unit.key).exists():
-            continue
-        if job.folder.record("failed", unit.key).exists():
-            break
-        ended.append(_Step(job, unit, stop).run())
-        if ended[-1].state != DONE:
-            log.warn(f"{unit.title} {ended[-1].state}: {ended[-1].words or 'the same command goes on'}")
-            break
-    return ended
+    def run(self, entry: Entry, stop: Stop) -> list[Ended]:
+        """Do the steps of a scene that are not on record yet, until one fails or work is to stop; returns their
+        ends."""
+        ended: list[Ended] = []
+        for unit in self.plan.units(entry):
+            if self.folder.record("done", unit.key).exists():
+                continue
+            if self.folder.record("failed", unit.key).exists():
+                break
+            ended.append(_Step(self, unit, stop).run())
+            if ended[-1].state != DONE:
+                log.warn(f"{unit.title} {ended[-1].state}: {ended[-1].words or 'the same command goes on'}")
+                break
+        return ended
 
 
 def is_open(plan: BatchPlan, entry: Entry, done: set[str], failed: set[str]) -> bool:
@@ -315,7 +315,7 @@ class _Step:
     def _run_command(self, alone: bool) -> Ending:
         unit, threads = self._unit, 1 if alone else self._job.threads
         places = {"source": unit.entry.source, **{name: f"inputs/{name}" for name in unit.needs}}
-        words = command_of(unit, places, _RESULT, _SETTINGS if unit.stage.settings else "")
+        words = unit.command(places, _RESULT, _SETTINGS if unit.stage.settings else "")
         ending = run_step(words, self._path, threads, self._stop, alone=alone)
         # of another state of the source
         own = unit.stage.name == COMMAND

@@ -19,7 +19,7 @@ from mudg.base.types import Gaussians, View
 from mudg.core import losses
 from mudg.core.harmonics import left_product_matrix
 from mudg.core.raster.rasterize import RasterConfig, rasterize
-from mudg.core.table import AdamKernel, Table
+from mudg.core.table import Table
 from mudg.gaussians import nodes
 from mudg.gaussians.model import SceneModel, compose_as_read, composite_sky
 from mudg.gaussians.nodes import RigidNode
@@ -105,12 +105,12 @@ class Appearance:
         affine = self.tables[COLOR]["affine"]
         return affine[row] - affine.mean(0)
 
-    def adam_step(self, step: int, rates: Mapping[str, float], kernel: AdamKernel) -> None:
+    def adam_step(self, step: int, rates: Mapping[str, float]) -> None:
         """One Adam step on the rows that have a gradient (the others rest), then gradients are dropped."""
         for table in self.tables.values():
             gradients = [gradient.flatten(1).abs().sum(1) for gradient in table.gradients().values()]
             if gradients:
-                table.adam_step(step, rates, kernel, torch.stack(gradients).sum(0) > 0)
+                table.adam_step(step, rates, torch.stack(gradients).sum(0) > 0)
             table.clear_gradients()
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -203,88 +203,79 @@ def refine_poses(
     model: SceneModel, views: Sequence[StoredView], raster: RasterConfig, appearance: Appearance = UNCORRECTED
 ) -> float:
     """One round for every node that learns its pose, in place. Returns root mean square of the moves, metres."""
-    rigid = {index: node for index, node in enumerate(model.nodes) if isinstance(node, RigidNode)}
-    learning = {index: node for index, node in rigid.items() if node.learn_pose}
+    learning = {i: node for i, node in enumerate(model.nodes) if isinstance(node, RigidNode) and node.learn_pose}
     evidence = {index: PoseEvidence(len(node.times_s)) for index, node in learning.items()}
     for stored in views:
         shown = _outlines(learning, stored)
-        outlines = {index: mask.to(model.device, non_blocking=True) for index, mask in shown.items()}
-        if outlines:
-            _add_evidence(model, stored, outlines, evidence, raster, appearance)
+        if shown:
+            _add_evidence(model, stored, shown, evidence, raster, appearance)
     moves = [_move(node, evidence[index]) for index, node in learning.items() if evidence[index].views]
     return float(np.sqrt(np.mean(np.concatenate(moves) ** 2))) if moves else 0.0
 
 
-def _outlines(learning: dict[int, RigidNode], stored: StoredView) -> dict[int, Tensor]:
-    """Bool[H, W] per node index: pixels inside the outline of its box that may be used; objects that show too few are
-    left out."""
-    found = {}
+Outlines = dict[int, tuple[NDArray[np.float64], NDArray[np.bool_]]]
+"""By node index: the pose of an object, and bool[H, W], pixels inside the outline of its box that may be used."""
+
+
+def _outlines(learning: dict[int, RigidNode], stored: StoredView) -> Outlines:
+    """The objects that show enough pixels in a view."""
+    found: Outlines = {}
     for index, node in learning.items():
         pose = node.pose_matrix(stored.view.time_s)
         mask = None if pose is None else outline_mask(stored.view, pose, node.size_m)
-        if mask is None:
+        if pose is None or mask is None:
             continue
         if stored.mask is not None:
             mask = mask & stored.mask
         if mask.sum() >= FEWEST_PX:
-            found[index] = torch.from_numpy(mask)
+            found[index] = pose, mask
     return found
 
 
 def _add_evidence(
     model: SceneModel,
     stored: StoredView,
-    outlines: dict[int, Tensor],
+    shown: Outlines,
     evidence: dict[int, PoseEvidence],
     raster: RasterConfig,
     appearance: Appearance,
 ) -> None:
     """Add what one recorded view tells about the objects in it."""
-    time_s = stored.view.time_s
     here = compose_as_read(model, stored.view, stored.readout, semantics=False)
-    rows = {index: (here.node == index).nonzero()[:, 0] for index in outlines}
-    poses = {index: model.nodes[index].pose_matrix(time_s) for index in outlines}
-    color = _picture(model, here, stored, raster, appearance)
+    poses = {index: pose for index, (pose, _) in shown.items()}
+
+    def picture(gaussians: Gaussians) -> Tensor:
+        """Blurred colour ``[3, H, W]``."""
+        pose = appearance.world_from_cam(stored.view, stored.name)
+        drawn = rasterize(gaussians, stored.view, raster, world_from_cam=pose)
+        rgb = composite_sky(model, stored.view, drawn.rgb, drawn.alpha)
+        return _blurred(appearance.colored(rgb, stored.name, "recorded"))
+
+    color = picture(here)
     target = _blurred(torch.from_numpy(stored.rgb).to(model.device, non_blocking=True).permute(2, 0, 1).float() / 255)
-    changes = []
-    for axis, step in enumerate(STEPS):
-        moved = _displaced(here, rows, poses, axis, step)
-        changes.append((_picture(model, moved, stored, raster, appearance) - color) / step)
+    changes = [(picture(_displaced(here, poses, *move)) - color) / move[1] for move in enumerate(STEPS)]
     missing = target - color
-    for index, outline in outlines.items():
+    for index, (_, mask) in shown.items():
+        outline = torch.from_numpy(mask).to(model.device, non_blocking=True)
         jacobian = torch.stack([change[:, outline].flatten() for change in changes], 1).double()
         matrix, vector = _normal_equations(jacobian, missing[:, outline].flatten().double())
-        evidence[index].add(model.nodes[index].keys_around(time_s), matrix, vector)
-
-
-def _picture(
-    model: SceneModel, gaussians: Gaussians, stored: StoredView, raster: RasterConfig, appearance: Appearance
-) -> Tensor:
-    """Blurred colour ``[3, H, W]``."""
-    pose = appearance.world_from_cam(stored.view, stored.name)
-    drawn = rasterize(gaussians, stored.view, raster, world_from_cam=pose)
-    rgb = composite_sky(model, stored.view, drawn.rgb, drawn.alpha)
-    return _blurred(appearance.colored(rgb, stored.name, "recorded"))
+        evidence[index].add(model.nodes[index].keys_around(stored.view.time_s), matrix, vector)
 
 
 def _blurred(rgb: Tensor) -> Tensor:
     return F.avg_pool2d(rgb[None], BLUR_PX, stride=1, padding=BLUR_PX // 2, count_include_pad=False)[0]
 
 
-def _displaced(
-    gaussians: Gaussians, rows: dict[int, Tensor], poses: dict[int, NDArray[np.float64] | None], axis: int, step: float
-) -> Gaussians:
-    """The Gaussians with every listed object displaced in its own frame along (axis 0..2) or about z (axis 3)."""
+def _displaced(gaussians: Gaussians, poses: Mapping[int, NDArray[np.float64]], axis: int, step: float) -> Gaussians:
+    """The Gaussians with every listed object (node index -> pose) displaced in its own frame along (axis 0..2) or about
+    z (axis 3)."""
     means, quats = gaussians.means.clone(), gaussians.quats.clone()
     shift = np.zeros(3)
     if axis < 3:
         shift[axis] = step
     move = geometry.yaw_matrix(step if axis == 3 else 0.0, shift)
-    for index, mine in rows.items():
-        pose = poses[index]
-        if pose is None:
-            continue
-        world = pose @ move @ geometry.invert(pose)
+    for index, pose in poses.items():
+        mine, world = (gaussians.node == index).nonzero()[:, 0], pose @ move @ geometry.invert(pose)
         rotation, shift_m = (
             torch.from_numpy(part).float().to(means.device, non_blocking=True) for part in (world[:3, :3], world[:3, 3])
         )

@@ -9,7 +9,6 @@ short, rows with the largest gradients go first. Only recorded views count.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -35,18 +34,12 @@ TIME_GRADIENT = 2e-3
 
 @dataclass(frozen=True)
 class DensifySettings:
-    """When and how to densify. Steps count from 1.
-
-    Args:
-        start, stop, every: rows change after step s when start <= s <= stop and s is a multiple of ``every``.
-        max_rows: growth stops here. growth: at most this share of the present rows is added at a time.
-        least_opacity: rows below are removed.
-        static_gradient, object_gradient: thresholds on the mean absolute screen gradient, in units of half the image
-            (published: 6e-4 for the background, 2e-4 for objects).
-        split_above_m: rows whose largest scale exceeds this are split, smaller ones cloned.
-        reset_every: steps between opacity resets (to ``RESET_OPACITY``), 0 = never.
-        late: step from which splits of Gaussians with a life span give three children with shorter lives, not two.
-    """
+    """When and how to densify: after every step (from 1) from ``start`` to ``stop`` that is a multiple of ``every``.
+    ``max_rows``: growth stops here. ``growth``: at most this share of the rows is added at a time. ``least_opacity``:
+    rows below are removed. ``static_gradient``, ``object_gradient``: thresholds on the mean absolute screen gradient,
+    in units of half the image (as published). ``split_above_m``: rows whose largest scale exceeds this are split,
+    smaller ones cloned. ``reset_every``: steps between opacity resets (to ``RESET_OPACITY``), 0 = never. ``late``: step
+    from which splits of Gaussians with a life span give three children with shorter lives, not two."""
 
     start: int
     stop: int
@@ -104,9 +97,9 @@ class DensifyStats:
         gradient = trace.abs_grad2d
         if plain_from is not None and plain_from < len(gradient) and trace.means2d.grad is not None:
             gradient = torch.cat([gradient[:plain_from], trace.means2d.grad[plain_from:]])
-        visible = trace.visible
+        visible, (across, down) = trace.visible, gradient.unbind(1)
         # far faster than a norm over rows of two
-        length = torch.view_as_complex(gradient * _half_size(width, height, gradient.device)).abs()
+        length = torch.complex(across * (width / 2), down * (height / 2)).abs()
         self.gradient += length * visible
         self.seen += visible
         if time_gradient is not None:
@@ -121,12 +114,6 @@ class DensifyStats:
     def from_state(cls, tensors: Mapping[str, Tensor]) -> DensifyStats:
         """Inverse of ``state``."""
         return cls(**{name: value.clone() for name, value in tensors.items()})
-
-
-@functools.lru_cache(maxsize=64)
-def _half_size(width: int, height: int, device: torch.device) -> Tensor:
-    """Half an image's width and height, sent to a device once."""
-    return torch.tensor([width / 2, height / 2]).to(device)
 
 
 def densify(

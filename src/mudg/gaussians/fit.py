@@ -51,6 +51,7 @@ from mudg.gaussians.schedule import (
     run_steps,
 )
 from mudg.gaussians.settings import METHODS, FitConfig, VirtualConfig
+from mudg.gaussians.start import FitStart
 from mudg.gaussians.storage import load_model as load_model
 from mudg.gaussians.storage import save_model as save_model
 from mudg.gaussians.trust import certainty_of, unseen_maps, unseen_rows
@@ -190,7 +191,7 @@ def start_state(
     config: FitConfig, scene: Scene, cloud: FusedCloud, shown: ViewSet, classes: tuple[int, ...]
 ) -> FitState:
     """The state that a fit starts from, on the CPU: a model built from the fused cloud, nothing corrected yet."""
-    model = recipe_of(config.method).start(scene, cloud, shown.recorded, classes, config)
+    model = recipe_of(config.method).start(FitStart(config, scene, cloud, shown.recorded, classes))
     model.facts |= {"method": config.method, "scene": scene.id, "classes": [palette.CLASSES[i] for i in classes]}
     model.facts |= drawing_facts(config.drawing)
     stats = DensifyStats.zeros(len(model.table))
@@ -240,14 +241,14 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
         probability = config.virtual.probability if virtual_from < step <= virtual_to else 0.0
         chosen = state.views.choose(config.seed, step, probability, config.virtual.beside)
         # The one way to the device; results come back in gaussians/rendering.py.
-        seen = [sizes.sized(view, step).as_tensors(state.device) for view in chosen]
+        seen = [TrainView.of(sizes.sized(view, step), state.device) for view in chosen]
         check = FiniteCheck(step)
         learn = partial(_learn_from, state, config=config, raster=raster, perception=perception, check=check)
         learnt = [learn(view, step=step, first=view is seen[0]) for view in seen]
         check.refuse()
         adam_step(state.model, step, config.iterations, state.begun_at)
         rates = appearance_rates(step, config.iterations)
-        state.appearance.adam_step(step - state.begun_at, rates, native_ops.adam_columns)
+        state.appearance.adam_step(step - state.begun_at, rates)
         if step % SHAPE_EVERY == 0:
             shorten_needles(state.model.table, config.densify.longest_to_middle)
             now, first = (learning_rates(at, config.iterations)["deform"] for at in (step, 1))
@@ -332,7 +333,7 @@ def recorded_terms(state: FitState, render: Render, view: TrainView, config: Fit
     everywhere = state.device.type == "cpu" and bool(view.mask.all())  # to ask another device is to wait for it
     rgb = losses.outside_mask_copied(_picture(state, render, view), view.rgb, None if everywhere else view.mask)
     terms = {"color": native_ops.photometric(rgb, view.rgb, weights.ssim_weight)}
-    if view.lidar is not None and len(view.lidar.pixel) and weights.lidar_weight:
+    if view.lidar is not None and weights.lidar_weight:
         terms["lidar"] = weights.lidar_weight * losses.sparse_depth(render.depth, view.lidar.pixel, view.lidar.depth_m)
     if view.sky is not None and weights.sky_weight and state.model.sky is not None:
         terms["sky"] = weights.sky_weight * losses.weighted_mean(losses.sky_map(render.alpha, view.sky), labels)
@@ -361,7 +362,7 @@ def virtual_terms(
         valid = torch.isfinite(view.depth) & (view.depth > 0) & (view.depth < FARTHEST_VIRTUAL_DEPTH_M)
         loss = losses.dense_depth_map(render.depth, torch.where(valid, view.depth, 1.0))
         terms["virtual_depth"] = weights.depth_weight * losses.confident_mean(loss, weight * valid)
-    if view.lidar is not None and len(view.lidar.pixel) and weights.lidar_weight:
+    if view.lidar is not None and weights.lidar_weight:
         loss = losses.sparse_depth(render.depth, view.lidar.pixel, view.lidar.depth_m)
         terms["virtual_lidar"] = weights.lidar_weight * loss
     if view.sky is not None and weights.sky_weight and state.model.sky is not None:
@@ -423,7 +424,7 @@ def adam_step(model: SceneModel, step: int, iterations: int, begun_at: int = 0) 
     ``begun_at``."""
     rates = learning_rates(step, iterations)
     for table in (model.table, *model.node_tables().values()):
-        table.adam_step(step - begun_at, rates, native_ops.adam_columns)
+        table.adam_step(step - begun_at, rates)
         table.clear_gradients()
 
 

@@ -33,10 +33,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mudg.base import geometry
-from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import CLASSES, ID
-from mudg.base.types import Gaussians, View
+from mudg.base.types import SAME_COLORS, CameraColors, Gaussians, View
 from mudg.core import native_ops
 from mudg.core.table import Table
 from mudg.core.trajectory import Readout, as_read, moved_by
@@ -204,24 +203,22 @@ def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussia
     """All Gaussians of the scene in the world at a time, activated, differentiable in every column. Objects that do not
     exist then stay in the rows with opacity 0. ``semantics``: add the class logits as ``extra`` channels."""
     table, counts = model.table, model.counts()
-    all_rows = NodeRows(table["means"], table["quats"], torch.sigmoid(table["logits"]), table["sh_dc"])
-    common = (all_rows.means, all_rows.quats, all_rows.opacity, all_rows.sh_dc)
-    blocks = zip(*(column.split(counts) for column in common))
+    whole = {name: table[name] for name in ("means", "quats", "sh_dc", *(["sh_rest"] if model.sh_degree > 0 else []))}
+    whole["opacity"] = torch.sigmoid(table["logits"])
+    blocks = {name: column.split(counts) for name, column in whole.items()}
     own = {name: column.split(counts) for name, column in table.columns.items() if name not in COLUMNS}
-    given = [NodeRows(*block, {name: parts[i] for name, parts in own.items()}) for i, block in enumerate(blocks)]
-    if model.sh_degree > 0:
-        all_rows = replace(all_rows, sh_rest=table["sh_rest"])
-        given = [replace(rows, sh_rest=rest) for rows, rest in zip(given, table["sh_rest"].split(counts))]
-    found = []
-    for node, rows in zip(model.nodes, given):
-        now = node.at_time(rows, time_s)
-        found.append(replace(rows, opacity=rows.opacity * 0.0) if now is None else now)
+    given, found = [], []
+    for index, node in enumerate(model.nodes):
+        rows, mine = ({name: parts[index] for name, parts in group.items()} for group in (blocks, own))
+        given.append(NodeRows(**rows, own=mine))
+        now = node.at_time(given[-1], time_s)
+        found.append(replace(given[-1], opacity=given[-1].opacity * 0.0) if now is None else now)
 
     def column(name: str) -> Tensor:
         """One column of all nodes; a column that no node changed is passed on without a copy."""
         parts = [getattr(rows, name) for rows in found]
         changed = any(part is not getattr(rows, name) for part, rows in zip(parts, given))
-        return torch.cat(parts) if changed else getattr(all_rows, name)
+        return torch.cat(parts) if changed else whole[name]
 
     return Gaussians(
         means=column("means"),

@@ -339,10 +339,19 @@ class RigidNode(Node):
         are; remembered per time."""
         if time_s not in self._placements:
             with torch.no_grad():
-                pose = self.pose_at(time_s)
-            place = None if pose is None else (pose[0], rotation_matrix(pose[1]), left_product_matrix(pose[1]))
-            self._placements[time_s] = None if place is None else _sent(place, self.offsets.device)
+                pose, device = self.pose_at(time_s), self.offsets.device
+            self._placements[time_s] = None
+            if pose is not None:
+                parts = pose[0], rotation_matrix(pose[1]), left_product_matrix(pose[1])
+                if device.type != "cpu":  # by one copy
+                    packed = torch.cat([part.flatten() for part in parts]).to(device, non_blocking=True)
+                    parts = packed[:3], packed[3:12].view(3, 3), packed[12:].view(4, 4)
+                self._placements[time_s] = parts[0], parts[1].T, parts[2].T
         return self._placements[time_s]
+
+    def place_in_box(self, means: Tensor) -> Tensor:
+        """Places ``[n, 3]`` in the frame of the box as -1 to 1 within it."""
+        return 2 * means / _size_there(self.size_m, means.dtype, means.device)
 
     def after_step(self, share: float) -> None:
         """Regularise, in place, what a node learns by gradient steps; ``share`` in [0, 1] falls with the learning
@@ -414,10 +423,8 @@ class DeformableNode(RigidNode):
         control = self.offsets["deform"][before]
         if after != before:
             control = torch.lerp(control, self.offsets["deform"][after], u)
-        place = 2 * means / _size_there(self.size_m, means.dtype, means.device)
-        moved = F.grid_sample(
-            control[None], place[None, None, None], mode="bilinear", padding_mode="border", align_corners=True
-        )
+        place = self.place_in_box(means)[None, None, None]
+        moved = F.grid_sample(control[None], place, mode="bilinear", padding_mode="border", align_corners=True)
         return moved[0, :, 0, 0].T
 
     @property
@@ -441,14 +448,6 @@ class DeformableNode(RigidNode):
 def _size_there(size_m: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     """Size of a box as a tensor, sent to a device once."""
     return torch.tensor(size_m, dtype=dtype).to(device)
-
-
-def _sent(place: tuple[Tensor, Tensor, Tensor], device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """A position and two matrices, these transposed, on a device by one copy."""
-    if device.type != "cpu":
-        packed = torch.cat([part.flatten() for part in place]).to(device, non_blocking=True)
-        place = packed[:3], packed[3:12].view(3, 3), packed[12:].view(4, 4)
-    return place[0], place[1].T, place[2].T
 
 
 def object_node(track: Track, learn_pose: bool = False, deformable: bool = False) -> RigidNode:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import pkgutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import attrgetter
@@ -17,14 +17,14 @@ from typing import ClassVar, Final
 from torch import Tensor
 
 from mudg.base.errors import UsageError
-from mudg.base.types import FusedCloud, Gaussians, Render, Scene
+from mudg.base.types import Gaussians, Render
 from mudg.core import losses
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.schedule import LAST_DENSIFIED, PUBLISHED_STEPS
 from mudg.gaussians.settings import UNFIT, WEIGHTS, FitConfig
-from mudg.gaussians.start import start_model
-from mudg.gaussians.views import LidarPixels, StoredView, TrainView
+from mudg.gaussians.start import FitStart
+from mudg.gaussians.views import TrainView
 
 SCENE_UNIT_M = 10.0
 """Published weights and rates belong to scenes whose unit is this long."""
@@ -45,11 +45,6 @@ class DrawnView:
     config: FitConfig
     raster: RasterConfig
 
-    @property
-    def lidar(self) -> LidarPixels | None:
-        """LiDAR depths of the view, if there are any."""
-        return self.view.lidar if self.view.lidar is not None and len(self.view.lidar.pixel) else None
-
     @cached_property
     def inverse_depth(self) -> Tensor:
         """Of the render, per scene unit; the sky at ``SKY_M``."""
@@ -57,9 +52,9 @@ class DrawnView:
 
     def lidar_term(self, weight: float) -> dict[str, Tensor]:
         """The error of inverse depth at LiDAR points, whose weight decays; empty without points."""
-        if self.lidar is None:
+        if (lidar := self.view.lidar) is None:
             return {}
-        error = losses.sparse_inverse_depth(self.inverse_depth, self.lidar.pixel, self.lidar.depth_m / SCENE_UNIT_M)
+        error = losses.sparse_inverse_depth(self.inverse_depth, lidar.pixel, lidar.depth_m / SCENE_UNIT_M)
         published_step = self.step * PUBLISHED_STEPS / self.config.iterations
         return {"lidar": weight * math.exp(-published_step / LIDAR_DECAY_STEPS) * error}
 
@@ -91,11 +86,9 @@ class Recipe:
         weights = [name.removeprefix("loss.") for name in WEIGHTS.get(config.method, ())]
         return replace(config, loss=replace(config.loss, **dict.fromkeys(weights, 0.0))) if weights else config
 
-    def start(
-        self, scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
-    ) -> SceneModel:
+    def start(self, given: FitStart) -> SceneModel:
         """The model that the fit starts from."""
-        return start_model(scene, fused, views, classes, config)
+        return given.model()
 
     def drawn_model(self, model: SceneModel, view: TrainView, step: int, config: FitConfig) -> SceneModel:
         """The model as a step draws it; it shares all parameters with ``model``."""

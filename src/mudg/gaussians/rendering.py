@@ -44,8 +44,7 @@ def boxes_in_view(model: SceneModel, view: View) -> Tensor:
     """Bool[1, H, W]: inside the outline of some object's box (slightly grown)."""
     inside = np.zeros((view.camera.height, view.camera.width), bool)
     for node in model.nodes:
-        pose = node.pose_matrix(view.time_s) if isinstance(node, RigidNode) else None
-        if pose is not None and isinstance(node, RigidNode):
+        if isinstance(node, RigidNode) and (pose := node.pose_matrix(view.time_s)) is not None:
             mask = outline_mask(view, pose, node.size_m)
             inside = inside if mask is None else inside | mask
     return torch.from_numpy(inside)[None]
@@ -94,6 +93,11 @@ class RenderedCondition:
     alpha: Tensor
     semantics: Tensor
     certainty: Tensor | None
+
+    def sure(self) -> Tensor:
+        """The certainty f32[H, W]; half of what is covered where none was measured, 0 without depth."""
+        known = 0.5 * self.alpha if self.certainty is None else self.certainty
+        return torch.where(torch.isfinite(self.depth), known, 0.0)
 
 
 def raster_of(model: SceneModel, backend: Backend = "auto") -> RasterConfig:
@@ -184,11 +188,8 @@ FAR_M = 1000.0
 
 def render_planes(model: SceneModel, view: View) -> RenderPlanes:
     """What a fitted scene, on any device, shows at a view: on the CPU, without the leading dimension. In the sky
-    coverage and certainty are 0; a scene fitted by a version that measured no certainty counts as half certain wherever
-    it covers."""
+    coverage and certainty are 0."""
     seen = render_condition(model, view)
-    solid = torch.isfinite(seen.depth)
-    alpha = torch.where(solid, seen.alpha, 0.0)
-    certainty = 0.5 * alpha if seen.certainty is None else torch.where(solid, seen.certainty, 0.0).clamp(max=alpha)
+    alpha = torch.where(torch.isfinite(seen.depth), seen.alpha, 0.0)
     depth = seen.depth.nan_to_num(FAR_M).clamp(max=FAR_M)
-    return RenderPlanes(seen.rgb, *(x.clamp(min=0)[None] for x in (depth, alpha, certainty)), seen.semantics[None])
+    return RenderPlanes(seen.rgb, *(x.clamp(min=0)[None] for x in (depth, alpha, seen.sure())), seen.semantics[None])

@@ -10,9 +10,9 @@ filled and the sky stands in.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Final
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -21,7 +21,6 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mudg.base import geometry, log, seeds
-from mudg.base.camera_colors import CameraColors
 from mudg.base.errors import InputError
 from mudg.base.palette import DYNAMIC_IDS, ID, UNLABELLED
 from mudg.base.types import FusedCloud, PointCloud, Scene
@@ -83,6 +82,11 @@ FAR_M = 150.0
 SKY_ROWS = 192
 FEWEST_OBJECT_POINTS = 150
 MIRROR_APART_M = 0.25
+SAME_DEPTH = 0.02
+"""A point is seen by a camera whose nearest depth at its pixel differs by at most this share."""
+MOMENT_FRAMES = 2
+"""Frames that share one of the moments by which points are thinned a second time."""
+LARGEST_M = 150.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,127 +130,23 @@ class StartPoints:
         return columns
 
 
-def start_model(
-    scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
-) -> SceneModel:
-    """Build the scene model that the fit starts from. InputError: the fused cloud has no points at all."""
-    if len(fused.static) == 0:
-        what, remedy = "the fused cloud has no static points", "check the LiDAR of the scene"
-        raise InputError(what, where=scene.root, remedy=remedy)
-    kinds = METHODS[config.method].nodes
-    cloud = fused.static
-    centers = np.stack([stored.view.center_world for stored in views]).astype(np.float32)
-    rows = thinned(cloud.xyz, centers, config)
-    points = StartPoints(cloud.xyz[rows], cloud.rgb[rows], _labels(cloud)[rows], neighbour_scale(cloud.xyz[rows]))
-    filled = fill_unreached(views, points.xyz, classes, fused.colors)
-    points = points if filled is None else StartPoints.joined([points, filled])
-    blocks = [points.columns(classes, config.sh_degree)]
-    nodes: list[StaticNode | RigidNode] = [StaticNode()]
-    if "objects" in kinds:
-        share = config.start.gaussians // max(1, len(fused.objects))
-        for track_id, cloud in sorted(fused.objects.items()):
-            node = object_node(scene.track(track_id), config.poses.learn, config.objects.deformable)
-            blocks.append(_object_columns(node, cloud, classes, config, min(share, 8000)))
-            nodes.append(node)
-    columns = {name: torch.cat([block[name] for block in blocks]) for name in blocks[0]}
-    counts = torch.tensor([len(block["means"]) for block in blocks])
-    owner = torch.arange(len(blocks), dtype=torch.int32).repeat_interleave(counts)
-    sky, static = painted_sky(views, fused.colors) if "sky" in kinds else None, int(counts[0])
-    log.info(f"start: {static} static Gaussians, {len(owner) - static} on {len(nodes) - 1} dynamic objects")
-    table = Table(columns, {"node": owner})
-    return SceneModel(table, tuple(nodes), sky, classes, config.sh_degree, colors=fused.colors)
+NO_POINTS: Final = StartPoints(
+    np.zeros((0, 3), np.float32), *(np.zeros(shape, np.uint8) for shape in ((0, 3), 0)), np.zeros(0, np.float32)
+)
 
 
 def _labels(cloud: PointCloud) -> NDArray[np.uint8]:
     return np.full(len(cloud), UNLABELLED, np.uint8) if cloud.semantics is None else cloud.semantics
 
 
-def thinned(xyz: NDArray[np.float32], centers: NDArray[np.float32], config: FitConfig) -> NDArray[np.int64]:
-    """Rows to keep: one point per voxel, voxels growing with the distance to the nearest camera, at most the wanted
-    number."""
-    distance, _ = cKDTree(centers).query(xyz, k=1, workers=1)
-    size = config.start.voxel_m * np.clip(distance / 20.0, 0.4, 3.0)
-    for _ in range(12):
-        rows = voxel_filter(xyz, size)
-        if len(rows) <= config.start.gaussians:
-            return rows
-        size = size * np.clip((len(rows) / config.start.gaussians) ** 0.5, 1.08, 2.0)
-    return rows[np.sort(seeds.numpy_rng(config.seed, 0, "thin").permutation(len(rows))[: config.start.gaussians])]
-
-
-def mirrored_points(
-    xyz: NDArray[np.float32], apart_m: float = MIRROR_APART_M
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Points reflected about y = 0 of the box, where no measured point is within ``apart_m``: xyz f32[M, 3] and their
-    sources."""
+def mirrored_points(xyz: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Points reflected about y = 0 of the box, where no measured point is near: xyz f32[M, 3] and their sources."""
     if len(xyz) == 0:
         return xyz, np.zeros(0, np.int64)
     flipped = xyz * np.array([1, -1, 1], np.float32)
     distance, _ = cKDTree(xyz).query(flipped, k=1, workers=1)
-    source = np.flatnonzero(distance > apart_m)
+    source = np.flatnonzero(distance > MIRROR_APART_M)
     return flipped[source], source
-
-
-def _object_columns(
-    node: RigidNode, cloud: PointCloud, classes: tuple[int, ...], config: FitConfig, most: int
-) -> Mapping[str, Tensor]:
-    rows = voxel_filter(cloud.xyz, 0.06)
-    rows = rows[np.sort(seeds.numpy_rng(config.seed, 0, f"object {node.name}").permutation(len(rows))[:most])]
-    xyz, rgb, semantics = cloud.xyz[rows], cloud.rgb[rows], _labels(cloud)[rows]
-    if config.objects.mirror_start and node.label.lower() in SYMMETRIC_LABELS:
-        other, source = mirrored_points(xyz)
-        xyz, rgb = np.concatenate([xyz, other]), np.concatenate([rgb, rgb[source]])
-        semantics = np.concatenate([semantics, semantics[source]])
-    if len(rows) < FEWEST_OBJECT_POINTS:
-        grid_xyz, grid_rgb = box_grid(node.size_m, rgb.mean(0) if len(rgb) else np.array([127, 127, 127]))
-        commonest = np.bincount(semantics, minlength=256).argmax() if len(semantics) else UNLABELLED
-        xyz, rgb = np.concatenate([xyz, grid_xyz]), np.concatenate([rgb, grid_rgb])
-        semantics = np.concatenate([semantics, np.full(len(grid_xyz), commonest, np.uint8)])
-    return StartPoints(xyz, rgb, semantics, neighbour_scale(xyz, 0.02, 0.3)).columns(classes, config.sh_degree)
-
-
-# ---- beyond LiDAR --------------------------------------------------------------------------------
-
-
-def fill_unreached(
-    views: Sequence[StoredView], xyz: NDArray[np.float32], classes: tuple[int, ...], cameras: CameraColors
-) -> StartPoints | None:
-    """Points for what is visible but has no LiDAR; see the module's text. None without labels."""
-    labelled = [index for index, stored in enumerate(views) if stored.channels is not None]
-    if not labelled or not classes:
-        return None
-    chosen = labelled[:: max(1, len(labelled) // FILL_FRAMES)]
-    points = StartPoints.joined([_fill_view(views[index], xyz, classes, cameras) for index in chosen])
-    return points[voxel_filter(points.xyz, np.maximum(points.scale_m * 2.0, 0.05))] if len(points) else None
-
-
-def _fill_view(
-    stored: StoredView, xyz: NDArray[np.float32], classes: tuple[int, ...], cameras: CameraColors
-) -> StartPoints:
-    view, cell = stored.view, FILL_CELL_PX
-    rows, columns = view.camera.height // cell, view.camera.width // cell
-    center_row = (np.arange(rows) * cell + cell // 2)[:, None]
-    center_column = (np.arange(columns) * cell + cell // 2)[None, :]
-    label = stored.train_ids(center_row, center_column, classes)
-    depth = _cell_depth(stored, xyz, rows, columns)
-    covered = np.isfinite(depth)
-    wanted = ~covered & np.isin(label, [i for i in range(19) if i not in (*DYNAMIC_IDS, *GROUND_IDS, ID["sky"])])
-    if stored.mask is not None:
-        wanted &= stored.mask[center_row, center_column]
-    guess = np.full((rows, columns), FAR_M)
-    below = np.full((256, columns), np.inf)  # per class: depth of the last covered cell below, in this column
-    every = np.arange(columns)
-    for row in range(rows - 1, -1, -1):
-        known = covered[row] & np.isin(label[row], UPRIGHT_IDS)
-        below[label[row, known], every[known]] = depth[row, known]
-        surface = below[label[row], every]
-        guess[row] = np.where(np.isfinite(surface), surface, FAR_M)
-    row, column = wanted.nonzero()
-    uv = np.stack([column * cell + cell / 2, row * cell + cell / 2], 1)
-    z = guess[row, column]
-    color = cameras.bytes_to_common(view.camera.name, stored.rgb[row * cell + cell // 2, column * cell + cell // 2])
-    points = geometry.unproject(view, uv, z).astype(np.float32)
-    return StartPoints(points, color, label[row, column], (0.5 * cell * z / view.camera.fx).astype(np.float32))
 
 
 def _cell_depth(stored: StoredView, xyz: NDArray[np.float32], rows: int, columns: int) -> NDArray[np.float64]:
@@ -262,137 +162,206 @@ def _cell_depth(stored: StoredView, xyz: NDArray[np.float32], rows: int, columns
     return np.where(np.isfinite(depth), depth, np.minimum(padded[:, :-2], padded[:, 2:]))
 
 
-def painted_sky(views: Sequence[StoredView], cameras: CameraColors) -> SkyNode:
-    """A sky that starts with the mean recorded colour per direction, in common colours."""
-
-    def pixels(stored: StoredView, shown: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """Directions and common colours of every second row and column of the sky."""
-        camera, (row, column) = stored.view.camera, (2 * index for index in shown[::2, ::2].nonzero())
-        rays = np.stack([*geometry.pinhole_ray(camera.intrinsics, column + 0.5, row + 0.5), np.ones(len(row))], 1)
-        rgb = cameras.bytes_to_common(camera.name, stored.rgb[row, column])
-        return rays @ stored.view.world_from_cam[:3, :3].T, rgb.astype(np.float32) / 255
-
-    sky = SkyNode.uniform(SKY_ROWS)
-    sky.fill(pixels(stored, stored.sky) for stored in views if stored.sky is not None)
-    return sky
-
-
-# ---- methods without boxes -----------------------------------------------------------------------
-#
-# LiDAR points where and when they were measured, coloured by the photographs of that time. Nothing here knows tracked
-# boxes or the fused cloud (whose dynamic points lie in boxes): a point of a moving car stays where its sweep met it.
-# Colours come from training photographs at most half a frame from the sweep, so that a moving point has the colour of
-# its own moment; points that none of these shows are left out.
-
-SAME_DEPTH = 0.02
-"""A point is seen by a camera whose nearest depth at its pixel differs by at most this share."""
-MOMENT_FRAMES = 2
-"""Frames that share one of the moments by which points are thinned a second time."""
-LARGEST_M = 150.0
-
-
-def timed_points(
-    scene: Scene, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig, colors: CameraColors
-) -> tuple[StartPoints, NDArray[np.float64]]:
-    """Starting points of a log, thinned to ``config.start.gaussians``, and what LiDAR did not reach (as in
-    ``start_model``); and when they were measured, f64[N] seconds, NaN where LiDAR did not reach.
-
-    Half of them are one per cube of space, half one per cube and every few frames, so that what moves has points all
-    along its way. InputError: no photograph shows any LiDAR point."""
-    xyz, rgb, semantics, time_s = _measured(scene, views, classes, colors)
-    if len(xyz) == 0:
-        what = "no LiDAR point is seen by a training photograph of its time"
-        raise InputError(what, where=scene.root, remedy="check the LiDAR of the scene and --cameras")
-    centers = np.stack([stored.view.center_world for stored in views]).astype(np.float32)
-    half = replace(config, start=replace(config.start, gaussians=max(50, config.start.gaussians // 2)))
-    parts = [thinned(xyz, centers, half), *_by_moment(xyz, time_s, scene, half)]
-    chosen = [
-        (StartPoints(xyz[rows], rgb[rows], semantics[rows], neighbour_scale(xyz[rows])), time_s[rows]) for rows in parts
-    ]
-    filled = fill_unreached(views, xyz, classes, colors)
-    if filled is not None:
-        chosen.append((filled, np.full(len(filled), np.nan)))
-    return StartPoints.joined([part for part, _ in chosen]), np.concatenate([times for _, times in chosen])
-
-
-def world_model(
-    node: StaticNode,
-    columns: Mapping[str, Tensor],
-    classes: tuple[int, ...],
-    config: FitConfig,
-    colors: CameraColors,
-    sky: SkyNode | None = None,
-) -> SceneModel:
-    """A scene that is one node with these rows, and a sky."""
-    table = Table(columns, {"node": torch.zeros(len(columns["means"]), dtype=torch.int32)})
-    return SceneModel(table, (node,), sky, classes, config.sh_degree, colors=colors)
-
-
 def frame_seconds(scene: Scene) -> float:
     """Seconds between frames; 0.1 where there is only one."""
     times = sorted({frame.view.time_s for frame in scene.frames})
     return (times[-1] - times[0]) / (len(times) - 1) if len(times) > 1 else 0.1
 
 
-def _measured(
-    scene: Scene, views: Sequence[StoredView], classes: tuple[int, ...], colors: CameraColors
-) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64]]:
-    near_s = 0.5 * frame_seconds(scene) + 1e-3
-    found: list[tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64]]] = []
-    for sweep in scene.sweeps:
-        nearest: dict[str, int] = {}
-        for index in sorted(range(len(views)), key=lambda index: abs(views[index].view.time_s - sweep.time_s)):
-            if abs(views[index].view.time_s - sweep.time_s) <= near_s:
-                nearest.setdefault(views[index].view.camera.name, index)
-        if not nearest:
-            continue
-        points = read_points(scene, sweep)
-        xyz, gap = geometry.transform_points(sweep.world_from_lidar, points.xyz), largest_beam_gap(points.xyz)
-        free = np.ones(len(xyz), bool)
-        for index in nearest.values():
-            rows, rgb, semantics = _seen(views[index], xyz, gap, classes, colors)
-            mine = free[rows]
-            rows = rows[mine]
-            free[rows] = False
-            found.append((xyz[rows], rgb[mine], semantics[mine], sweep.time_s + points.dt_s[rows].astype(np.float64)))
-    if not found:
-        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.uint8), np.zeros(0)
-    xyz, rgb, semantics, time_s = (np.concatenate(column) for column in zip(*found))
-    return xyz, rgb, semantics, time_s
+@dataclass(frozen=True, eq=False)
+class FitStart:
+    """What a fit starts from, and the model made of it. ``fused``: of methods without boxes, only the colours of its
+    cameras are used. ``classes``: train ids of the model's class channels."""
 
+    config: FitConfig
+    scene: Scene
+    fused: FusedCloud
+    views: Sequence[StoredView]
+    classes: tuple[int, ...]
 
-def _seen(
-    stored: StoredView, xyz: NDArray[np.float32], gap_deg: float, classes: tuple[int, ...], colors: CameraColors
-) -> tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.uint8]]:
-    """Rows of the points that a photograph shows, their common colours and train ids."""
-    view, camera = stored.view, stored.view.camera
-    uv, z = geometry.project(view, xyz)
-    with np.errstate(invalid="ignore"):
-        inside = ((uv >= 0) & (uv < (camera.width, camera.height))).all(1) & (z > 0.5) & (z < LARGEST_M)
-    rows = np.flatnonzero(inside)
-    column, row = uv[rows, 0].astype(int), uv[rows, 1].astype(int)
-    nearest = visible_depth(view, xyz, HIDING_RULES["sweep"], gap_deg=gap_deg, far_m=LARGEST_M)[row, column]
-    with np.errstate(invalid="ignore"):
-        seen = np.abs(nearest - z[rows]) <= SAME_DEPTH * z[rows]
-    if stored.mask is not None:
-        seen &= stored.mask[row, column]
-    rows, row, column = rows[seen], row[seen], column[seen]
-    common = colors.bytes_to_common(camera.name, stored.rgb[row, column])
-    return rows, common, stored.train_ids(row, column, classes)
+    def model(self) -> SceneModel:
+        """The scene model of fused points. InputError: the fused cloud has no points at all."""
+        config, cloud, kinds = self.config, self.fused.static, METHODS[self.config.method].nodes
+        if len(cloud) == 0:
+            what, remedy = "the fused cloud has no static points", "check the LiDAR of the scene"
+            raise InputError(what, where=self.scene.root, remedy=remedy)
+        rows = self._thinned(cloud.xyz, config.start.gaussians)
+        points = StartPoints(cloud.xyz[rows], cloud.rgb[rows], _labels(cloud)[rows], neighbour_scale(cloud.xyz[rows]))
+        points = StartPoints.joined([points, self._unreached(points.xyz)])
+        blocks = [points.columns(self.classes, config.sh_degree)]
+        nodes: list[StaticNode | RigidNode] = [StaticNode()]
+        if "objects" in kinds:
+            share = config.start.gaussians // max(1, len(self.fused.objects))
+            for track_id, cloud in sorted(self.fused.objects.items()):
+                node = object_node(self.scene.track(track_id), config.poses.learn, config.objects.deformable)
+                blocks.append(self._object_columns(node, cloud, min(share, 8000)))
+                nodes.append(node)
+        columns = {name: torch.cat([block[name] for block in blocks]) for name in blocks[0]}
+        counts = torch.tensor([len(block["means"]) for block in blocks])
+        owner = torch.arange(len(blocks), dtype=torch.int32).repeat_interleave(counts)
+        static = int(counts[0])
+        log.info(f"start: {static} static Gaussians, {len(owner) - static} on {len(nodes) - 1} dynamic objects")
+        return self._model_of(Table(columns, {"node": owner}), tuple(nodes))
 
+    def world_model(self, node: StaticNode, columns: Mapping[str, Tensor]) -> SceneModel:
+        """A scene that is one node with these rows, and the sky that the method has."""
+        table = Table(columns, {"node": torch.zeros(len(columns["means"]), dtype=torch.int32)})
+        return self._model_of(table, (node,))
 
-def _by_moment(
-    xyz: NDArray[np.float32], time_s: NDArray[np.float64], scene: Scene, config: FitConfig
-) -> list[NDArray[np.int64]]:
-    """Rows, one per cube of space, of every moment; at most the wanted number in all."""
-    moment = np.floor((time_s - time_s.min()) / (MOMENT_FRAMES * frame_seconds(scene)) + 1e-6).astype(np.int64)
-    parts = []
-    for number in np.unique(moment):
-        mine = np.flatnonzero(moment == number)
-        parts.append(mine[voxel_filter(xyz[mine], 2 * config.start.voxel_m)])
-    share = min(1.0, config.start.gaussians / max(1, sum(map(len, parts))))
-    chosen = []
-    for index, rows in enumerate(parts):
-        order = seeds.numpy_rng(config.seed, index, "moment").permutation(len(rows))
-        chosen.append(rows[np.sort(order[: max(4, int(share * len(rows)))])])
-    return chosen
+    def _model_of(self, table: Table, nodes: tuple[StaticNode | RigidNode, ...]) -> SceneModel:
+        config, sky = self.config, None
+        if "sky" in METHODS[config.method].nodes:  # starts with the mean recorded colour per direction
+            sky = SkyNode.uniform(SKY_ROWS)
+            sky.fill(self._sky_pixels(stored, stored.sky) for stored in self.views if stored.sky is not None)
+        return SceneModel(table, nodes, sky, self.classes, config.sh_degree, colors=self.fused.colors)
+
+    def _sky_pixels(
+        self, stored: StoredView, shown: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+        """Directions and common colours of every second row and column of the sky."""
+        camera, (row, column) = stored.view.camera, (2 * index for index in shown[::2, ::2].nonzero())
+        rays = np.stack([*geometry.pinhole_ray(camera.intrinsics, column + 0.5, row + 0.5), np.ones(len(row))], 1)
+        rgb = self.fused.colors.bytes_to_common(camera.name, stored.rgb[row, column])
+        return rays @ stored.view.world_from_cam[:3, :3].T, rgb.astype(np.float32) / 255
+
+    def _thinned(self, xyz: NDArray[np.float32], most: int) -> NDArray[np.int64]:
+        """Rows to keep: one point per voxel, voxels growing with the distance to the nearest camera."""
+        centers = np.stack([stored.view.center_world for stored in self.views]).astype(np.float32)
+        distance, _ = cKDTree(centers).query(xyz, k=1, workers=1)
+        size = self.config.start.voxel_m * np.clip(distance / 20.0, 0.4, 3.0)
+        for _ in range(12):
+            rows = voxel_filter(xyz, size)
+            if len(rows) <= most:
+                return rows
+            size = size * np.clip((len(rows) / most) ** 0.5, 1.08, 2.0)
+        return rows[np.sort(seeds.numpy_rng(self.config.seed, 0, "thin").permutation(len(rows))[:most])]
+
+    def _object_columns(self, node: RigidNode, cloud: PointCloud, most: int) -> Mapping[str, Tensor]:
+        config, rows = self.config, voxel_filter(cloud.xyz, 0.06)
+        rows = rows[np.sort(seeds.numpy_rng(config.seed, 0, f"object {node.name}").permutation(len(rows))[:most])]
+        xyz, rgb, semantics = cloud.xyz[rows], cloud.rgb[rows], _labels(cloud)[rows]
+        if config.objects.mirror_start and node.label.lower() in SYMMETRIC_LABELS:
+            other, source = mirrored_points(xyz)
+            xyz, rgb = np.concatenate([xyz, other]), np.concatenate([rgb, rgb[source]])
+            semantics = np.concatenate([semantics, semantics[source]])
+        if len(rows) < FEWEST_OBJECT_POINTS:
+            grid_xyz, grid_rgb = box_grid(node.size_m, rgb.mean(0) if len(rgb) else np.array([127, 127, 127]))
+            commonest = np.bincount(semantics, minlength=256).argmax() if len(semantics) else UNLABELLED
+            xyz, rgb = np.concatenate([xyz, grid_xyz]), np.concatenate([rgb, grid_rgb])
+            semantics = np.concatenate([semantics, np.full(len(grid_xyz), commonest, np.uint8)])
+        scale_m = neighbour_scale(xyz, 0.02, 0.3)
+        return StartPoints(xyz, rgb, semantics, scale_m).columns(self.classes, config.sh_degree)
+
+    # beyond LiDAR ---------------------------------------------------------------------------------
+
+    def _unreached(self, xyz: NDArray[np.float32]) -> StartPoints:
+        """Points for what is visible but has no LiDAR; see the module's text. Without labels there are none."""
+        labelled = [stored for stored in self.views if stored.channels is not None] if self.classes else []
+        chosen = labelled[:: max(1, len(labelled) // FILL_FRAMES)]
+        points = StartPoints.joined([NO_POINTS, *(self._fill_view(stored, xyz) for stored in chosen)])
+        return points[voxel_filter(points.xyz, np.maximum(points.scale_m * 2.0, 0.05))]
+
+    def _fill_view(self, stored: StoredView, xyz: NDArray[np.float32]) -> StartPoints:
+        view, cell = stored.view, FILL_CELL_PX
+        rows, columns = view.camera.height // cell, view.camera.width // cell
+        center_row = (np.arange(rows) * cell + cell // 2)[:, None]
+        center_column = (np.arange(columns) * cell + cell // 2)[None, :]
+        label = stored.train_ids(center_row, center_column, self.classes)
+        depth = _cell_depth(stored, xyz, rows, columns)
+        covered = np.isfinite(depth)
+        wanted = ~covered & np.isin(label, [i for i in range(19) if i not in (*DYNAMIC_IDS, *GROUND_IDS, ID["sky"])])
+        if stored.mask is not None:
+            wanted &= stored.mask[center_row, center_column]
+        guess = np.full((rows, columns), FAR_M)
+        below = np.full((256, columns), np.inf)  # per class: depth of the last covered cell below, in this column
+        every = np.arange(columns)
+        for row in range(rows - 1, -1, -1):
+            known = covered[row] & np.isin(label[row], UPRIGHT_IDS)
+            below[label[row, known], every[known]] = depth[row, known]
+            surface = below[label[row], every]
+            guess[row] = np.where(np.isfinite(surface), surface, FAR_M)
+        row, column = wanted.nonzero()
+        uv = np.stack([column * cell + cell / 2, row * cell + cell / 2], 1)
+        z, pixels = guess[row, column], stored.rgb[row * cell + cell // 2, column * cell + cell // 2]
+        color = self.fused.colors.bytes_to_common(view.camera.name, pixels)
+        points = geometry.unproject(view, uv, z).astype(np.float32)
+        return StartPoints(points, color, label[row, column], (0.5 * cell * z / view.camera.fx).astype(np.float32))
+
+    # without boxes --------------------------------------------------------------------------------
+    #
+    # LiDAR points where and when they were measured, coloured by the photographs of that time. Nothing here knows
+    # tracked boxes or the fused cloud (whose dynamic points lie in boxes): a point of a moving car stays where its
+    # sweep met it. Colours come from training photographs at most half a frame from the sweep, so that a moving point
+    # has the colour of its own moment; points that none of these shows are left out.
+
+    def timed_points(self) -> tuple[StartPoints, NDArray[np.float64]]:
+        """Starting points of a log and what LiDAR did not reach (as in ``model``); and when they were measured, f64[N]
+        seconds, NaN where LiDAR did not reach.
+
+        Half of them are one per cube of space, half one per cube and every few frames, so that what moves has points
+        all along its way. InputError: no photograph shows any LiDAR point."""
+        found = [part for part in self._measured() if len(part[0])]
+        if not found:
+            what = "no LiDAR point is seen by a training photograph of its time"
+            raise InputError(what, where=self.scene.root, remedy="check the LiDAR of the scene and --cameras")
+        xyz, rgb, semantics, time_s = (np.concatenate(column) for column in zip(*found))
+        half = max(50, self.config.start.gaussians // 2)
+        chosen = [self._thinned(xyz, half), *self._by_moment(xyz, time_s, half)]
+        parts = [StartPoints(xyz[rows], rgb[rows], semantics[rows], neighbour_scale(xyz[rows])) for rows in chosen]
+        unreached = self._unreached(xyz)
+        times = [*(time_s[rows] for rows in chosen), np.full(len(unreached), np.nan)]
+        return StartPoints.joined([*parts, unreached]), np.concatenate(times)
+
+    def _measured(self) -> Iterator[tuple[NDArray[Any], ...]]:
+        """Points of the sweeps: places f32[N, 3], common colours u8[N, 3], train ids u8[N], times f64[N]."""
+        near_s = 0.5 * frame_seconds(self.scene) + 1e-3
+        for sweep in self.scene.sweeps:
+            apart = lambda stored: abs(stored.view.time_s - sweep.time_s)  # noqa: B023
+            nearest: dict[str, StoredView] = {}
+            for stored in sorted(self.views, key=apart):
+                if apart(stored) <= near_s:
+                    nearest.setdefault(stored.view.camera.name, stored)
+            if not nearest:
+                continue
+            points = read_points(self.scene, sweep)
+            xyz, gap = geometry.transform_points(sweep.world_from_lidar, points.xyz), largest_beam_gap(points.xyz)
+            free = np.ones(len(xyz), bool)
+            for stored in nearest.values():
+                rows, rgb, semantics = self._seen(stored, xyz, gap)
+                mine = free[rows]
+                rows = rows[mine]
+                free[rows] = False
+                yield xyz[rows], rgb[mine], semantics[mine], sweep.time_s + points.dt_s[rows].astype(np.float64)
+
+    def _seen(
+        self, stored: StoredView, xyz: NDArray[np.float32], gap_deg: float
+    ) -> tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.uint8]]:
+        """Rows of the points that a photograph shows, their common colours and train ids."""
+        view, camera = stored.view, stored.view.camera
+        uv, z = geometry.project(view, xyz)
+        with np.errstate(invalid="ignore"):
+            inside = ((uv >= 0) & (uv < (camera.width, camera.height))).all(1) & (z > 0.5) & (z < LARGEST_M)
+        rows = np.flatnonzero(inside)
+        column, row = uv[rows, 0].astype(int), uv[rows, 1].astype(int)
+        nearest = visible_depth(view, xyz, HIDING_RULES["sweep"], gap_deg=gap_deg, far_m=LARGEST_M)[row, column]
+        with np.errstate(invalid="ignore"):
+            seen = np.abs(nearest - z[rows]) <= SAME_DEPTH * z[rows]
+        if stored.mask is not None:
+            seen &= stored.mask[row, column]
+        rows, row, column = rows[seen], row[seen], column[seen]
+        common = self.fused.colors.bytes_to_common(camera.name, stored.rgb[row, column])
+        return rows, common, stored.train_ids(row, column, self.classes)
+
+    def _by_moment(
+        self, xyz: NDArray[np.float32], time_s: NDArray[np.float64], most: int
+    ) -> Iterator[NDArray[np.int64]]:
+        """Rows, one per cube of space, of every moment; at most so many in all."""
+        span_s, parts = MOMENT_FRAMES * frame_seconds(self.scene), []
+        moment = np.floor((time_s - time_s.min()) / span_s + 1e-6).astype(np.int64)
+        for number in np.unique(moment):
+            mine = np.flatnonzero(moment == number)
+            parts.append(mine[voxel_filter(xyz[mine], 2 * self.config.start.voxel_m)])
+        share = min(1.0, most / max(1, sum(map(len, parts))))
+        for index, rows in enumerate(parts):
+            order = seeds.numpy_rng(self.config.seed, index, "moment").permutation(len(rows))
+            yield rows[np.sort(order[: max(4, int(share * len(rows)))])]

@@ -67,7 +67,7 @@ def certainty_of(
     chosen = np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))
     total = torch.zeros(5, len(model.table), device=model.device)
     for index in chosen:
-        sums = weight_sums(model, views[int(index)].as_tensors(model.device), raster, appearance)
+        sums = weight_sums(model, TrainView.of(views[int(index)], model.device), raster, appearance)
         total += torch.cat([(sums[:1] / (sums[:1] + 1)), sums])
     total *= len(views) / len(chosen)
     return certainty(*total).half()
@@ -98,7 +98,7 @@ def difference_images(model: SceneModel, render: Render, view: TrainView, appear
     used = view.mask[0].float()
     color = (rgb - view.rgb).abs().mean(0) * used
     lidar, depth = torch.zeros_like(used), torch.zeros_like(used)
-    if view.lidar is not None and len(view.lidar.pixel):
+    if view.lidar is not None:
         pixel, measured = view.lidar.pixel, view.lidar.depth_m
         lidar.view(-1)[pixel] = 1.0
         depth.view(-1)[pixel] = ((render.depth.reshape(-1)[pixel] - measured).abs() / measured).clamp(max=1)

@@ -4,9 +4,9 @@ bytes, in memory or in files, and become tensors when a step asks for one."""
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,14 +27,13 @@ from mudg.base.types import Frame, FusedCloud, ObservationKind, Scene, Sweep, Tr
 from mudg.core.fusion import largest_beam_gap
 from mudg.core.pictures import resize_area, resize_nearest
 from mudg.core.project import RULES as HIDING_RULES
-from mudg.core.project import ProjectConfig, project_sparse, visible_depth
+from mudg.core.project import ProjectConfig, project_cloud, visible_depth
 from mudg.core.trajectory import Readout, points_as_read, readout_of
 from mudg.networks.featnets import WHOLE_PIXELS
 from mudg.scene.labels import read_label
 from mudg.scene.observations import ObservationSet, list_observation_sets, read_observations
 from mudg.scene.read import read_image, read_points
 
-CPU = torch.device("cpu")
 MAX_LIDAR_M = 100.0
 NEAREST_SWEEP_S = 0.1
 READERS = 8
@@ -49,9 +48,8 @@ class LidarPixels:
     pixel: Tensor
     depth_m: Tensor
 
-    def to(self, device: torch.device) -> LidarPixels:
-        """The same pixels on a device."""
-        return LidarPixels(self.pixel.to(device, non_blocking=True), self.depth_m.to(device, non_blocking=True))
+    def __len__(self) -> int:
+        return len(self.pixel)
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ class TrainView:
     model's class channels (255 = unlabelled), or None. ``confidence``: f32[1, H, W] in [0, 1]: of all that a virtual
     view shows, of the labels alone for a recorded one. ``mask``: bool[1, H, W], pixels that may be used at all.
     ``sky``: bool[1, H, W] or None if unknown. ``depth``: f32[1, H, W] metres of a virtual view (NaN = none), or None.
-    ``lidar``: or None."""
+    ``lidar``: or None where nothing was measured."""
 
     name: str
     view: View
@@ -73,7 +71,29 @@ class TrainView:
     sky: Tensor | None
     depth: Tensor | None
     lidar: LidarPixels | None
-    readout: Readout | None = None
+    readout: Readout | None
+
+    @classmethod
+    def of(cls, stored: StoredView, device: torch.device) -> TrainView:
+        """A stored view on a device. The bytes travel and grow there: a fifth of what the tensors take."""
+
+        def sent(array: NDArray[Any] | Tensor) -> Tensor:
+            return torch.as_tensor(array).to(device, non_blocking=True)
+
+        everywhere = torch.ones(1, *stored.rgb.shape[:2], device=device)
+        return cls(
+            name=stored.name,
+            view=stored.view,
+            kind=stored.kind,
+            rgb=sent(stored.rgb).permute(2, 0, 1).contiguous().float().div_(255),
+            channels=None if stored.channels is None else sent(stored.channels).long(),
+            confidence=everywhere if stored.confidence is None else sent(stored.confidence)[None].float().div_(255),
+            mask=everywhere.bool() if stored.mask is None else sent(stored.mask)[None],
+            sky=None if stored.sky is None else sent(stored.sky)[None],
+            depth=None if stored.depth is None else sent(stored.depth)[None],
+            lidar=LidarPixels(*map(sent, vars(stored.lidar).values())) if stored.lidar else None,
+            readout=stored.readout,
+        )
 
 
 @dataclass(frozen=True)
@@ -100,27 +120,6 @@ class StoredView:
         if self.channels is None:
             return np.full(np.broadcast(row, column).shape, UNLABELLED, np.uint8)
         return np.array([*classes, UNLABELLED], np.uint8)[np.minimum(self.channels[row, column], len(classes))]
-
-    def as_tensors(self, device: torch.device = CPU) -> TrainView:
-        """The view for a step, on a device. The bytes travel and grow there: a fifth of what the tensors take."""
-
-        def sent(array: NDArray[Any]) -> Tensor:
-            return torch.from_numpy(array).to(device, non_blocking=True)
-
-        everywhere = torch.ones(1, *self.rgb.shape[:2], device=device)
-        return TrainView(
-            name=self.name,
-            view=self.view,
-            kind=self.kind,
-            rgb=sent(self.rgb).permute(2, 0, 1).contiguous().float().div_(255),
-            channels=None if self.channels is None else sent(self.channels).long(),
-            confidence=everywhere if self.confidence is None else sent(self.confidence)[None].float().div_(255),
-            mask=everywhere.bool() if self.mask is None else sent(self.mask)[None],
-            sky=None if self.sky is None else sent(self.sky)[None],
-            depth=None if self.depth is None else sent(self.depth)[None],
-            lidar=None if self.lidar is None else self.lidar.to(device),
-            readout=self.readout,
-        )
 
 
 @dataclass(frozen=True)
@@ -268,7 +267,7 @@ def fused_lidar(cloud: FusedCloud, tracks: Sequence[Track]) -> Callable[[View], 
     drawn = ProjectConfig(near_m=1.0, far_m=MAX_LIDAR_M, occluder_m=0.2)
 
     def measured(view: View) -> LidarPixels:
-        seen = project_sparse(cloud, tracks, view, drawn, hide=True)
+        seen = project_cloud(cloud, {t.id: t.pose_at(view.time_s) for t in tracks}, view, drawn, hide=True)
         pixel = seen.valid.reshape(-1).nonzero()[:, 0]
         return LidarPixels(pixel, seen.depth.reshape(-1)[pixel].contiguous())
 
@@ -303,36 +302,31 @@ class _SweepCache:
     may ask."""
 
     def __init__(self, scene: Scene) -> None:
-        self._scene = scene
-        self._read: OrderedDict[str, _WorldSweep] = OrderedDict()
-        self._lock = threading.Lock()
-        self._most = SWEEPS_PER_SENSOR * len({sweep.sensor for sweep in scene.sweeps})
+        self._scene, self._sweeps = scene, dict[str, list[Sweep]]()
+        for sweep in scene.sweeps:
+            self._sweeps.setdefault(sweep.sensor, []).append(sweep)
+        self._lock = threading.Lock()  # who waits for a sweep that is being read need not read it, too
+        self._world = functools.lru_cache(SWEEPS_PER_SENSOR * len(self._sweeps))(self._read)
 
     def pixels_of(self, view: View) -> LidarPixels | None:
         """Depths of the nearest sweep of every sensor as seen by the view; None if no sweep is near in time."""
         clouds, gap_deg = [], 0.0
-        for sensor in dict.fromkeys(sweep.sensor for sweep in self._scene.sweeps):
-            sweeps = [sweep for sweep in self._scene.sweeps if sweep.sensor == sensor]
-            nearest = min(sweeps, key=lambda sweep: abs(sweep.time_s - view.time_s))
-            if abs(nearest.time_s - view.time_s) <= NEAREST_SWEEP_S:
-                found = self._world(nearest)
-                clouds.append(self._points_at(found, nearest, view.time_s))
+        for sensor, sweeps in self._sweeps.items():
+            index = min(range(len(sweeps)), key=lambda index: abs(sweeps[index].time_s - view.time_s))
+            if abs(sweeps[index].time_s - view.time_s) <= NEAREST_SWEEP_S:
+                with self._lock:
+                    found = self._world(sensor, index)
+                clouds.append(self._points_at(found, sweeps[index], view.time_s))
                 gap_deg = max(gap_deg, found[2])
         if not clouds:
             return None
         return lidar_pixels(view, points_as_read(self._scene, view, np.concatenate(clouds)), gap_deg)
 
-    def _world(self, sweep: Sweep) -> _WorldSweep:
-        with self._lock:
-            found = self._read.pop(sweep.id, None)
-            if found is None:
-                points = read_points(self._scene, sweep)
-                world = geometry.transform_points(sweep.world_from_lidar, points.xyz)
-                found = world, points.dt_s, largest_beam_gap(points.xyz)
-            self._read[sweep.id] = found
-            while len(self._read) > self._most:
-                self._read.popitem(last=False)
-        return found
+    def _read(self, sensor: str, index: int) -> _WorldSweep:
+        sweep = self._sweeps[sensor][index]
+        points = read_points(self._scene, sweep)
+        world = geometry.transform_points(sweep.world_from_lidar, points.xyz)
+        return world, points.dt_s, largest_beam_gap(points.xyz)
 
     def _points_at(self, found: _WorldSweep, sweep: Sweep, time_s: float) -> NDArray[np.float32]:
         """World points of a sweep, the points of every tracked box carried from when they were measured to
@@ -404,8 +398,9 @@ def keep(loaded: LoadedViews, count: int, folder: Path | None) -> Sequence[Store
                 place, left = left[: plane.nbytes].view(plane.dtype).reshape(plane.shape), left[room[name] :]
                 place[...] = plane
                 own[name] = place
-            lidar = stored.lidar and LidarPixels(*(torch.from_numpy(own.pop(name)) for name in vars(stored.lidar)))
-            places[index] = replace(stored, lidar=lidar, **own)
+            if stored.lidar is not None:
+                own["lidar"] = LidarPixels(*(torch.from_numpy(own.pop(name)) for name in vars(stored.lidar)))
+            places[index] = replace(stored, **own)
     return tuple(places[index] for index in range(count))
 
 

@@ -112,11 +112,9 @@ class ImageTower(nn.Module):
 
 
 def prepare_image(image: Tensor, side: int = 224) -> Tensor:
-    """Images f32[N,3,H,W] in [-1,1] squashed to side x side, in the tower's units of colour.
-
-    Where the image shrinks it is blurred first (Gaussian of deviation (factor - 1) / 2 pixels per axis, reflected at
-    the border), then read off bicubically with the corner pixels' centres kept in place.
-    """
+    """Images f32[N,3,H,W] in [-1,1] squashed to side x side, in the tower's units of colour. Where the image shrinks it
+    is blurred first (Gaussian of deviation (factor - 1) / 2 pixels per axis, reflected at the border), then read off
+    bicubically with the corner pixels' centres kept in place."""
     image = image.float()
     factors = (image.shape[-2] / side, image.shape[-1] / side)
     if max(factors) > 1:

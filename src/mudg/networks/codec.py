@@ -67,10 +67,8 @@ class ChannelNorm(nn.LayerNorm):
 
 
 def temporal_shift(x: Tensor, frames: int, share: int = 8) -> Tensor:
-    """Move 1/share of the channels one frame later and as many one frame earlier; ends keep their own.
-
-    `x` [B*T,C,h,w]. The following convolution then mixes neighbouring frames at no cost (Lin et al., "TSM").
-    """
+    """Move 1/share of the channels one frame later and as many one frame earlier; ends keep their own. `x` [B*T,C,h,w].
+    The following convolution then mixes neighbouring frames at no cost (Lin et al., "TSM")."""
     n, c, h, w = x.shape
     if frames == 1:
         return x
@@ -97,12 +95,10 @@ class DecoderBlock(nn.Module):
 
 
 class PatchCodec(nn.Module):
-    """Codec of the embedded model: linear 2x2 patches, 4 channels for colour and depth, class shares for semantics.
-
-    The colour basis is fitted once by `fit_color`; the decoder is trained by the `learn` verb on the three latents
+    """Codec of the embedded model: linear 2x2 patches, 4 channels for colour and depth, class shares for semantics. The
+    colour basis is fitted once by `fit_color`; the decoder is trained by the `learn` verb on the three latents
     together, so that edges agree between modalities; a missing modality is fed as zeros (it is trained with such
-    omissions). Depth keeps all four patch values, so its linear part loses nothing.
-    """
+    omissions). Depth keeps all four patch values, so its linear part loses nothing."""
 
     factor = 2
     rgb_mean: Tensor
@@ -135,10 +131,8 @@ class PatchCodec(nn.Module):
 
     @torch.no_grad()
     def fit_color(self, rgb: Tensor) -> None:
-        """Fit the colour basis (principal components of 2x2 patches) on images f32[N,3,H,W] in [0,1].
-
-        The two detail channels are scaled down by a further 1.5, so that they do not take a quarter of the loss.
-        """
+        """Fit the colour basis (principal components of 2x2 patches) on images f32[N,3,H,W] in [0,1]. The two detail
+        channels are scaled down by a further 1.5, so that they do not take a quarter of the loss."""
         patches = functional.pixel_unshuffle(rgb.double() * 2 - 1, 2).permute(0, 2, 3, 1).flatten(0, 2)
         mean = patches.mean(0)
         values, vectors = torch.linalg.eigh((patches - mean).T @ (patches - mean) / len(patches))
@@ -185,10 +179,8 @@ class PatchCodec(nn.Module):
     # decoding -------------------------------------------------------------------------------------
 
     def decode_raw(self, latents: dict[Modality, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """Decode latents [N,C,h,w] to rgb in [-1,1] [N,3,H,W], depth code [N,1,H,W] and class scores [N,19,H,W].
-
-        Not clamped; what training of the decoder differentiates.
-        """
+        """Decode latents [N,C,h,w] to rgb in [-1,1] [N,3,H,W], depth code [N,1,H,W] and class scores [N,19,H,W]. Not
+        clamped; what training of the decoder differentiates."""
         x = torch.cat([latents[m] for m in MODALITIES], 1).contiguous(memory_format=torch.channels_last)
         x = self.enter(x)
         for block in self.blocks:
@@ -212,10 +204,8 @@ class PatchCodec(nn.Module):
 
 
 def semantic_shares(ids: Tensor, factor: int = 2) -> Tensor:
-    """Share of each class among the labelled pixels of every factor x factor patch.
-
-    `ids` i64[..,H,W] -> f32[..,19,H/factor,W/factor]; sums to 1 over classes, to 0 where nothing is labelled.
-    """
+    """Share of each class among the labelled pixels of every factor x factor patch. `ids` i64[..,H,W] ->
+    f32[..,19,H/factor,W/factor]; sums to 1 over classes, to 0 where nothing is labelled."""
     lead = ids.shape[:-2]
     cells = functional.pixel_unshuffle(ids.clamp(min=0, max=CLASSES).reshape(-1, 1, *ids.shape[-2:]), factor)
     counts = torch.zeros(len(cells), CLASSES + 1, *cells.shape[-2:], device=ids.device)

@@ -17,21 +17,15 @@ from mudg.core.losses import lpips_distance, unit_features
 from mudg.core.metrics import Pair
 from mudg.core.native_ops import box_mean
 from mudg.networks.codec import PatchCodec
-from mudg.networks.folders import checked_state
+from mudg.networks.folders import ScoreNetwork
 
 OPPONENT: Final = ((0.299, 0.587, 0.114), (0.5, -0.5, 0.0), (0.25, 0.25, -0.5))
 
 
 class FilterBank(nn.Module):
-    """Fixed multi-scale features of an image ``[3, H, W]`` in [0, 1].
-
-    Args:
-        scales: number of octaves; the image must be at least ``4 * 2**scales`` pixels in each direction.
-
-    Returns (from ``forward``):
-        Per scale one tensor ``[C, h, w]``: normalised signed derivatives (2), their pooled energy (4 orientations) and
-        the blurred opponent colours (3); C = 9.
-    """
+    """Fixed features of an image ``[3, H, W]`` in [0, 1] at several scales, octaves apart; it must have at least ``4 *
+    2**scales`` pixels in each direction. Per scale one tensor ``[9, h, w]``: normalised signed derivatives (2), their
+    pooled energy (4 orientations) and the blurred opponent colours (3)."""
 
     CONTRAST_FLOOR: Final = 0.02
 
@@ -91,15 +85,10 @@ class _Slope(torch.autograd.Function):
 
 class CodecFeatures(nn.Module):
     """Features of an image ``[3, H, W]`` in [0, 1]: activations of the codec's decoder network on the image's own code.
-
     The codec's encoder is one linear map of 2x2 pixels; what the codec has learned about images lies in the decoder
     network, which was trained to restore what the code lost. Its stages (the first convolution and each residual block)
-    are the features, for the image at full, half and quarter size. Depth and classes are withheld, as in a part of the
-    codec's training.
-
-    Returns (from ``forward``):
-        Per size, largest first, and per stage one tensor ``[C, h, w]``.
-    """
+    are the features, for the image at full, half and quarter size: per size, largest first, and per stage one tensor
+    ``[C, h, w]``. Depth and classes are withheld, as in a part of the codec's training."""
 
     SIZES: Final = 3
 
@@ -185,20 +174,10 @@ def lpips_shapes(trunk: LpipsTrunk) -> dict[str, tuple[int, ...]]:
     return shapes
 
 
-class LpipsFeatures(nn.Module):
-    """A trunk of LPIPS 0.1 (Zhang et al. 2018) and its weights per channel, from tensors under the usual names.
-
-    Args:
-        state: ``net.slice1.0.weight``, ..., ``lin0.model.1.weight``, ..., as the lpips package names them; other
-            entries are left alone.
-        where: file name for errors.
-        trunk: AlexNet or VGG-16.
-        given: correct: colours are brought to [-1, 1] first. unscaled: they stay in [0, 1], as in much published code
-            of Gaussian scenes.
-
-    Raises:
-        InputError: a tensor is missing or has another shape.
-    """
+class LpipsFeatures(ScoreNetwork):
+    """A trunk of LPIPS 0.1 (Zhang et al. 2018), AlexNet or VGG-16, and its weights per channel, from tensors as the
+    lpips package names them; other entries are left alone. given: correct: colours are brought to [-1, 1] first.
+    unscaled: they stay in [0, 1], as in much published code of Gaussian scenes."""
 
     SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
     SMALLEST_PX: Final = 31
@@ -210,17 +189,15 @@ class LpipsFeatures(nn.Module):
         trunk: LpipsTrunk = "alex",
         given: LpipsInput = "correct",
     ) -> None:
-        super().__init__()
+        super().__init__(state, lpips_shapes(trunk), where, "LPIPS", lambda _: True)
         self.trunk, self.given = trunk, given
         for name, values in (("shift", self.SHIFT), ("scale", self.SCALE)):
             self.register_buffer(name, torch.tensor(values).view(1, 3, 1, 1))
-        for name, value in checked_state(state, lpips_shapes(trunk), where, "LPIPS", lambda _: True).items():
-            self.register_buffer(name.replace(".", "/"), value)
 
     @property
     def channel_weights(self) -> list[Tensor]:
         """Weights per channel, by stage."""
-        return [self.get_buffer(f"lin{stage}/model/1/weight").flatten() for stage in range(len(TRUNKS[self.trunk]))]
+        return [self.tensor(f"lin{stage}.model.1.weight").flatten() for stage in range(len(TRUNKS[self.trunk]))]
 
     def forward(self, rgb: Tensor) -> list[Tensor]:
         """Features ``[C, h, w]`` of the stages of an image ``[3, H, W]`` in [0, 1], at least 31 pixels a side."""
@@ -235,8 +212,8 @@ class LpipsFeatures(nn.Module):
                 if isinstance(step, int):
                     x = F.max_pool2d(x, step, 2)
                     continue
-                path = f"net/slice{number + 1}/{step.place}"
-                kernel, bias = self.get_buffer(f"{path}/weight"), self.get_buffer(f"{path}/bias")
+                name = f"net.slice{number + 1}.{step.place}"
+                kernel, bias = self.tensor(f"{name}.weight"), self.tensor(f"{name}.bias")
                 x = F.relu(F.conv2d(x, kernel, bias, step.stride, step.padding))
             features.append(x[0])
         return features
@@ -250,11 +227,9 @@ def reduced(image: Tensor) -> Tensor:
 
 
 class PerceptualDistance:
-    """``lpips_distance`` of a pair's colours in the features of a network; threads may call it.
-
-    The same truth is compared with one method after another: each thread keeps its features until another truth comes.
-    Pairs come on the CPU; what is compared goes to the device of the network here, and the number comes back.
-    """
+    """``lpips_distance`` of a pair's colours in the features of a network; threads may call it. The same truth is
+    compared with one method after another: each thread keeps its features until another truth comes. Pairs come on the
+    CPU; what is compared goes to the device of the network here, and the number comes back."""
 
     def __init__(
         self, features: nn.Module, weights: list[Tensor] | None = None, device: torch.device | None = None

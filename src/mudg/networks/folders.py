@@ -14,28 +14,47 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional
 
 from mudg.base import store, weights
 from mudg.base.errors import InputError, ResourceError
 
+NORM: Final = ("weight", "bias", "running_mean", "running_var")
+"""Tensors of a norm."""
+NORM_EPSILON: Final = 1e-3
 
-def checked_state(
-    state: Mapping[str, Tensor],
-    wanted: Mapping[str, tuple[int, ...]],
-    where: str,
-    network: str,
-    ignored: Callable[[str], bool] = lambda name: name.endswith(".bn.num_batches_tracked"),
-) -> dict[str, Tensor]:
-    """The wanted tensors of a score's network (name -> shape) as float32. ``where``: file name for errors. ``network``:
-    what to call it. ``ignored``: names that may be there and are not read. InputError: a tensor is missing, unknown,
-    has another shape, or holds impossible values."""
-    found = {name: value for name, value in state.items() if name in wanted or not ignored(name)}
-    weights.match_exactly(found, wanted, where, network)
-    weights.refuse_bad_values(found, where)
-    for name, value in found.items():
-        if name.endswith("running_var") and bool((value < 0).any()):
-            raise InputError("a variance lies below 0", where=f"{where}: {name}")
-    return {name: found[name].detach().float() for name in wanted}
+
+class ScoreNetwork(nn.Module):
+    """A fixed network of a score, always in evaluation mode, with the wanted tensors (name -> shape) as float32.
+    ``where``: file name for errors. ``network``: what to call it. ``ignored``: names that may be there and are not
+    read. InputError: a tensor is missing, unknown, has another shape, or holds impossible values."""
+
+    def __init__(
+        self,
+        state: Mapping[str, Tensor],
+        wanted: Mapping[str, tuple[int, ...]],
+        where: str,
+        network: str,
+        ignored: Callable[[str], bool] = lambda name: name.endswith(".bn.num_batches_tracked"),
+    ) -> None:
+        super().__init__()
+        found = {name: value for name, value in state.items() if name in wanted or not ignored(name)}
+        weights.match_exactly(found, wanted, where, network)
+        weights.refuse_bad_values(found, where)
+        for name, value in found.items():
+            if name.endswith("running_var") and bool((value < 0).any()):
+                raise InputError("a variance lies below 0", where=f"{where}: {name}")
+        for name in wanted:
+            self.register_buffer(name.replace(".", "/"), found[name].detach().float())
+
+    def tensor(self, name: str) -> Tensor:
+        """A tensor by its published name."""
+        return self.get_buffer(name.replace(".", "/"))
+
+    def normed(self, x: Tensor, name: str) -> Tensor:
+        """The norm of a convolution, and ReLU."""
+        weight, bias, mean, variance = (self.tensor(f"{name}.bn.{leaf}") for leaf in NORM)
+        return functional.relu(functional.batch_norm(x, mean, variance, weight, bias, eps=NORM_EPSILON))
 
 
 # folders ------------------------------------------------------------------------------------------
@@ -90,14 +109,8 @@ def read_settings(file: Path) -> dict[str, Any]:
 
 def load_network(network_class: Any, folder: Path, device: torch.device = CPU, subfolder: str = "") -> nn.Module:
     """A network with all its weights, in float32 on its device, ready for use; its parameters have no gradient.
-
-    Args:
-        network_class: class of transformers or diffusers. folder: as ``save_pretrained`` writes it.
-        device: where it shall compute. subfolder: part of the folder that holds this network.
-
-    Raises:
-        InputError: the folder does not hold this network, or not all of it.
-    """
+    network_class: class of transformers or diffusers. folder: as ``save_pretrained`` writes it, or the folder around
+    ``subfolder``. InputError: the folder does not hold this network, or not all of it."""
     where = str(folder / subfolder)
     options: dict[str, Any] = {"local_files_only": True, "use_safetensors": True, "output_loading_info": True}
     if subfolder:

@@ -11,17 +11,16 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from mudg.base.errors import InputError
 from mudg.core.pictures import bilinear_from_corner
-from mudg.networks.folders import checked_state
+from mudg.networks.folders import NORM, ScoreNetwork
 
 SIDE_PX: Final = 224
 WIDTH: Final = 400
 SHORTEST: Final = 9
 """Fewest frames of a clip that leave two steps after three halvings."""
-NORM_EPSILON: Final = 1e-3
 
 VideoRule = Literal["videogpt", "google", "stylegan-v"]
 """How a frame u8[H, W, 3] becomes f32[3, 224, 224] in [-1, 1].
@@ -30,8 +29,6 @@ VideoRule = Literal["videogpt", "google", "stylegan-v"]
 * google: squashed to 224x224, bilinear, pixel k of the result at k * in / out. The original FVD.
 * stylegan-v: squashed to 224x224, bilinear, half-pixel centres, no antialiasing.
 """
-
-_NORM: Final = ("weight", "bias", "running_mean", "running_var")
 
 
 class _Cube(NamedTuple):
@@ -99,7 +96,7 @@ def tensor_shapes() -> dict[str, tuple[int, ...]]:
     shapes: dict[str, tuple[int, ...]] = {}
     for unit in _units():
         shapes[f"{unit.name}.conv3d.weight"] = (unit.out, unit.into, *(unit.size,) * 3)
-        shapes |= {f"{unit.name}.bn.{leaf}": (unit.out,) for leaf in _NORM}
+        shapes |= {f"{unit.name}.bn.{leaf}": (unit.out,) for leaf in NORM}
     return {**shapes, "logits.conv3d.weight": (WIDTH, 1024, 1, 1, 1), "logits.conv3d.bias": (WIDTH,)}
 
 
@@ -111,25 +108,15 @@ def _units() -> Iterator[_Cube]:
             yield from step.units().values()
 
 
-class I3DFeatures(nn.Module):
-    """The network, always in evaluation mode, from the tensors of ``tensor_shapes`` in either layout; counts of batches
-    are left alone. ``where``: file name for errors. InputError: a tensor is missing, has another shape, holds
-    impossible values, or is unknown."""
+class I3DFeatures(ScoreNetwork):
+    """The network from the tensors of ``tensor_shapes`` in either layout; counts of batches are left alone."""
 
     def __init__(self, state: Mapping[str, Tensor], where: str = "I3D weights") -> None:
-        super().__init__()
-        for name, value in checked_state(with_known_names(state), tensor_shapes(), where, "I3D").items():
-            self.register_buffer(name.replace(".", "/"), value)
+        super().__init__(with_known_names(state), tensor_shapes(), where, "I3D")
 
     def forward(self, clips: Tensor) -> Tensor:
-        """Scores before the softmax, averaged over time: FVD's features.
-
-        Args:
-            clips: ``[n, 3, T, 224, 224]`` in [-1, 1], T >= 9.
-
-        Returns:
-            ``[n, 400]``.
-        """
+        """FVD's features ``[n, 400]``, scores before the softmax, averaged over time, of clips ``[n, 3, T, 224, 224]``
+        in [-1, 1], T >= 9."""
         fits = clips.dim() == 5 and clips.shape[1] == 3 and clips.shape[3:] == (SIDE_PX, SIDE_PX)
         if not fits or clips.shape[2] < SHORTEST:
             expected = f"[n, 3, T >= {SHORTEST}, {SIDE_PX}, {SIDE_PX}]"
@@ -145,15 +132,12 @@ class I3DFeatures(nn.Module):
                 pooled = _maxima(x, _Pool((3, 3, 3), (1, 1, 1)))
                 parts = of["b0"](x), of["b1b"](of["b1a"](x)), of["b2b"](of["b2a"](x)), of["b3b"](pooled)
                 x = torch.cat(parts, 1)
-        weight, bias = self.get_buffer("logits/conv3d/weight"), self.get_buffer("logits/conv3d/bias")
+        weight, bias = self.tensor("logits.conv3d.weight"), self.tensor("logits.conv3d.bias")
         return F.conv3d(F.avg_pool3d(x, (2, 7, 7), 1), weight, bias).mean((2, 3, 4))
 
     def _convolved(self, unit: _Cube, x: Tensor) -> Tensor:
-        path = unit.name.replace(".", "/")
         x = same_padded(x, (unit.size,) * 3, (unit.stride,) * 3)
-        x = F.conv3d(x, self.get_buffer(f"{path}/conv3d/weight"), None, unit.stride)
-        weight, bias, mean, variance = (self.get_buffer(f"{path}/bn/{leaf}") for leaf in _NORM)
-        return F.relu(F.batch_norm(x, mean, variance, weight, bias, training=False, eps=NORM_EPSILON))
+        return self.normed(F.conv3d(x, self.tensor(f"{unit.name}.conv3d.weight"), None, unit.stride), unit.name)
 
 
 def same_padded(x: Tensor, size: tuple[int, int, int], stride: tuple[int, int, int]) -> Tensor:

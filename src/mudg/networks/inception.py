@@ -11,14 +11,13 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from mudg.base.errors import InputError
 from mudg.core.pictures import bilinear_from_corner, resize_bicubic
-from mudg.networks.folders import checked_state
+from mudg.networks.folders import NORM, ScoreNetwork
 
 SIDE_PX: Final = 299
-NORM_EPSILON: Final = 1e-3
 WIDTH: Final = 2048
 CLASSES: Final = 1008
 KNOWN_SHA256: Final = "6726825d0af5f729cebd5821db510b11b1cfad8faad88a03f1befd49fb9129b2"
@@ -128,11 +127,8 @@ def tensor_shapes() -> dict[str, tuple[int, ...]]:
     shapes: dict[str, tuple[int, ...]] = {}
     for name, into, (_, out, size, _, _) in _units():
         shapes[f"{name}.conv.weight"] = (out, into, *size)
-        shapes |= {f"{name}.bn.{leaf}": (out,) for leaf in _NORM}
+        shapes |= {f"{name}.bn.{leaf}": (out,) for leaf in NORM}
     return {**shapes, "fc.weight": (CLASSES, WIDTH), "fc.bias": (CLASSES,)}
-
-
-_NORM: Final = ("weight", "bias", "running_mean", "running_var")
 
 
 def _units() -> Iterator[tuple[str, int, _Unit]]:
@@ -157,17 +153,13 @@ def _units() -> Iterator[tuple[str, int, _Unit]]:
         width = total
 
 
-class InceptionFeatures(nn.Module):
-    """The network, always in evaluation mode, from the tensors of ``tensor_shapes``; counts of batches are left alone.
-    ``where``: file name for errors. InputError: a tensor is missing, has another shape, holds values that are not
-    finite or a variance below 0, or is unknown."""
+class InceptionFeatures(ScoreNetwork):
+    """The network from the tensors of ``tensor_shapes``; counts of batches are left alone."""
 
     def __init__(self, state: Mapping[str, Tensor], where: str = "Inception weights") -> None:
-        super().__init__()
-        self._units = {name: unit for name, _, unit in _units()}
         network = "FID's Inception (pt_inception-2015-12-05-6726825d.pth; torchvision's is another network)"
-        for name, value in checked_state(state, tensor_shapes(), where, network).items():
-            self.register_buffer(name.replace(".", "/"), value)
+        super().__init__(state, tensor_shapes(), where, network)
+        self._units = {name: unit for name, _, unit in _units()}
 
     def forward(self, images: Tensor) -> Tensor:
         """Features of FID, the average over all places: ``[n, 3, 299, 299]`` from ``prepared`` -> ``[n, 2048]``."""
@@ -197,11 +189,8 @@ class InceptionFeatures(nn.Module):
 
     def _convolved(self, name: str, x: Tensor) -> Tensor:
         _, _, (tall, wide), stride, same = self._units[name]
-        path = name.replace(".", "/")
         padding = (tall // 2, wide // 2) if same else 0
-        x = F.conv2d(x, self.get_buffer(f"{path}/conv/weight"), None, stride, padding)
-        weight, bias, mean, variance = (self.get_buffer(f"{path}/bn/{leaf}") for leaf in _NORM)
-        return F.relu(F.batch_norm(x, mean, variance, weight, bias, training=False, eps=NORM_EPSILON))
+        return self.normed(F.conv2d(x, self.tensor(f"{name}.conv.weight"), None, stride, padding), name)
 
 
 def _pooled(kind: str, x: Tensor) -> Tensor:

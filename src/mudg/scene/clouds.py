@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import store
-from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import InputError, IntegrityError
 from mudg.base.geometry import invert
-from mudg.base.types import EgoPath, FusedCloud, PointCloud, SweepPoints
+from mudg.base.types import SAME_COLORS, CameraColors, EgoPath, FusedCloud, PointCloud, SweepPoints
 
 # returns ------------------------------------------------------------------------------------------
 # Sensors and drivers write beams without a return among the points: as (0, 0, 0), as NaN, or with a range of zero. In a

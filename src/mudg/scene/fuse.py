@@ -14,11 +14,10 @@ from PIL import Image
 
 from mudg.base import config as configuration
 from mudg.base import log, store
-from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import InputError
 from mudg.base.geometry import transform_points
 from mudg.base.run_folder import RunDir
-from mudg.base.types import Frame, FusedCloud, Photo, Scene
+from mudg.base.types import SAME_COLORS, CameraColors, Frame, FusedCloud, Photo, Scene
 from mudg.core.calibration import match_cameras
 from mudg.core.fusion import (
     STATIC,

@@ -21,7 +21,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from mudg import native
-from mudg.base import log, palette, store
+from mudg.base import log, store
 from mudg.base.devices import choose_device
 from mudg.base.processes import computed_ahead, one_torch_thread
 from mudg.base.records import understood
@@ -131,32 +131,28 @@ def baseline_of(scene: Scene, cloud: FusedCloud) -> Baseline:
     """The fused points drawn at a view, every hole taking the nearest point in the image: no learning at all."""
 
     def draw(view: View) -> Observation:
-        placed = ((track.id, track.pose_at(view.time_s)) for track in scene.tracks)
-        return nearest_fill(cloud, {name: pose for name, pose in placed if pose is not None}, view)
+        return nearest_fill(cloud, {track.id: track.pose_at(view.time_s) for track in scene.tracks}, view)
 
     return draw
 
 
-def nearest_fill(cloud: FusedCloud, world_from_object: Mapping[str, NDArray[np.float64]], view: View) -> Observation:
+def nearest_fill(
+    cloud: FusedCloud, world_from_object: Mapping[str, NDArray[np.float64] | None], view: View
+) -> Observation:
     """Draw a cloud and fill what no point covers with the nearest covered pixel's colour, depth and class. A view that
     sees no point at all is black, without depth and class."""
     drawn = project.project_cloud(cloud, world_from_object, view, BASELINE_DRAWING)
     height, width = view.camera.height, view.camera.width
-    index = drawn.index.numpy()
-    if (index < 0).all():
+    if not drawn.valid.any():
         row, column = np.mgrid[0:height, 0:width]
     else:
-        row, column = distance_transform_edt(index < 0, return_distances=False, return_indices=True)
-    layers = [cloud.static, *(points for _, points in project.drawn_objects(cloud, world_from_object))]
-    semantics = None
-    if all(layer.semantics is not None for layer in layers):
-        known = np.concatenate([layer.semantics for layer in layers if layer.semantics is not None])
-        ids = np.append(known, palette.UNLABELLED)[index]  # index -1 = nothing = the appended entry
-        semantics = torch.from_numpy(ids[row, column].astype(np.int64))
-    rgb, depth = (torch.from_numpy(plane.numpy()[:, row, column]) for plane in (drawn.color, drawn.depth))
+        row, column = distance_transform_edt(~drawn.valid.numpy(), return_distances=False, return_indices=True)
+    classed = all(points.semantics is not None for points in (cloud.static, *cloud.objects.values()))
+    semantics = drawn.semantics[row, column].long() if classed else None
+    rgb, depth = drawn.rgb[:, row, column], drawn.depth[row, column][None]
     depth = torch.where(depth > 0, depth, torch.nan).float()
     mask = torch.ones(1, height, width, dtype=torch.bool)
-    return Observation(view, rgb, depth, semantics, drawn.valid.float(), mask, "virtual", BASELINE)
+    return Observation(view, rgb, depth, semantics, drawn.valid[None].float(), mask, "virtual", BASELINE)
 
 
 @dataclass(frozen=True)
@@ -177,7 +173,7 @@ def _score(
     motion, exact_motion = metrics.ExactMotion(), metrics.ExactMotion(reference.vehicles)
     build = lambda: metrics.build_all(reference.distances, motion, metrics.build_facts(exact_motion))
     sums = {name: build() for name in names} | {TRUTH: metrics.build_facts(exact_motion)}
-    counted = trajectory.counted(reference.held_out)
+    counted = reference.counted(trajectory)
     wanted = _wanted(trajectory, reference, counted)
     truth_has: set[str] = set()
     scored = 0
@@ -213,9 +209,7 @@ def _score(
                     scored += 1
                     truth_has |= _contents(made.truth, exact)
                 if reference.error_pictures and number == every // 2:
-                    picture = _error_picture(made.seen, made.truth.seen)
-                    path = out / "errors" / f"{trajectory.name}.png"
-                    store.write_image(path, picture, optimize=False, compress_level=1)
+                    write_errors(out / "errors" / f"{trajectory.name}.png", made.seen, made.truth.seen)
             for name, values in made.measured.items():
                 for metric, value in values.items():
                     sums[name][metric].add(value)
@@ -243,7 +237,7 @@ def _wanted(trajectory: ScoredTrajectory, reference: Reference, counted: Sequenc
     every_frame = {"temporal_flickering"} | ({"flicker", "warp_error"} if reference.truth.exact else set())
     needs_weights = reference.distances.keys()  # "flicker" and "temporal_flickering" want all views, in order
     usual = {name for name, row in metrics.METRICS.items() if row.build is not None}
-    usual = (usual | {*metrics.FACTS}) - {*needs_weights, *metrics.EVERY_VIEW}
+    usual -= {*needs_weights, *metrics.EVERY_VIEW}
     return [
         every_frame | (usual if n in counted else set()) | (needs_weights if n in sampled else set())
         for n in range(len(trajectory.views))
@@ -325,9 +319,10 @@ def pair_of(
     return metrics.Pair(*made, *truths, mask=true.mask, moving=truth.moving, view=true.view, facts=facts)
 
 
-def _error_picture(seen: Mapping[str, Observation], true: Observation) -> NDArray[np.uint8]:
-    """Truth and the methods beside each other, their colour errors below."""
+def write_errors(path: Path, seen: Mapping[str, Observation], true: Observation) -> None:
+    """A picture: truth and the methods beside each other, their colour errors below."""
     height, width = true.view.camera.height, true.view.camera.width
     images = [true.rgb, *(resize_rgb(observation.rgb, height, width) for observation in seen.values())]
     errors = [np.zeros((height, width, 3), np.uint8), *(error_image(rgb, true.rgb) for rgb in images[1:])]
-    return np.vstack([np.hstack([to_bytes(rgb) for rgb in images]), np.hstack(errors)])
+    picture = np.vstack([np.hstack([to_bytes(rgb) for rgb in images]), np.hstack(errors)])
+    store.write_image(path, picture, optimize=False, compress_level=1)

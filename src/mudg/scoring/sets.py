@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from mudg.base import log, seeds, store
 from mudg.base.devices import choose_device
@@ -25,7 +25,7 @@ from mudg.core import feature_distances
 from mudg.core.feature_distances import frechet_distance
 from mudg.core.pictures import resize_rgb, to_bytes
 from mudg.editing.settings import ScoreConfig
-from mudg.networks import i3d, inception
+from mudg.networks import folders, i3d, inception
 from mudg.networks.featnets import LpipsFeatures, LpipsTrunk, lpips_shapes
 from mudg.scene.observations import ObservationSet, read_observations
 from mudg.scene.read import read_image
@@ -157,26 +157,61 @@ class TrajectorySets:
     methods: Mapping[str, ImageSet]
     truth: ImageSet | None
 
+    @classmethod
+    def of(
+        cls, trajectory: ScoredTrajectory, reference: Reference, out: Path, counted: Sequence[int]
+    ) -> TrajectorySets:
+        """The images at the counted views of a trajectory whose views have been scored and written."""
 
-@dataclass
+        def chosen(views: ObservationSet, indices: Sequence[int]) -> ImageSet:
+            return ImageSet(len(counted), lambda number: views.rgb_u8(indices[counted[number]]))
+
+        def true_image(number: int) -> NDArray[np.uint8]:
+            place = counted[number]
+            true = reference.truth.at_view(trajectory.views[place], trajectory.frames[place], trajectory.name)
+            if true is None:
+                raise InputError("a view has no ground truth", where=f"{trajectory.name}, view {place}")
+            return to_bytes(true.seen.rgb)
+
+        methods = {name: chosen(found, trajectory.indices[name]) for name, found in trajectory.sets.items()}
+        every = range(len(trajectory.views))
+        if reference.baseline is not None:
+            methods = {BASELINE: chosen(read_observations(out / BASELINE / trajectory.name), every), **methods}
+        truth = None
+        if reference.truth.exact and trajectory.shift_m != 0.0:
+            if reference.truth.stored:
+                truth = ImageSet(len(counted), true_image)
+            else:
+                truth = chosen(read_observations(out / "truth" / trajectory.name), every)
+        camera = trajectory.views[0].camera
+        return cls(trajectory.name, trajectory.camera, camera.width, camera.height, methods, truth)
+
+
 class EmbeddingFiles:
     """Features of sets of images by a network, kept in a folder: what went through the same network before is read, by
-    the hash of ``key`` (weights and rules) and pixels. ``network``: images ``[n, 3, h, w]`` -> ``[n, width]``.
-    ``prepare``: an image u8[H, W, 3] as the network wants it."""
+    the hash of weights, rule and pixels. ``network``: of tensors and the name of their file. ``weights``: that file.
+    ``prepare``: an image u8[H, W, 3] as the network wants it, by a rule. InputError: the file is missing, damaged, or
+    holds another network."""
 
-    network: Callable[[Tensor], Tensor]
-    prepare: Callable[[NDArray[np.uint8]], Tensor]
-    width: int
-    key: str
-    folder: Path
-    device: torch.device
+    def __init__(
+        self,
+        network: Callable[[Tensors, str], nn.Module],
+        weights: Path,
+        prepare: Callable[..., Tensor],
+        rule: str,
+        width: int,
+        name: str,
+        folder: Path,
+        device: torch.device,
+    ) -> None:
+        self.weights, self.rule, self.width, self.folder, self.device = weights, rule, width, folder, device
+        self.network = network(read_checkpoint(weights), str(weights)).to(device)
+        self.prepare, self.sha256 = functools.partial(prepare, rule=rule), store.sha256_file(weights)
+        self.key = name.format(f"{self.sha256} {rule}")
 
-    def of(self, images: ImageSet) -> NDArray[np.float32]:
-        """Features f32[n, width], read from the folder if these very pixels were seen before."""
-        return self.named(images)[1]
-
-    def named(self, images: ImageSet) -> tuple[str, NDArray[np.float32]]:
-        """The name of the file that holds the features ("" where there are none), and the features f32[n, width]."""
+    def of(self, images: ImageSet) -> tuple[str, NDArray[np.float32]]:
+        """The name of the file that holds the features ("" where there are none), and the features f32[n, width]: read
+        from the folder if these very pixels were seen before."""
         shape = self.rows(images.count), self.width
         if not shape[0]:
             return "", np.zeros(shape, np.float32)
@@ -207,17 +242,11 @@ class EmbeddingFiles:
 
 
 class FeatureFiles(EmbeddingFiles):
-    """Features f32[n, 2048] of sets of images by FID's network, kept in a folder. ``weights``: file of the network's;
-    ``rule``: how images get its size. InputError: the file is missing, damaged, or holds another network."""
+    """Features f32[n, 2048] of sets of images by FID's network. ``rule``: how images get its size."""
 
     def __init__(self, weights: Path, rule: inception.ResizeRule, folder: Path, device: torch.device) -> None:
-        state, sha256 = read_checkpoint(weights), store.sha256_file(weights)
-        network = inception.InceptionFeatures(state, str(weights)).to(device)
-        prepare = functools.partial(inception.prepared, rule=rule)
-        key = f"Inception {sha256} {rule}"
-        super().__init__(network, prepare, inception.WIDTH, key, folder, device)
-        self.rule: inception.ResizeRule = rule
-        self.sha256, self.source_sha256 = sha256, source_sha256(weights)
+        how = inception.prepared, rule, inception.WIDTH, "Inception {}"
+        super().__init__(inception.InceptionFeatures, weights, *how, folder, device)
 
 
 EVERY_SECOND: Final = (lambda rows: (rows[::2], rows[1::2]), "every second recorded frame against the others")
@@ -257,10 +286,10 @@ class SetComparison:
             return dict.fromkeys(counts, score_tables.TOO_FEW)
         key = (sets.camera, sets.width, sets.height)
         if key not in self._recorded:
-            self._recorded[key] = self._files.named(recorded)
+            self._recorded[key] = self._files.of(recorded)
         (name, reference), found = self._recorded[key], dict[str, Entry | str]()
         for method, images in sets.methods.items():
-            own, rows = self._files.named(images.resized(sets.width, sets.height))
+            own, rows = self._files.of(images.resized(sets.width, sets.height))
             # which files were compared, so that sets of several logs can be pooled
             self._sets.append({"trajectory": sets.name, "method": method, "made": own, "reference": name})
             found[method] = self._compare(rows, reference)
@@ -268,7 +297,7 @@ class SetComparison:
         pair = split(reference)
         if sets.truth is not None:
             how = "true images of the same views"
-            pair = self._files.of(sets.truth.resized(sets.width, sets.height)), reference
+            pair = self._files.of(sets.truth.resized(sets.width, sets.height))[1], reference
         if min(map(len, pair)) >= FEWEST:
             entry = self._compare(*pair)
             self._floors.append({"trajectory": sets.name, "how": how, **entry.pop("values"), **entry})
@@ -284,7 +313,7 @@ def distributions(scene: Scene, files: FeatureFiles) -> SetComparison:
     facts = {
         "network": "Inception-v3 of 2015, global average, 2048 values",
         "weights_sha256": files.sha256,
-        "published_weights": files.source_sha256 == inception.KNOWN_SHA256,
+        "published_weights": source_sha256(files.weights) == inception.KNOWN_SHA256,
         "resize": files.rule,
         "reference": "recorded frames of the same camera",
         "covariance": "n - 1",
@@ -323,15 +352,11 @@ HOP_FRAMES: Final = 8
 
 
 class ClipFiles(EmbeddingFiles):
-    """Features f32[clips, 400] of the clips of a video by FVD's network, kept in a folder; see ``FeatureFiles``."""
+    """Features f32[clips, 400] of the clips of a video by FVD's network. ``rule``: how frames get its size."""
 
     def __init__(self, weights: Path, rule: i3d.VideoRule, folder: Path, device: torch.device) -> None:
-        state, self.sha256 = read_checkpoint(weights), store.sha256_file(weights)
-        self.rule: i3d.VideoRule = rule
-        network = i3d.I3DFeatures(state, str(weights)).to(device)
-        key = f"I3D {self.sha256} {rule} {CLIP_FRAMES} {HOP_FRAMES}"
-        prepare = functools.partial(i3d.prepared_frame, rule=rule)
-        super().__init__(network, prepare, i3d.WIDTH, key, folder, device)
+        how = i3d.prepared_frame, rule, i3d.WIDTH, f"I3D {{}} {CLIP_FRAMES} {HOP_FRAMES}"
+        super().__init__(i3d.I3DFeatures, weights, *how, folder, device)
 
     def rows(self, images: int) -> int:
         """See ``EmbeddingFiles``: one per clip."""
@@ -363,7 +388,7 @@ def videos(scene: Scene, files: ClipFiles) -> SetComparison:
     made = {
         "network": "I3D, Kinetics-400, scores before the softmax, 400 values",
         "weights_sha256": files.sha256,
-        "norm_epsilon": i3d.NORM_EPSILON,
+        "norm_epsilon": folders.NORM_EPSILON,
         "resize": files.rule,
         "clip_frames": CLIP_FRAMES,
         "hop_frames": HOP_FRAMES,
@@ -404,14 +429,16 @@ class SetScores:
                 bar.advance(len(rows))
 
     def _add(self, trajectory: ScoredTrajectory, rows: Scored, reference: Reference, out: Path) -> None:
-        counted, every = trajectory.counted(reference.held_out), range(len(trajectory.views))
+        counted, every = reference.counted(trajectory), range(len(trajectory.views))
         for name, comparison in self.comparisons.items():
-            images = _sets_of(trajectory, reference, out, counted if name == "distributions" else every)
+            images = TrajectorySets.of(trajectory, reference, out, counted if name == "distributions" else every)
             entry, found = name.removesuffix("s"), comparison.of(images)
             for row in rows:
                 of = found[row["method"]]
-                row["values"] |= dict.fromkeys(SET_SIZES[entry], of) if isinstance(of, str) else dict(of["values"])
-                if not isinstance(of, str):
+                if isinstance(of, str):
+                    row["values"] |= dict.fromkeys(SET_SIZES[entry], of)
+                else:
+                    row["values"] |= of["values"]
                     row[entry] = {name: value for name, value in of.items() if name != "values"}
         for metric, (entry, source) in self.detected.items():
             _add_detected(rows, metric, entry, source, trajectory, counted, reference)
@@ -464,33 +491,6 @@ def anchors_of(results: Scored, trajectories: Sequence[ScoredTrajectory]) -> lis
     return found
 
 
-def _sets_of(trajectory: ScoredTrajectory, reference: Reference, out: Path, counted: Sequence[int]) -> TrajectorySets:
-    """The images at the counted views of a trajectory whose views have been scored and written."""
-
-    def chosen(views: ObservationSet, indices: Sequence[int]) -> ImageSet:
-        return ImageSet(len(counted), lambda number: views.rgb_u8(indices[counted[number]]))
-
-    def true_image(number: int) -> NDArray[np.uint8]:
-        place = counted[number]
-        true = reference.truth.at_view(trajectory.views[place], trajectory.frames[place], trajectory.name)
-        if true is None:
-            raise InputError("a view has no ground truth", where=f"{trajectory.name}, view {place}")
-        return to_bytes(true.seen.rgb)
-
-    methods = {name: chosen(found, trajectory.indices[name]) for name, found in trajectory.sets.items()}
-    every = range(len(trajectory.views))
-    if reference.baseline is not None:
-        methods = {BASELINE: chosen(read_observations(out / BASELINE / trajectory.name), every), **methods}
-    truth = None
-    if reference.truth.exact and trajectory.shift_m != 0.0:
-        if reference.truth.stored:
-            truth = ImageSet(len(counted), true_image)
-        else:
-            truth = chosen(read_observations(out / "truth" / trajectory.name), every)
-    camera = trajectory.views[0].camera
-    return TrajectorySets(trajectory.name, trajectory.camera, camera.width, camera.height, methods, truth)
-
-
 def _add_detected(
     rows: Scored,
     metric: str,
@@ -512,9 +512,8 @@ def _add_detected(
     for row in rows:
         indices = trajectory.indices.get(row["method"], tuple(range(len(trajectory.views))))
         images = ViewImages(f"{row['method']}/{trajectory.name}", tuple(indices[n] for n in counted), views)
-        value = source.of(images)
-        row["values"][metric] = value if isinstance(value, str) else value["value"]
         row.setdefault("anchors", {})[metric] = beside
-        if isinstance(value, str):
-            continue
-        row[entry] = {k: v for k, v in value.items() if k != "value"}
+        row["values"][metric] = value = source.of(images)
+        if not isinstance(value, str):
+            row["values"][metric] = value.pop("value")
+            row[entry] = value

@@ -118,17 +118,13 @@ def _judged(
                 raise InputError(what, where=where, expected=str(len(true)), got=str(len(beams)), remedy=remedy)
             yield sweep, beams, Measured(true.range_m, true.intensity)
         elif world is not None:
-            yield sweep, beams, _exact(world, beams)
-
-
-def _exact(world: CityWorld, beams: Beams) -> Measured:
-    """What the beams meet in a generated city."""
-    places, directions = np.zeros((len(beams), 3)), np.zeros((len(beams), 3))
-    for share in np.unique(beams.share):
-        own, pose = np.flatnonzero(beams.share == share), beams.pose(float(share))
-        places[own], directions[own] = pose[:3, 3], beams.directions[own] @ pose[:3, :3].T
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return Measured(*world.ranges(places, directions, beams.start_s + beams.share * (beams.end_s - beams.start_s)))
+            places, directions = np.zeros((len(beams), 3)), np.zeros((len(beams), 3))
+            for moment in np.unique(share):
+                own, pose = np.flatnonzero(share == moment), beams.pose(float(moment))
+                places[own], directions[own] = pose[:3, 3], beams.directions[own] @ pose[:3, :3].T
+            directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+            fired_s = sweep.start_s + share * (sweep.end_s - sweep.start_s)
+            yield sweep, beams, Measured(*world.ranges(places, directions, fired_s))
 
 
 class NearestSweep:
@@ -150,8 +146,7 @@ class NearestSweep:
         for share, own in beams.parts(SLICES):
             pose, poses = beams.pose(share), {}
             for name, track in self._tracks.items():
-                at = track.pose_at(beams.time_s(share))
-                if at is not None:
+                if (at := track.pose_at(beams.time_s(share))) is not None:
                     poses[name] = at
             xyz, numbers = placed(parts, poses, pose[:3, 3])
             local = np.stack([xyz[:, 0] * a + xyz[:, 1] * b + xyz[:, 2] * c for a, b, c in pose[:3, :3].T], 1)

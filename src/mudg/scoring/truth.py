@@ -8,8 +8,8 @@ A folder of truth (``write_truth``) holds one observation folder per trajectory 
 
 from __future__ import annotations
 
+import functools
 import re
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -196,11 +196,11 @@ class LogPoints:
         self.scene = scene
         self._rules = FusionRules()
         self.dynamic: tuple[Track, ...] = tuple(t for t in scene.tracks if judge_track(t, self._rules).moving)
+        self._sweeps = {sweep.id: sweep for sweep in scene.sweeps}
         self._sensors: dict[str, list[Sweep]] = {}
         for sweep in scene.sweeps:
             self._sensors.setdefault(sweep.sensor, []).append(sweep)
-        self._kept: dict[str, OwnedPoints] = {}
-        self._lock = threading.Lock()
+        self._sweep_points = functools.lru_cache(KEPT_SWEEPS)(self._read)
 
     def of_moment(self, time_s: float) -> OwnedPoints | None:
         """Points of the sweep of each LiDAR that was taken with an image, or None without one."""
@@ -248,27 +248,20 @@ class LogPoints:
     def _merged(self, sweeps: Sequence[Sweep]) -> OwnedPoints | None:
         if not sweeps:
             return None
-        parts = [self._read(sweep) for sweep in sweeps]
+        parts = [self._sweep_points(sweep.id) for sweep in sweeps]
         joined = [np.concatenate([getattr(part, name) for part in parts]) for name in ("xyz", "owner", "ids")]
         return OwnedPoints(*joined, gap_deg=min(part.gap_deg for part in parts))
 
-    def _read(self, sweep: Sweep) -> OwnedPoints:
-        kept = self._kept.get(sweep.id)
-        if kept is None:
-            points = read_points(self.scene, sweep)
-            shots = SweepShots(sweep.time_s, sweep.world_from_lidar, points, ())
-            owner, owned = separate(shots, self.dynamic, self._rules)
-            xyz = geometry.transform_points(sweep.world_from_lidar, points.xyz).astype(np.float32)
-            for number, local in owned.items():
-                xyz[owner == number] = local
-            ids = points.classes
-            known = np.full(len(xyz), palette.UNLABELLED, np.uint8) if ids is None else ids
-            kept = OwnedPoints(xyz, owner, known, largest_beam_gap(points.xyz))
-            with self._lock:
-                while len(self._kept) >= KEPT_SWEEPS:
-                    del self._kept[next(iter(self._kept))]
-                self._kept[sweep.id] = kept
-        return kept
+    def _read(self, sweep_id: str) -> OwnedPoints:
+        sweep = self._sweeps[sweep_id]
+        points = read_points(self.scene, sweep)
+        shots = SweepShots(sweep.time_s, sweep.world_from_lidar, points, ())
+        owner, owned = separate(shots, self.dynamic, self._rules)
+        xyz = geometry.transform_points(sweep.world_from_lidar, points.xyz).astype(np.float32)
+        for number, local in owned.items():
+            xyz[owner == number] = local
+        ids = np.full(len(xyz), palette.UNLABELLED, np.uint8) if points.classes is None else points.classes
+        return OwnedPoints(xyz, owner, ids, largest_beam_gap(points.xyz))
 
 
 def shown_frame(scene: Scene, frame: Frame, rgb: NDArray[np.uint8]) -> ShownFrame | None:
@@ -293,9 +286,7 @@ class FactMaker:
     """Makes the facts of views; threads may call."""
 
     def __init__(self, scene: Scene) -> None:
-        self._scene = scene
-        self._points = LogPoints(scene)
-        self._vehicles = vehicles_of(scene)
+        self._scene, self._points, self._vehicles = scene, LogPoints(scene), vehicles_of(scene)
         self._path = driven_path(scene.ego.world_from_ego)
 
     def of(self, view: View, truth: ViewTruth | None) -> ViewFacts:
@@ -342,9 +333,9 @@ class FactMaker:
         """Outlines of all tracked boxes, bool[H, W]."""
         mask = np.zeros((view.camera.height, view.camera.width), bool)
         for track in self._scene.tracks:
-            pose = track.pose_at(view.time_s)
-            outline = None if pose is None else box_outline(view, pose, track.size_m)
-            mask = mask if outline is None else mask | outline
+            if (pose := track.pose_at(view.time_s)) is not None:
+                outline = box_outline(view, pose, track.size_m)
+                mask = mask if outline is None else mask | outline
         return mask
 
 
@@ -384,11 +375,6 @@ class ScoredTrajectory:
     sets: Mapping[str, ObservationSet]
     indices: Mapping[str, tuple[int, ...]]
 
-    def counted(self, held_out: frozenset[str]) -> list[int]:
-        """The views that count. Recorded training frames were seen by the fit and do not; views off the path never
-        were."""
-        return [n for n, frame in enumerate(self.frames) if frame is None or frame.id in held_out]
-
     def record(self) -> dict[str, Any]:
         """The trajectory as JSON values."""
         camera, indices = self.views[0].camera, {m: list(i) for m, i in self.indices.items()}
@@ -412,6 +398,11 @@ class Reference:
     distance_views: int
     facts: FactMaker
     vehicles: tuple[tuple[int, Track], ...]
+
+    def counted(self, trajectory: ScoredTrajectory) -> list[int]:
+        """The views that count. Recorded training frames were seen by the fit and do not; views off the path never
+        were."""
+        return [n for n, frame in enumerate(trajectory.frames) if frame is None or frame.id in self.held_out]
 
 
 def trajectories_of(config: ScoreConfig, scene: Scene, methods: Mapping[str, Path]) -> list[ScoredTrajectory]:

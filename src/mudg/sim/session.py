@@ -452,7 +452,7 @@ class Canvas:
         self.rgb[:, *where] = seen.rgb.numpy()
         self.distance[where] = seen.depth.numpy() / rays[..., 2]
         self.classes[where] = seen.semantics.numpy()
-        self.certainty[where] = _certainty(seen)
+        self.certainty[where] = seen.sure().numpy()
         if instances is not None:
             self.instances[where] = instances
 
@@ -463,7 +463,7 @@ class Canvas:
         self.rgb[:, *place] = bilinear(seen.rgb.numpy(), face.uv)
         self.distance[place] = face.surface(seen.depth.numpy())[0]
         self.classes[place] = nearest(seen.semantics.numpy(), face.uv)
-        self.certainty[place] = nearest(_certainty(seen), face.uv)
+        self.certainty[place] = nearest(seen.sure().numpy(), face.uv)
         if instances is not None:
             self.instances[place] = nearest(instances, face.uv)
 
@@ -480,12 +480,6 @@ def _repaired(mixer: RenderMixer, view: View, rendered: RenderedCondition) -> Re
 def _background(model: SceneModel) -> Matrix:
     """Places f64[N, 3] of the Gaussians that stand still."""
     return model.table["means"].detach()[: model.counts()[0]].cpu().numpy().astype(np.float64)
-
-
-def _certainty(seen: RenderedCondition) -> NDArray[np.float32]:
-    """Certainty f32[H, W]; half the coverage for scenes that measured none."""
-    certainty = 0.5 * seen.alpha if seen.certainty is None else seen.certainty
-    return np.where(np.isfinite(seen.depth.numpy()), certainty.numpy(), 0.0).astype(np.float32)
 
 
 def _pose(value: ArrayLike, where: str) -> Matrix:

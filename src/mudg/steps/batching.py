@@ -32,7 +32,7 @@ from mudg.fleet.plan import (
     refuse_address,
     shard_of,
 )
-from mudg.fleet.records import BatchFolder, Ended, read_status, slurm_tasks_left, text_of
+from mudg.fleet.records import BatchFolder, Ended, slurm_tasks_left
 from mudg.fleet.settings import BatchConfig
 from mudg.fleet.work import DONE, STOPPED, Job, Stop, is_open
 from mudg.steps.settings import PresetName, RunConfig, run_preset
@@ -151,12 +151,6 @@ def _with_absolute_paths(values: Any) -> Any:
         return {name: _with_absolute_paths(value) for name, value in values.items()}
     is_path = isinstance(values, str) and "/" in values and os.path.exists(values)
     return os.path.abspath(values) if is_path else values
-
-
-def show_status(out: str) -> dict[str, Any]:
-    """How far a batch is, what has failed and what it took."""
-    state = read_status(BatchFolder(Path(out)))
-    return {**state, "text": text_of(state)}
 
 
 def settings_of(preset: PresetName, config: Path | None, given: Sequence[str]) -> RunConfig:

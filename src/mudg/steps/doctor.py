@@ -10,15 +10,12 @@ from collections import Counter
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from mudg.base.errors import plain_lines
 from mudg.base.memory import free_bytes, in_words
 from mudg.base.versions import installed, origin, plugins, version
 from mudg.steps.step import Flag, Step
-
-if TYPE_CHECKING:
-    from mudg.scene.check import Finding
 
 
 class Doctor(Step):
@@ -52,20 +49,25 @@ def report_machine() -> dict[str, Any]:
     same for people; ``ready``: everything needed is here."""
     from mudg import native
 
+    encoders: list[str] = []
+    if find_spec("av") is not None:
+        from mudg.formats.exporters.video import video_encoders
+
+        encoders = video_encoders()
+    shipped: Counter[str] = Counter()  # bytes of models
+    for file in (Path(__file__).resolve().parents[1] / "assets").rglob("*.safetensors"):
+        shipped[file.parent.name] += file.stat().st_size
     packages = {name: installed(name) or "missing" for name in _CORE}
     missing = [name for name, found in packages.items() if found == "missing"]
-    rows_of_torch, encoders, weights = _torch(), _encoders(), _weights()
-    problems = [
-        *([f"packages are missing: {', '.join(missing)}; reinstall mudg with pip"] if missing else []),
-        *(
-            []
-            if len(rows_of_torch) > 1
-            else ["torch cannot be imported; reinstall with pip install 'torch>=2.10,<2.14'"]
-        ),
-        *([] if native.library() is not None else [f"the native library is not in use: {native.REMEDY}"]),
-        *([] if encoders else ["PyAV has no H.264 encoder: reports will show pictures instead of videos"]),
-        *([] if weights else ["no diffusion model is shipped with this build: train one with mudg learn"]),
-    ]
+    rows_of_torch = _torch()
+    checks = (
+        (not missing, f"packages are missing: {', '.join(missing)}; reinstall mudg with pip"),
+        (len(rows_of_torch) > 1, "torch cannot be imported; reinstall with pip install 'torch>=2.10,<2.14'"),
+        (native.library() is not None, f"the native library is not in use: {native.REMEDY}"),
+        (encoders, "PyAV has no H.264 encoder: reports will show pictures instead of videos"),
+        (shipped, "no diffusion model is shipped with this build: train one with mudg learn"),
+    )
+    problems = [problem for fine, problem in checks if not fine]
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     sections: dict[str, dict[str, str]] = {
         "machine": {
@@ -83,7 +85,7 @@ def report_machine() -> dict[str, Any]:
         },
         "plugins": {f"importer {name}": origin(point) for name, point in plugins().items()},
         "video": {"encoders": ", ".join(encoders) or "none"},
-        "weights": weights,
+        "weights": {name: f"shipped with mudg, {in_words(size)}" for name, size in sorted(shipped.items())},
     }
     if installed("gsplat") and len(rows_of_torch) > 1:
         from mudg.core.raster import gsplat_cuda
@@ -93,10 +95,8 @@ def report_machine() -> dict[str, Any]:
     for title, rows in sections.items():
         lines += [title] if rows else []
         lines += [f"  {name:<18} {value}" for name, value in rows.items()]
-    lines += [
-        "",
-        *([f"problem: {problem}" for problem in problems] or ["everything that the default run needs is here"]),
-    ]
+    told = [f"problem: {problem}" for problem in problems] or ["everything that the default run needs is here"]
+    lines += ["", *told]
     return {**sections, "problems": problems, "ready": not problems, "text": plain_lines(lines)}
 
 
@@ -119,24 +119,6 @@ def _torch() -> dict[str, str]:
     return rows
 
 
-def _encoders() -> list[str]:
-    """Encoders of H.264 that PyAV has."""
-    if find_spec("av") is None:
-        return []
-    from mudg.formats.exporters.video import video_encoders
-
-    return video_encoders()
-
-
-def _weights() -> dict[str, str]:
-    """Models that are shipped, and their size."""
-    files = (Path(__file__).resolve().parents[1] / "assets").rglob("*.safetensors")
-    sizes: Counter[str] = Counter()
-    for file in files:
-        sizes[file.parent.name] += file.stat().st_size
-    return {name: f"shipped with mudg, {in_words(size)}" for name, size in sorted(sizes.items())}
-
-
 def report_scene(scene: Path) -> dict[str, Any]:
     """What is wrong or odd about a scene directory, that of a run, or a log in the neutral layout, as plain values;
     ``text`` is the same for people; ``exit_code`` is 3 if it cannot be used. Of a sound scene, ``alignment`` tells for
@@ -144,7 +126,9 @@ def report_scene(scene: Path) -> dict[str, Any]:
     from mudg.editing.runs import scene_of_run
     from mudg.formats.importers import RECOGNISERS
     from mudg.formats.importers.custom import check_log
+    from mudg.scene import check
     from mudg.scene.check import Finding, check_scene, worst_first
+    from mudg.scene.read import read_scene
 
     scene = scene if (scene / "scene.json").is_file() else scene_of_run(scene) or scene
     kind = next((name for name, looks_like in RECOGNISERS.items() if looks_like(scene)), "")
@@ -156,8 +140,13 @@ def report_scene(scene: Path) -> dict[str, Any]:
     alignment: dict[str, Any] = {}
     agreements: list[str] = []
     if not is_log and not any(f.level == "error" for f in found):
-        alignment, agreements, doubts = _alignment(scene)
-        found = worst_first([*found, *doubts])
+        for name, one in check.camera_alignment(read_scene(scene)).items():
+            alignment[name], text = check.to_json(one), check.describe(name, one)
+            if one.verdict == "doubtful":
+                found = [*found, Finding("warning", f"camera {name}", text.partition(": ")[2])]
+            else:
+                agreements.append(text)
+        found = worst_first(found)
     count = {level: sum(f.level == level for f in found) for level in ("error", "warning", "note")}
     lines = [f"{f.level}: {f.where}: {f.message}" for f in found] + agreements
     if count["error"]:
@@ -172,17 +161,3 @@ def report_scene(scene: Path) -> dict[str, Any]:
         "text": plain_lines(lines),
         "exit_code": 3 if count["error"] else 0,
     }
-
-
-def _alignment(path: Path) -> tuple[dict[str, Any], list[str], list[Finding]]:
-    """Records for JSON, sentences about cameras that fit or cannot be judged, and findings about those that do not."""
-    from mudg.scene import check as alignment
-    from mudg.scene.check import Finding
-    from mudg.scene.read import read_scene
-
-    found = alignment.camera_alignment(read_scene(path))
-    records = {name: alignment.to_json(one) for name, one in found.items()}
-    words = {name: alignment.describe(name, one) for name, one in found.items()}
-    doubtful = [name for name, one in found.items() if one.verdict == "doubtful"]
-    doubts = [Finding("warning", f"camera {name}", words[name].partition(": ")[2]) for name in doubtful]
-    return records, [text for name, text in words.items() if name not in doubtful], doubts

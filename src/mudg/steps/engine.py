@@ -35,8 +35,26 @@ class Result(Step):
         out: Path
         overwrite: bool = False
 
-    def act(self) -> Any:
-        return fill(self)
+    def act(self) -> Path:
+        """Make the result, or reuse it. A path that leads nowhere is refused before anything heavy is loaded."""
+        from mudg.base import store
+        from mudg.base.run_folder import ResultFile
+
+        for path in paths_of(self).values():
+            if path is not None:
+                store.require(Path(path))
+        if self.is_file:
+            step, inputs, make = ready(self)
+            with ResultFile.open(step.out, step.verb(), step.key_settings(), inputs, overwrite=step.overwrite) as file:
+                return file.reused() if file.complete else file.finish({**make(file), "inputs": inputs})
+        folder, make = opened(self)
+        if not folder.complete:
+            try:
+                folder.finish(make(folder))
+            except KeyboardInterrupt:
+                folder.pause()
+                raise
+        return folder.path
 
     def output(self) -> VerbOutput:
         """Verb, version and files, as the folder's record names them."""
@@ -56,10 +74,11 @@ class Result(Step):
 
     def reads(self) -> dict[str, Path | str | None]:
         """Files and folders that it reads, by their names in messages. The output must lie apart from all of them."""
+        from mudg.editing.script import read_edits
+
         paths = paths_of(self)
-        for path in [path for name, path in paths.items() if is_script(self, name) and path]:
-            script = script_of(Path(path))
-            paths |= {f"{path}: {name}": file for name, file in script.files().items()} if script is not None else {}
+        for path in [path for name, path in paths.items() if path and is_script(self, name)]:
+            paths |= {f"{path}: {name}": file for name, file in read_edits(Path(path)).files().items()}
         return paths
 
     def inputs(self) -> dict[str, str]:
@@ -98,32 +117,6 @@ class Result(Step):
         left there. Returns the summary for its record."""
         raise NotImplementedError
 
-    def resulting(self, folder: Path) -> Path:
-        """What `run` returns of the finished folder."""
-        return folder
-
-
-def fill(step: Result) -> Path:
-    """Make the result of a step, or reuse it. A path that leads nowhere is refused before anything heavy is loaded."""
-    from mudg.base import store
-    from mudg.base.run_folder import ResultFile
-
-    for path in paths_of(step).values():
-        if path is not None:
-            store.require(Path(path))
-    if step.is_file:
-        step, inputs, make = ready(step)
-        with ResultFile.open(step.out, step.verb(), step.key_settings(), inputs, overwrite=step.overwrite) as file:
-            return file.reused() if file.complete else file.finish({**make(file), "inputs": inputs})
-    step, folder, make = opened(step)
-    if not folder.complete:
-        try:
-            folder.finish(make(folder))
-        except KeyboardInterrupt:
-            folder.pause()
-            raise
-    return step.resulting(folder.path)
-
 
 def ready(step: Result) -> tuple[Result, dict[str, str], Make]:
     """A step as it is carried out, digests of what it reads, and what makes it: all that can be refused is, and nothing
@@ -138,9 +131,8 @@ def ready(step: Result) -> tuple[Result, dict[str, str], Make]:
     return step, inputs, step.prepare(inputs)
 
 
-def opened(step: Result) -> tuple[Result, RunDir, Make]:
-    """A step as it is carried out, its folder, and what fills it; a finished result is verified and said to be
-    reused."""
+def opened(step: Result) -> tuple[RunDir, Make]:
+    """The folder of a step, and what fills it; a finished result is verified and said to be reused."""
     from mudg.base.run_folder import RunDir
 
     step, inputs, make = ready(step)
@@ -149,7 +141,7 @@ def opened(step: Result) -> tuple[Result, RunDir, Make]:
         folder.reused()
     elif isinstance(step, Watched) and step.tensorboard:
         folder.watch()
-    return step, folder, make
+    return folder, make
 
 
 def paths_of(step: Step) -> dict[str, Path | str | None]:

@@ -69,6 +69,7 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
     import torch
 
     from mudg import native
+    from mudg.viewer import report as run_report
 
     out = Path(out)
     if str(source) != CITY and not Path(source).exists():
@@ -79,39 +80,30 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
     torch.set_num_threads(native.default_threads())
     _Ledger.refuse_foreign(out, str(source))
     with locked(out / "lock"):
-        return _run_locked(config, source, out, overwrite)
-
-
-def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: bool) -> dict[str, Any]:
-    from mudg.viewer import report as run_report
-
-    ledger, page = _Ledger.open(out, config, str(source), overwrite), out / "report.html"
-    config = with_device(config)
-    try:
-        scene = _prepare_scene(config, source, out, ledger, overwrite)
-        for name, step in steps_of(config, scene, out, overwrite).items():
-            ledger.timed(name, step.out, step.run)
-        names = sorted(path.parent.relative_to(out).as_posix() for path in out.rglob(store.MANIFEST))
-        digests = {name: store.sha256_file(out / name / store.MANIFEST) for name in names if ".part" not in name}
-        reels = None
-        if digests != ledger.digests or not page.is_file():
-            store.remove(page)
-            ledger.digests = digests
-            ledger.timed("viewer", out / "viewer.html", lambda: _write_viewer(out))
-            reels = ledger.timed("report", page, lambda: run_report.film(out))
-    except KeyboardInterrupt:
-        ledger.save("interrupted")
-        raise
-    except MudgError:
-        ledger.save("failed")
-        raise
-    ledger.save("complete")
-    if reels is not None:  # written last, when the seconds of all steps are known
-        run_report.write_page(out, reels)
-        ledger.steps["report"]["written_bytes"] = folder_bytes(page)
+        ledger, page = _Ledger.open(out, config, str(source), overwrite), out / "report.html"
+        config = with_device(config)
+        try:
+            scene = _prepare_scene(config, source, out, ledger, overwrite)
+            for name, step in steps_of(config, scene, out, overwrite).items():
+                ledger.timed(name, step.out, step.run)
+            names = sorted(path.parent.relative_to(out).as_posix() for path in out.rglob(store.MANIFEST))
+            digests = {name: store.sha256_file(out / name / store.MANIFEST) for name in names if ".part" not in name}
+            reels = None
+            if digests != ledger.digests or not page.is_file():
+                store.remove(page)
+                ledger.digests = digests
+                ledger.timed("viewer", out / "viewer.html", lambda: _write_viewer(out))
+                reels = ledger.timed("report", page, lambda: run_report.film(out))
+        except (KeyboardInterrupt, MudgError) as error:
+            ledger.save("interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
+            raise
         ledger.save("complete")
-    text = _closing_text(out, page, ledger)
-    return {"report": page, "metrics": out / "score" / "metrics.json", "seconds": ledger.seconds(), "text": text}
+        if reels is not None:  # written last, when the seconds of all steps are known
+            run_report.write_page(out, reels)
+            ledger.steps["report"]["written_bytes"] = folder_bytes(page)
+            ledger.save("complete")
+        text = _closing_text(out, page, ledger)
+        return {"report": page, "metrics": out / "score" / "metrics.json", "seconds": ledger.seconds(), "text": text}
 
 
 def _write_viewer(out: Path) -> Path:
@@ -224,13 +216,11 @@ def _closing_text(out: Path, report: Path, ledger: _Ledger) -> str:
     from mudg.scoring import score
     from mudg.viewer.report import next_commands
 
-    form = "  {:<26}{:8.1f} s{:11.1f} s{:>12}{:>12}"
-    rows = [
-        form.format(
-            name, of.seconds, of.processor_s, in_words(of.peak_bytes or 0) if of.peak_bytes else "", in_words(size)
-        )
-        for name, (of, size) in ledger.rows().items()
-    ]
+    rows = []
+    for name, entry in ledger.steps.items():
+        of, size = Usage.of_record(entry), int(entry.get("written_bytes", 0))
+        peak = in_words(of.peak_bytes) if of.peak_bytes else ""
+        rows.append(f"  {name:<26}{of.seconds:8.1f} s{of.processor_s:11.1f} s{peak:>12}{in_words(size):>12}")
     head = f"  {'step':<26}{'time':>10}{'processor':>13}{'memory':>12}{'written':>12}"
     total = f"  {'total':<26}{sum(ledger.seconds().values()):8.1f} s"
     viewer = out / "viewer.html"
@@ -300,11 +290,11 @@ class _Ledger:
     @classmethod
     def _read(cls, path: Path) -> dict[str, Any]:
         """An earlier ledger; UsageError if the file is something else, as the run.json of a single verb is."""
+        content = store.json_object(path)
         try:
-            content = store.read_json(path)
             own = parse_record(_LedgerRecord, content, str(path)).asked.get("verb") == "run"
-        except InputError as error:
-            raise cls._foreign(path.parent) from error
+        except InputError:
+            own = False
         if not own:
             raise cls._foreign(path.parent)
         if not store.check_holds(content):
@@ -350,10 +340,6 @@ class _Ledger:
     def seconds(self) -> dict[str, float]:
         """Seconds per step, in order."""
         return {name: float(entry["seconds"]) for name, entry in self.steps.items()}
-
-    def rows(self) -> dict[str, tuple[Usage, int]]:
-        """What was taken and bytes written per step, in order."""
-        return {name: (Usage.of_record(of), int(of.get("written_bytes", 0))) for name, of in self.steps.items()}
 
     def save(self, state: str) -> None:
         """Write OUT/run.json."""

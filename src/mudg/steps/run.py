@@ -150,9 +150,10 @@ class BatchProgress(Step):
     """Folder of a batch."""
 
     def act(self) -> dict[str, Any]:
-        from mudg.steps import batching
+        from mudg.fleet.records import BatchFolder, read_status, text_of
 
-        return batching.show_status(self.out)
+        state = read_status(BatchFolder(Path(self.out)))
+        return {**state, "text": text_of(state)}
 
 
 class BatchRetry(Step):

@@ -24,16 +24,11 @@ if typing.TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Flag:
-    """What the command line knows of a field beyond its name, type, default and text.
-
-    Args:
-        metavar: what stands for the value in the help. FILE.yaml: an edit script.
-        position: "first": a word without a flag. "rest": all further words. "second": a flag; in Python, the second
-            argument, which needs no name.
-        part: the part of a run that the field reads ("scene", "fused", "model", "fitted", "start_from", "views"): the
-            folder of a run is taken for it.
-        hidden: only other steps set it; the command line and the function do not have it.
-    """
+    """What the command line knows of a field beyond its name, type, default and text. metavar: what stands for the
+    value in the help; FILE.yaml: an edit script. position: "first": a word without a flag; "rest": all further words;
+    "second": a flag; in Python, the second argument, which needs no name. part: the part of a run that the field reads
+    ("scene", "fused", "model", "fitted", "start_from", "views"): the folder of a run is taken for it. hidden: only
+    other steps set it; the command line and the function do not have it."""
 
     metavar: str = "FOLDER"
     position: Literal["", "first", "second", "rest"] = ""
@@ -343,25 +338,18 @@ def texts_of(kind: type[Any]) -> dict[str, str]:
     return texts
 
 
-_TEXTS: dict[str, dict[str, dict[str, str]]] = {}
-
-
+@functools.cache
 def _texts_of_module(source: str) -> dict[str, dict[str, str]]:
-    """Texts by class and field of one source file, read once."""
-    if source not in _TEXTS:
-        _TEXTS[source] = {}
-        with contextlib.suppress(OSError):
-            for node in ast.parse(Path(source).read_bytes()).body:
-                if isinstance(node, ast.ClassDef):
-                    _TEXTS[source][node.name] = dict(_texts_of_class(node))
-    return _TEXTS[source]
-
-
-def _texts_of_class(node: ast.ClassDef) -> Iterator[tuple[str, str]]:
-    for field, below in zip(node.body, node.body[1:], strict=False):
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(below, ast.Expr):
-            if isinstance(below.value, ast.Constant) and isinstance(below.value.value, str):
-                yield field.target.id, " ".join(below.value.value.split())
+    """Texts by class and field of one source file."""
+    texts: dict[str, dict[str, str]] = {}
+    with contextlib.suppress(OSError):
+        for node in ast.parse(Path(source).read_bytes()).body:
+            if isinstance(node, ast.ClassDef):
+                for pair in zip(node.body, node.body[1:], strict=False):
+                    match pair:
+                        case ast.AnnAssign(target=ast.Name(name)), ast.Expr(value=ast.Constant(str(text))):
+                            texts.setdefault(node.name, {})[name] = " ".join(text.split())
+    return texts
 
 
 # -- the function of a verb ------------------------------------------------------------------------

@@ -40,7 +40,7 @@ class Learn(Watched):
     def act(self) -> Path:
         from mudg.diffusion import learn
 
-        return learn.train(self.settings, self.out, self.output(), lambda: opened(self)[1])
+        return learn.train(self.settings, self.out, self.output(), lambda: opened(self)[0])
 
     def checked(self) -> Self:
         from mudg.diffusion import learn

@@ -20,9 +20,8 @@ from PIL import Image
 from scipy.spatial import KDTree
 
 from mudg.base import geometry, html, palette, seeds, store
-from mudg.base.camera_colors import CameraColors
 from mudg.base.errors import UsageError
-from mudg.base.types import Camera, Frame, Scene
+from mudg.base.types import Camera, CameraColors, Frame, Scene
 from mudg.baselines.bezier import BezierNode
 from mudg.baselines.omnire import DeformedNode
 from mudg.baselines.pvg import VibrationNode

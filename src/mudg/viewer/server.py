@@ -19,7 +19,6 @@ import threading
 import time
 import webbrowser
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
@@ -47,16 +46,6 @@ Answer = Callable[[Any], tuple[bytes, str]]
 TYPES: Final = {"html": "text/html; charset=utf-8", "bin": "application/octet-stream"}
 
 
-@dataclass(frozen=True)
-class Site:
-    """What is served. ``files``: name -> content; "" is the page. ``answers``: name -> what answers a POST with JSON
-    there. ``token``: secret that every request must bring, in the address, a cookie or a header."""
-
-    files: Mapping[str, bytes]
-    answers: Mapping[str, Answer]
-    token: str
-
-
 def token_for(host: str, token: str) -> str:
     """The secret of a page: the given one, or on the loopback address a random one. UsageError: another address without
     a token, or a token that is too short."""
@@ -79,16 +68,25 @@ def is_loopback(host: str) -> bool:
 
 class SiteServer(ThreadingHTTPServer):
     """Answers each connection in a thread. Those that only wait are cut off when they are late, or when others need
-    their room."""
+    their room. It listens at once; ``serve_forever`` is the caller's. ``files``: name -> content; "" is the page.
+    ``answers``: name -> what answers a POST with JSON there. ``token``: secret that every request must bring, in the
+    address, a cookie or a header. ResourceError: the port is taken, or the address is none of this machine."""
 
     request_queue_size = MOST_CONNECTIONS
     daemon_threads = True
 
-    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
+    def __init__(
+        self, files: Mapping[str, bytes], answers: Mapping[str, Answer], token: str, host: str, port: int
+    ) -> None:
+        self.files, self.answers, self.token = files, answers, token
         self._lock = threading.Lock()
         self._until: dict[socket.socket, float] = {}
         """Connections -> when their patience ends; infinity while they are answered."""
-        super().__init__(address, handler)
+        try:
+            super().__init__((host, port), SiteRequest)
+        except (OSError, OverflowError, UnicodeError) as error:  # a port, a name that cannot be
+            remedy = "choose another --port"
+            raise ResourceError("cannot listen", where=f"{host}:{port}", got=str(error), remedy=remedy) from error
 
     def server_bind(self) -> None:
         """Without the look-up of the machine's name that http.server makes, which may ask the network."""
@@ -151,16 +149,6 @@ class SiteServer(ThreadingHTTPServer):
             log.warn(f"viewer: a request could not be answered: {type(error).__name__}: {error}")
 
 
-def open_server(site: Site, host: str, port: int) -> SiteServer:
-    """A server that listens; ``serve_forever`` is the caller's. ResourceError: the port is taken, or the address is
-    none of this machine."""
-    try:
-        return SiteServer((host, port), type("OwnSiteRequest", (SiteRequest,), {"site": site}))
-    except (OSError, OverflowError, UnicodeError) as error:  # a port, a name that cannot be
-        remedy = "choose another --port"
-        raise ResourceError("cannot listen", where=f"{host}:{port}", got=str(error), remedy=remedy) from error
-
-
 def show(address: str, port: int, wanted: bool) -> bool:
     """Open a browser, or say how to reach the page from another machine; whether one was opened."""
     graphical = any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))) or os.name == "nt"
@@ -172,9 +160,8 @@ def show(address: str, port: int, wanted: bool) -> bool:
 
 
 class SiteRequest(BaseHTTPRequestHandler):
-    """Answers one request. ``site`` is set by ``open_server``."""
+    """Answers one request."""
 
-    site: Site
     protocol_version = "HTTP/1.1"
     server_version = "mudg"
     sys_version = ""
@@ -191,7 +178,7 @@ class SiteRequest(BaseHTTPRequestHandler):
         name = self._name()
         if name is None:
             return
-        content = self.site.files.get(name)
+        content = self.server.files.get(name)
         if content is None:
             self._answer(HTTPStatus.NOT_FOUND, b"no such file")
             return
@@ -202,7 +189,7 @@ class SiteRequest(BaseHTTPRequestHandler):
         name = self._name()
         if name is None:
             return
-        answer, host = self.site.answers.get(name), self.headers.get("Host")
+        answer, host = self.server.answers.get(name), self.headers.get("Host")
         if self.headers.get("Origin") not in (f"http://{host}", f"https://{host}"):
             self._answer(HTTPStatus.FORBIDDEN, b"a request from another page")
         elif answer is None:
@@ -257,7 +244,7 @@ class SiteRequest(BaseHTTPRequestHandler):
         brought += [value for name, _, value in cookies if name == COOKIE]
         if self.headers.get("Host", "") not in names and not anywhere:
             self._answer(HTTPStatus.FORBIDDEN, b"this server has another name")
-        elif not any(hmac.compare_digest(one.encode(), self.site.token.encode()) for one in brought):
+        elif not any(hmac.compare_digest(one.encode(), self.server.token.encode()) for one in brought):
             self._answer(HTTPStatus.FORBIDDEN, b"open the address that mudg view printed: it carries a token")
         else:
             return parts.path.removeprefix("/")
@@ -268,7 +255,7 @@ class SiteRequest(BaseHTTPRequestHandler):
     ) -> None:
         named = {"Content-Type": kind, "Content-Length": str(len(content))}
         if cookie:
-            named["Set-Cookie"] = f"{COOKIE}={self.site.token}; HttpOnly; SameSite=Strict; Path=/"
+            named["Set-Cookie"] = f"{COOKIE}={self.server.token}; HttpOnly; SameSite=Strict; Path=/"
         if status != HTTPStatus.OK:
             self.close_connection = True  # a body may be left unread
             named["Connection"] = "close"

@@ -56,7 +56,7 @@ from mudg.scene.read import read_scene
 from mudg.viewer import page as pages
 from mudg.viewer.page import CHUNK, ONE_FILE_BYTES, Packed, PageFile, ViewerPage, begin_of, key_rows
 from mudg.viewer.report import FAR_M, NEAR_M
-from mudg.viewer.server import Site, SiteServer, open_server, show, token_for
+from mudg.viewer.server import SiteServer, show, token_for
 from mudg.viewer.settings import PageConfig, ViewConfig
 
 PAGE_IMAGE_PX, LIVE_IMAGE_PX = 320, 640
@@ -545,9 +545,9 @@ def run_view(
     """Serve the page of a run until it is interrupted. ``edits``: the script that it begins with. ``edits_out``: where
     edits are saved. UsageError: an address that other machines reach, without a token. ResourceError: the port is
     taken. As ``run_page``."""
-    server, site = server_of(config, run, compare, scene, edits, edits_out)
+    server = server_of(config, run, compare, scene, edits, edits_out)
     host, port = server.server_address[:2]
-    address = f"http://{host!s}:{port}/?token={site.token}"
+    address = f"http://{host!s}:{port}/?token={server.token}"
     log.info(f"viewer: {address}   (Ctrl-C ends it)")
     show(address, port, config.browser)
     try:
@@ -566,8 +566,8 @@ def server_of(
     scene: Path | None,
     edits: Path | None = None,
     edits_out: Path | None = None,
-) -> tuple[SiteServer, Site]:
-    """The server of a run's page, listening, and what it serves."""
+) -> SiteServer:
+    """The server of a run's page, listening."""
     token, sources = token_for(config.host, config.token), find_sources(config, run, scene, compare)
     shown, mixers = sources.read(), list[RenderMixer]()
     if config.repair:
@@ -588,5 +588,4 @@ def server_of(
         served["report.html"] = store.read_bytes(report)
     device = drawing_device(config.device, "view")
     source = FrameSource(desk.edited, shown.scene, config.width_px, device, mixers)
-    site = Site(served, {"edits": desk.answer, "frame": source.png}, token)
-    return open_server(site, config.host, config.port), site
+    return SiteServer(served, {"edits": desk.answer, "frame": source.png}, token, config.host, config.port)

@@ -28,9 +28,6 @@ from mudg.core.raster import torch_twin
 if TYPE_CHECKING:
     from mudg.core.raster.rasterize import RasterConfig
 
-# whether the package gsplat can be used here, and why not. Imports it only in ``load`` ------------
-
-
 MINIMUM_VERSION: Final = (1, 5, 3)
 _usable = False
 
@@ -57,20 +54,16 @@ def compiled_kernels() -> Path | None:
     """The library of kernels that came with gsplat; None if gsplat compiles them when it first draws."""
     spec = importlib.util.find_spec("gsplat")
     folders = [] if spec is None else spec.submodule_search_locations or []
-    return next(
-        (file for folder in folders for file in sorted(Path(folder).glob("csrc*.*")) if file.suffix in (".so", ".pyd")),
-        None,
-    )
+    files = (file for folder in folders for file in sorted(Path(folder).glob("csrc*.*")))
+    return next((file for file in files if file.suffix in (".so", ".pyd")), None)
 
 
 def nvcc() -> str | None:
     """The CUDA compiler that gsplat would use, looked for where torch looks: CUDA_HOME, CUDA_PATH, PATH,
     /usr/local/cuda."""
     home = os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH")
-    named = [Path(home) / "bin" / "nvcc"] if home else []
-    found = shutil.which("nvcc")
-    places = [*named, *([Path(found)] if found else []), Path("/usr/local/cuda/bin/nvcc")]
-    return next((str(place) for place in places if place.is_file()), None)
+    places = (f"{home}/bin/nvcc" if home else "", shutil.which("nvcc") or "", "/usr/local/cuda/bin/nvcc")
+    return next((place for place in places if Path(place).is_file()), None)
 
 
 def _compiler_problem() -> str:
@@ -87,14 +80,11 @@ def _compiler_problem() -> str:
 
 def status() -> str:
     """One line for people: usable here, and where its kernels come from; or why not."""
-    reason = problem()
-    if reason:
+    if reason := problem():
         return f"cannot be used here: {reason}"
-    return (
-        "its kernels came with it"
-        if compiled_kernels()
-        else f"{nvcc()} compiles its kernels at the first picture (minutes, once)"
-    )
+    if compiled_kernels():
+        return "its kernels came with it"
+    return f"{nvcc()} compiles its kernels at the first picture (minutes, once)"
 
 
 def load() -> ModuleType:

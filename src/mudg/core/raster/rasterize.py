@@ -158,10 +158,7 @@ def _check(gaussians: Gaussians) -> None:
             raise InputError(what, where=f"gaussians.{name}", expected=f"{dtype} on {device}", got=got)
 
 
-# place --------------------------------------------------------------------------------------------
 # Which device Gaussians are drawn on, and so where everything that is learnt about them lives.
-
-
 DRAWN_ON: Final[dict[str, tuple[str, ...]]] = {
     "auto": ("cpu", "cuda"),
     "cpu": ("cpu",),
@@ -172,15 +169,10 @@ DRAWN_ON: Final[dict[str, tuple[str, ...]]] = {
 
 
 def drawing_device(wanted: str, purpose: str, backend: Backend = "auto") -> torch.device:
-    """The device for a purpose that draws Gaussians. Says which, once per purpose.
+    """The device (``wanted``: a ``DeviceName``) for a purpose that draws Gaussians. Says which, once per purpose.
 
     ``auto`` takes a CUDA device only if the backend can draw there: with backend ``auto``, if gsplat can be used.
-
-    Args:
-        wanted: a ``DeviceName``.
-
-    Raises:
-        UsageError: the backend does not draw on the device. See ``choose_device``.
+    UsageError: the backend does not draw on the device, or see ``choose_device``.
     """
     kinds = DRAWN_ON[backend]
     if wanted == "auto":

@@ -40,6 +40,41 @@ class Splats:
     depth: Tensor
     extents: Tensor
 
+    @classmethod
+    def of(
+        cls, parts: tuple[Tensor, Tensor, Tensor, Tensor], world_from_cam: Tensor, camera: Camera, config: RasterConfig
+    ) -> Splats:
+        """Means, quaternions, scales and opacity, projected; nonsense for what cannot be drawn."""
+        means, quats, scales, opacity = parts
+        cam_from_world = world_from_cam[:3, :3].T
+        mean_cam = (means - world_from_cam[:3, 3]) @ cam_from_world.T
+        depth = mean_cam[:, 2]
+        z = torch.where(depth > config.near_m, depth, torch.ones_like(depth))
+        slope = mean_cam[:, :2] / z[:, None]
+        focal = slope.new_tensor([camera.fx, camera.fy])
+        center, size = slope.new_tensor([camera.cx, camera.cy]), slope.new_tensor([camera.width, camera.height])
+        # The linearisation point is held within 1.3 times the field of view, where the approximation still makes sense.
+        slack = 0.15 * size / focal
+        held = torch.minimum(torch.maximum(slope, -center / focal - slack), (size - center) / focal + slack)
+        zero = torch.zeros_like(z)
+        jacobian = torch.stack(
+            [focal[0] / z, zero, -focal[0] * held[:, 0] / z, zero, focal[1] / z, -focal[1] * held[:, 1] / z], 1
+        ).view(-1, 2, 3)
+        unit = quats / quats.square().sum(1, keepdim=True).clamp_min(1e-24).sqrt()  # zero gives the identity
+        half = jacobian @ cam_from_world @ (rotation_of_unit(unit) * scales[:, None, :])  # unit sphere -> ellipse
+        sharp = half @ half.transpose(1, 2)
+        xx, xy, yy = sharp[:, 0, 0] + config.blur_px2, sharp[:, 0, 1], sharp[:, 1, 1] + config.blur_px2
+        # det = xx yy - xy^2, by way of the cross product of the two rows: no cancellation for needles.
+        sharp_det = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(1)
+        det = sharp_det + config.blur_px2 * (xx + yy - config.blur_px2)
+        if config.antialias:
+            opacity = opacity * (sharp_det / det).clamp_min(1e-6).sqrt()
+        conics = torch.stack([yy / det, -xy / det, xx / det], 1)
+        with torch.no_grad():
+            level = (2 * torch.log(opacity.clamp_min(1e-30) / ALPHA_MIN)).clamp_min(0)
+            extents = torch.stack([(level * xx).sqrt(), (level * yy).sqrt()], 1) + 1e-3
+        return cls(focal * slope + center, conics, opacity, depth, extents)
+
 
 def render(g: Gaussians, camera: Camera, world_from_cam: Tensor, config: RasterConfig, absgrad: bool) -> Render:
     """Draw with torch operations. See ``core.raster.rasterize``."""
@@ -79,52 +114,14 @@ def project(g: Gaussians, world_from_cam: Tensor, camera: Camera, config: Raster
     """Means and covariances into the image. What cannot be drawn (in front of ``near_m``, a covariance that overflows)
     gets extent 0 and harmless stand-in values, so that it can spoil neither images nor gradients."""
     with torch.no_grad():
-        first = _project((g.means, g.quats, g.scales, g.opacity), world_from_cam, camera, config)
+        first = Splats.of((g.means, g.quats, g.scales, g.opacity), world_from_cam, camera, config)
         proper = torch.isfinite(torch.cat([first.means2d, first.conics, first.extents], 1)).all(1)
         proper &= (first.conics[:, 0] > 0) & (first.conics[:, 2] > 0) & (first.depth > config.near_m)
     harmless = world_from_cam.detach()[:3, 3] + world_from_cam.detach()[:3, 2] * (config.near_m + 1)
     values = ((g.means, harmless), (g.quats, harmless.new_tensor([1.0, 0, 0, 0])), (g.scales, harmless.new_ones(3)))
     safe = [torch.where(proper[:, None], value, stand_in) for value, stand_in in values]
-    splats = _project((safe[0], safe[1], safe[2], g.opacity), world_from_cam, camera, config)
+    splats = Splats.of((safe[0], safe[1], safe[2], g.opacity), world_from_cam, camera, config)
     return replace(splats, extents=torch.where(proper[:, None], splats.extents, 0))
-
-
-def _project(
-    parts: tuple[Tensor, Tensor, Tensor, Tensor], world_from_cam: Tensor, camera: Camera, config: RasterConfig
-) -> Splats:
-    means, quats, scales, opacity = parts
-    cam_from_world = world_from_cam[:3, :3].T
-    mean_cam = (means - world_from_cam[:3, 3]) @ cam_from_world.T
-    depth = mean_cam[:, 2]
-    z = torch.where(depth > config.near_m, depth, torch.ones_like(depth))
-    slope = mean_cam[:, :2] / z[:, None]
-    focal = slope.new_tensor([camera.fx, camera.fy])
-    center, size = slope.new_tensor([camera.cx, camera.cy]), slope.new_tensor([camera.width, camera.height])
-    # The linearisation point is held within 1.3 times the field of view, where the approximation still makes sense.
-    slack = 0.15 * size / focal
-    held = torch.minimum(torch.maximum(slope, -center / focal - slack), (size - center) / focal + slack)
-    zero = torch.zeros_like(z)
-    jacobian = torch.stack(
-        [focal[0] / z, zero, -focal[0] * held[:, 0] / z, zero, focal[1] / z, -focal[1] * held[:, 1] / z], 1
-    ).view(-1, 2, 3)
-    half = jacobian @ cam_from_world @ (rotation_matrices(quats) * scales[:, None, :])  # unit sphere -> ellipse
-    sharp = half @ half.transpose(1, 2)
-    xx, xy, yy = sharp[:, 0, 0] + config.blur_px2, sharp[:, 0, 1], sharp[:, 1, 1] + config.blur_px2
-    # det = xx yy - xy^2, by way of the cross product of the two rows: no cancellation for needles.
-    sharp_det = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(1)
-    det = sharp_det + config.blur_px2 * (xx + yy - config.blur_px2)
-    if config.antialias:
-        opacity = opacity * (sharp_det / det).clamp_min(1e-6).sqrt()
-    conics = torch.stack([yy / det, -xy / det, xx / det], 1)
-    with torch.no_grad():
-        level = (2 * torch.log(opacity.clamp_min(1e-30) / ALPHA_MIN)).clamp_min(0)
-        extents = torch.stack([(level * xx).sqrt(), (level * yy).sqrt()], 1) + 1e-3
-    return Splats(focal * slope + center, conics, opacity, depth, extents)
-
-
-def rotation_matrices(quats: Tensor) -> Tensor:
-    """[N, 4] (w, x, y, z), any length, to rotations [N, 3, 3]. A zero quaternion gives the identity."""
-    return rotation_of_unit(quats / quats.square().sum(1, keepdim=True).clamp_min(1e-24).sqrt())
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:

@@ -17,10 +17,8 @@ from mudg.base.types import SweepPoints, View
 from mudg.base.weather_settings import FogSettings, RainSettings, SnowSettings, WeatherSettings
 
 # noise --------------------------------------------------------------------------------------------
-# Hashes and value noise of world places: the same numbers for every camera and frame.
-#
-# Twins of ``hash_bits``, ``hash01`` and ``noise2`` in native/city_math.h, so that the generated city can show the same
-# puddles and patches of snow.
+# Hashes and value noise of world places, the same for every camera and frame. Twins of ``hash_bits``, ``hash01`` and
+# ``noise2`` in native/city_math.h, so that the generated city can show the same puddles and patches of snow.
 
 
 Array = NDArray[np.float64]
@@ -56,6 +54,11 @@ def hash_bits(a: ArrayLike, b: ArrayLike, c: ArrayLike, d: ArrayLike | None = No
 def unit(h: Hashes) -> NDArray[np.float64]:
     """Numbers f64[...] in [0, 1) of hashes."""
     return (h >> np.uint32(8)).astype(np.float64) * (1.0 / 16777216.0)
+
+
+def noise_seed(seed: int, purpose: str) -> int:
+    """A seed of value noise, 0 to a million, for a purpose."""
+    return seeds.key(seed, 0, purpose) % 1_000_000
 
 
 def noise2(x: NDArray[np.floating], y: NDArray[np.floating], seed: int) -> NDArray[np.float64]:
@@ -103,13 +106,8 @@ def extinction(visibility_m: float) -> float:
 
 
 def way_below(range_m: Array, rise: Array, height_m: float, top_m: float) -> Array:
-    """Length f64[...] of the part of rays that runs below a height, metres.
-
-    Args:
-        range_m: distance along the ray, metres; infinite in the sky.
-        rise: sine of the ray's elevation.
-        height_m, top_m: of the camera, and of the limit, above the ground.
-    """
+    """Length f64[...] of the part of rays that runs below ``top_m`` above the ground, metres, seen from ``height_m``.
+    ``range_m``: distance along the ray, infinite in the sky; ``rise``: sine of its elevation."""
     with np.errstate(divide="ignore", invalid="ignore"):
         crossing = np.where(rise == 0, np.inf, (top_m - height_m) / rise)
         if height_m < top_m:
@@ -157,14 +155,8 @@ _MOST_STEPS = 400
 
 @dataclass(frozen=True, slots=True)
 class ParticleSize:
-    """Particles of about one size.
-
-    Args:
-        density: per cubic metre.
-        diameter_m: whose square is the mean square.
-        fall_m_s: speed towards the ground.
-        sway_m: amplitude of a horizontal swing.
-    """
+    """Particles of about one size: how many in a cubic metre, the diameter whose square is the mean square, the speed
+    towards the ground, and the amplitude of a horizontal swing."""
 
     density: float
     diameter_m: float
@@ -227,15 +219,7 @@ def _inside(view: View, xyz: Array, reach_m: float, margin_m: float) -> NDArray[
 
 def places(size: ParticleSize, velocity: Array, view: View, reach_m: float, key: int) -> Array:
     """World places f64[N, 3] at ``view.time_s`` of the particles that stand in the view's pyramid within the reach, and
-    a few beside it.
-
-    Args:
-        size: how many there are in a cubic metre.
-        velocity: f64[3] m/s, the same for all.
-        view: camera, pose and time.
-        reach_m: distance from the camera.
-        key: of the random numbers.
-    """
+    a few beside it. ``velocity``: f64[3] m/s, the same for all; ``key``: of the random numbers."""
     time_s = view.time_s
     cell = min(max((2.0 / size.density) ** (1 / 3), 0.25), 2.0)
     margin = cell + size.sway_m
@@ -272,12 +256,8 @@ def covered(view: View, depth: NDArray[np.floating], xyz: Array, velocity: Array
 
     A ball of w pixels that moves during the exposure covers, summed over pixels, pi/4 w^2 of one pixel on the axis,
     however long its streak is; off the axis its image is longer, by range over depth. That sum is spread evenly over
-    the streak; large balls have soft edges.
-
-    Args:
-        view: camera and pose.
-        depth: camera z of the surfaces f[H, W], metres.
-        xyz: world places f64[N, 3] at the middle of the exposure. velocity: f64[3] against the camera, m/s.
+    the streak; large balls have soft edges. ``depth``: camera z of the surfaces f[H, W], metres; ``xyz``: world places
+    f64[N, 3] at the middle of the exposure; ``velocity``: f64[3] against the camera, m/s.
     """
     camera = view.camera
     turn = view.world_from_cam[:3, :3]
@@ -364,29 +344,22 @@ LOST, HARD, SOFT = 0, 1, 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BeamReturns:
-    """A sweep in bad weather, for the same N beams.
-
-    Args:
-        range_m: f64[N]; of soft returns the place in the fog; where nothing returned the range that was given.
-        intensity: f64[N], received power against a white surface in clear air, times r^2: attenuated reflectance.
-        kind: u8[N]: 0 lost, 1 the surface, 2 fog.
-    """
+    """A sweep in bad weather, for the same N beams: ranges f64[N], of soft returns the place in the fog, where nothing
+    returned the range that was given; ``intensity`` f64[N], received power against a white surface in clear air, times
+    r^2 (attenuated reflectance); ``kind`` u8[N]: 0 lost, 1 the surface, 2 fog."""
 
     range_m: Array
     intensity: Array
     kind: NDArray[np.uint8]
 
 
-def soft_response(visibility_m: float, reach_m: float = 60.0, step_m: float = 0.02) -> tuple[Array, Array]:
-    """Power of the fog alone by recorded distance, in the units of ``THRESHOLD``.
+def soft_response(visibility_m: float) -> tuple[Array, Array]:
+    """Distances f64[M] in metres, and the power f64[M] of the fog alone recorded there, in the units of ``THRESHOLD``.
 
     ``beta_b`` times the integral over r' of ``exp(-2 alpha r') / r'^2`` x crossover x pulse, by the midpoint rule; the
     pulse is centred on the recorded distance and scaled so that a surface at r returns ``reflectance / pi / r^2``.
-
-    Returns:
-        Distances f64[M] in metres and powers f64[M].
     """
-    alpha = math.log(20.0) / visibility_m
+    alpha, reach_m, step_m = math.log(20.0) / visibility_m, 60.0, 0.02
     r = (np.arange(int(reach_m / step_m), dtype=np.float64) + 0.5) * step_m
     density = np.exp(-2 * alpha * r) / r**2 * np.clip((r - CROSS_FROM_M) / (CROSS_TO_M - CROSS_FROM_M), 0, 1)
     behind = (np.arange(int(2 * PULSE_M / step_m), dtype=np.float64) + 0.5) * step_m  # the front of the pulse
@@ -396,14 +369,8 @@ def soft_response(visibility_m: float, reach_m: float = 60.0, step_m: float = 0.
 
 
 def in_fog(range_m: Array, reflectance: Array, visibility_m: float, seed: int) -> BeamReturns:
-    """A sweep in fog. Only beams that hit a surface are known: beams into the sky stay without return.
-
-    Args:
-        range_m: f64[N] to the surface, metres.
-        reflectance: f64[N] of the surface times the cosine of incidence, 0 to 1.
-        visibility_m: meteorological optical range.
-        seed: of the jitter of soft returns.
-    """
+    """A sweep in fog, from ranges f64[N] to surfaces, metres, and their reflectance times the cosine of incidence
+    f64[N], 0 to 1. Only beams that hit a surface are known: beams into the sky stay without return."""
     range_m, reflectance = np.asarray(range_m, np.float64), np.asarray(reflectance, np.float64)
     alpha = math.log(20.0) / visibility_m
     hard = reflectance / math.pi / range_m**2 * np.exp(-2 * alpha * range_m)
@@ -436,18 +403,11 @@ def in_rain(range_m: Array, reflectance: Array, mm_h: float, seed: int) -> BeamR
 
 
 def sweep_in_weather(points: SweepPoints, weather: WeatherSettings, seed: int) -> tuple[SweepPoints, NDArray[np.uint8]]:
-    """A sweep as it would have been in fog and rain.
+    """A sweep, recorded in clear air, as it would have been in fog and rain: the points that return, moved along their
+    beams, and for each 1 = surface, 2 = fog, u8[N]. ``seed``: another for every sweep.
 
     The recorded intensity is taken as reflectance times the cosine of incidence, 0 to 1: sensors whose intensity means
     something else need it converted first. Snow in the air is not modelled.
-
-    Args:
-        points: in the LiDAR's frame, recorded in clear air.
-        weather: fog and rain of it.
-        seed: another for every sweep.
-
-    Returns:
-        The points that return, moved along their beams, and for each 1 = surface, 2 = fog, u8[N].
     """
     xyz = points.xyz.astype(np.float64)
     distance = np.maximum(np.linalg.norm(xyz, axis=1), 1e-3)
@@ -464,9 +424,9 @@ def sweep_in_weather(points: SweepPoints, weather: WeatherSettings, seed: int) -
         shown, intensity = np.where(hard, rain.range_m, shown), np.where(hard, rain.intensity, intensity)
         kind = np.where(hard, rain.kind, kind).astype(np.uint8)
     kept = kind != LOST
-    classes = (
-        None if points.classes is None else np.where(kind == SOFT, UNLABELLED, points.classes).astype(np.uint8)[kept]
-    )
+    classes = points.classes
+    if classes is not None:
+        classes = np.where(kind == SOFT, UNLABELLED, classes).astype(np.uint8)[kept]
     moved = (beams * shown[:, None]).astype(np.float32)[kept]
     result = SweepPoints(moved, np.clip(intensity, 0, 1).astype(np.float32)[kept], points.dt_s[kept], classes)
     return result, kind[kept]

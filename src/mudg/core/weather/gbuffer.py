@@ -28,18 +28,13 @@ KERBS_WITHIN_M = 20.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GBuffer:
-    """Surfaces behind the pixels of one view.
+    """Surfaces behind the pixels of one view: linear light ``color`` f32[H, W, 3] >= 0, camera z ``depth`` f32[H, W] in
+    metres (+inf in the sky), Cityscapes train ids u8[H, W], unit normals f32[H, W, 3] of the world towards the camera
+    (0 in the sky), and the share ``openness`` f32[H, W] of the sky that the surface sees.
 
-    Args:
-        color: f32[H, W, 3] linear light >= 0.
-        depth: f32[H, W] camera z in metres, +inf in the sky.
-        classes: u8[H, W] Cityscapes train ids, 255 = unknown.
-        normal: f32[H, W, 3] unit vectors of the world, towards the camera; 0 in the sky.
-        openness: f32[H, W] share of the sky that the surface sees, 0 to 1.
-        sunlit: f32[H, W] share of the recorded sun that reaches the surface, or None (then it is guessed from
-            brightness).
-        new_sunlit: the same for the sun of the light to change to, or None (then everything that faces it is lit).
-        camera_velocity: f64[3] of the camera, metres per second along the world's axes.
+    ``sunlit`` f32[H, W]: share of the recorded sun that reaches the surface (None: it is guessed from brightness);
+    ``new_sunlit``: the same for the sun to change to (None: everything that faces it is lit); ``camera_velocity``:
+    metres per second along the world's axes.
     """
 
     color: Image
@@ -74,6 +69,12 @@ def world_rays(view: View) -> tuple[Array, Array]:
     x, y = geometry.pixel_rays(view.camera)
     local = np.stack([*np.broadcast_arrays(x[None, :], y[:, None]), np.ones((len(y), len(x)))], -1)
     return local @ view.world_from_cam[:3, :3].T, np.linalg.norm(local, axis=-1)
+
+
+def rises(view: View) -> Array:
+    """Sine f64[H, W] of the elevation of the rays through pixel centres."""
+    rays, length = world_rays(view)
+    return rays[..., 2] / length
 
 
 def world_points(view: View, depth: NDArray[np.floating]) -> Array:
@@ -185,16 +186,12 @@ def from_render(
     heights: OccluderMap | None = None,
     smooth_px: int = 0,
 ) -> GBuffer:
-    """A G-buffer from the planes of a render.
+    """A G-buffer from the planes of a render: linear light f32[H, W, 3], camera z (0, negative or not finite = sky, as
+    is everything of that class) and classes u8[H, W].
 
-    Args:
-        view: of the render.
-        light: linear light f32[H, W, 3].
-        depth: camera z; 0, negative or not finite = sky, as is everything of that class.
-        classes: u8[H, W].
-        heights: height map of the drive; None = the sky's visibility is a guess by class.
-        smooth_px: radius in pixels over which inverse depth (median) and normals (mean, per class) are smoothed: 0 for
-            exact depth, about 2 for the depth of a fitted scene.
+    Without ``heights``, the height map of the drive, the sky's visibility is a guess by class. ``smooth_px``: radius in
+    pixels over which inverse depth (median) and normals (mean, per class) are smoothed: 0 for exact depth, about 2 for
+    the depth of a fitted scene.
     """
     sky = ~np.isfinite(depth) | (depth <= 0) | (classes == ID["sky"])
     clean = np.where(sky, np.inf, depth).astype(np.float32)
@@ -229,13 +226,9 @@ def sky_share(openness: NDArray[np.floating]) -> NDArray[np.floating]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OccluderMap:
-    """Largest height per cell of the ground plane. Things are solid down to the ground: below a bridge no sky is seen.
-
-    Args:
-        x0_m, y0_m: world place of the first cell's corner.
-        cell_m: side of a cell.
-        top_m: f32[rows along y, columns along x], -inf where nothing is known.
-    """
+    """Largest height ``top_m`` f32[rows along y, columns along x] per cell of the ground plane, -inf where nothing is
+    known, from the first cell's corner ``x0_m, y0_m`` on. Things are solid down to the ground: below a bridge no sky is
+    seen."""
 
     x0_m: float
     y0_m: float
@@ -316,16 +309,11 @@ def sun_visibility(gbuffer: GBuffer, view: View, heights: OccluderMap, direction
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surroundings:
-    """Light and ground of a drive, the same for all its frames and cameras. Radiances are f64[3] linear light;
-    irradiances are divided by pi, so that a white level surface in the open shows ``ambient + sun * cos``.
+    """Light and ground of a drive, the same for all its frames and cameras.
 
-    Args:
-        horizon, zenith: radiance of the sky.
-        ambient: irradiance of the sky.
-        sun: irradiance of the sun on a surface that faces it.
-        sun_direction: f64[3] towards the sun.
-        airlight: radiance of thick fog.
-        ground_z_m: height of the road below the camera.
+    Radiances of the sky and of thick fog (``airlight``) are f64[3] linear light; irradiances of the sky (``ambient``)
+    and of the sun on a surface that faces it are divided by pi, so that a white level surface in the open shows
+    ``ambient + sun * cos``. ``heights``: for shadows and snow (None: by class alone).
     """
 
     horizon: Array
@@ -335,6 +323,7 @@ class Surroundings:
     sun_direction: Array
     airlight: Array
     ground_z_m: float = 0.0
+    heights: OccluderMap | None = None
 
 
 def _quantile_color(colors: Image, share: float, otherwise: Array) -> Array:
@@ -350,13 +339,12 @@ def estimate_surroundings(views: Iterable[tuple[View, GBuffer]]) -> Surroundings
     ground has beyond the darkest, over the same albedo. Its direction is not found: straight above is assumed.
     The road's height is the median of its pixels.
     """
-    low, high, rises, rest, ground, heights = [], [], [], [], [], []
+    low, high, seen, rest, ground, heights = [], [], [], [], [], []
     for view, gbuffer in views:
-        rays, length = world_rays(view)
-        up, sky = rays[..., 2] / length, gbuffer.sky
+        up, sky = rises(view), gbuffer.sky
         low.append(gbuffer.color[sky & (up < 0.34)])
         high.append(gbuffer.color[sky & (up >= 0.34)])
-        rises.append((up[sky], gbuffer.color[sky]))
+        seen.append((up[sky], gbuffer.color[sky]))
         rest.append(gbuffer.color[~sky].reshape(-1, 3))
         road = gbuffer.classes == ID["road"]
         ground.append(gbuffer.color[road])
@@ -374,7 +362,7 @@ def estimate_surroundings(views: Iterable[tuple[View, GBuffer]]) -> Surroundings
     ambient, sun = ambient / too_bright, sun / too_bright
     z = np.concatenate(heights)
     ground_z = float(np.median(z)) if len(z) else 0.0
-    up, color = (np.concatenate(parts) for parts in zip(*rises, strict=True))
+    up, color = (np.concatenate(parts) for parts in zip(*seen, strict=True))
     lowest = color[up <= np.quantile(up, 0.1)] if len(up) else color
     airlight = _quantile_color(lowest, 0.5, horizon)
     airlight = airlight * min(1.0, BRIGHTEST_FOG / max(float(airlight.max()), 1e-6))

@@ -49,11 +49,17 @@ class Cloud:
     fields: Fields
     missing: int
 
+    def field(self, name: str, what: str, path: Path, remedy: str = "") -> NDArray:
+        """A field that the cloud must have; ``what`` it holds, for messages."""
+        if name not in self.fields:
+            got, expected = ", ".join(self.fields) or "coordinates only", f"a field {name!r}"
+            raise InputError(f"cloud has no {what}", where=str(path), expected=expected, got=got, remedy=remedy)
+        return self.fields[name]
+
 
 def read_cloud(path: Path, known: Collection[str] = ()) -> Cloud:
     """Read a cloud by the suffix of its name; ``known``: fields that the caller reads, or knows to be there, besides
-    ``USUAL``. Raises InputError: unknown suffix, cut off, sizes that contradict each other, no coordinates, values not
-    finite."""
+    ``USUAL``. Raises InputError: another suffix, cut off, contradictory, without coordinates, not finite."""
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         what = "point cloud format is not known"
@@ -151,11 +157,9 @@ def _pcd_fields(header: dict[str, list[str]], where: str) -> tuple[dict[str, tup
 
 
 def lzf_decompress(packed: bytes, length: int, where: str) -> bytes:
-    """Unpack LibLZF data to exactly ``length`` bytes.
-
-    A token below 32 is that many + 1 literal bytes. Any other copies from what was unpacked: its upper 3 bits + 2 are
-    the length (7: one more byte to add), its lower 5 bits and the next byte are how far back, less 1. Raises
-    InputError: reads or writes beyond an end, or another length comes out."""
+    """Unpack LibLZF data to exactly ``length`` bytes. A token below 32 is that many + 1 literal bytes. Any other copies
+    from what was unpacked: its upper 3 bits + 2 are the length (7: one more byte to add), its lower 5 bits and the next
+    byte are how far back, less 1."""
     out = bytearray(length)
     at = to = 0
     try:
@@ -218,7 +222,7 @@ def _float_rows(content: bytes, columns: int, what: str, where: str) -> NDArray[
 def read_float_rows(path: Path, columns: int, what: str = "scan") -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Rows of little-endian float32 without a header, as raw scans are kept: f32[N, columns], of which the first three
     are coordinates in the sensor's frame, and which of them are returns bool[N]. ``what``: what one file holds, for
-    messages. Raises InputError: missing, cut off, or values of a return that are not finite."""
+    messages."""
     rows = _float_rows(store.read_bytes(path), columns, what, str(path))
     returns = is_return(rows[:, :3])
     bad = ~np.isfinite(rows[returns]).all(1)

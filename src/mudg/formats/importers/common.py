@@ -29,7 +29,7 @@ from mudg.base.geometry import (
     yaw_matrix,
     yaw_of,
 )
-from mudg.base.types import EgoPath
+from mudg.base.types import Camera, EgoPath
 from mudg.scene import motion
 from mudg.scene.clouds import is_return, near_places
 from mudg.scene.schema import ref_problem
@@ -321,7 +321,25 @@ def nearest_index(sorted_times_s: NDArray[Any], times_s: NDArray[Any]) -> NDArra
     return np.searchsorted((sorted_times_s[1:] + sorted_times_s[:-1]) / 2, times_s)
 
 
-# --- poses ----------------------------------------------------------------------------------------
+# --- cameras and poses ----------------------------------------------------------------------------
+
+
+def pinhole_camera(
+    name: str, size: tuple[int, int], intrinsics: Any, where: str, lens: tuple[float, ...] = ()
+) -> Camera:
+    """A camera of ``size`` (width, height) from 3x3 intrinsics whose pixels are counted from the centre of the top-left
+    one, as OpenCV does: half a pixel is added here. Raises InputError: numbers that no pinhole camera has."""
+    try:
+        k = np.array(intrinsics, np.float64)
+    except (TypeError, ValueError):
+        k = np.zeros((0, 0))
+    off = k[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1] if k.shape == (3, 3) else np.array([np.nan])
+    if not np.isfinite(k).all() or not (np.abs(off) < 1e-6).all() or min(k[0, 0], k[1, 1]) <= 0:
+        what, expected = "intrinsics are not of a pinhole camera", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
+        remedy = "check the calibration"
+        raise InputError(what, where=where, expected=expected, got=str(intrinsics), remedy=remedy)
+    (fx, fy), (cx, cy) = np.diag(k)[:2].tolist(), k[:2, 2].tolist()
+    return Camera(name, *size, fx, fy, cx + 0.5, cy + 0.5, lens)
 
 
 def rigid_pose(matrix: ArrayLike, where: str) -> Matrix:

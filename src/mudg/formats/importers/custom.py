@@ -17,12 +17,12 @@ from pydantic import Field, WrapValidator
 from mudg.base import log, store
 from mudg.base.errors import InputError, MudgError, UsageError
 from mudg.base.records import Number, StrictRecord, checked_by, named_by, parse_record, place
-from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Shutter, Source, Sweep, SweepPoints, Track, View
+from mudg.base.types import EgoPath, Frame, Ref, Scene, Shutter, Source, Sweep, SweepPoints, Track, View
 from mudg.formats.importers import common
 from mudg.formats.importers.clouds import Cloud, read_cloud
 from mudg.formats.importers.common import ImportOptions
-from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
-from mudg.formats.importers.images import Lens, brown_conrady, equidistant, fit_images, image_notes
+from mudg.formats.importers.drive_log import CameraOptics, SceneContent, SceneImage, SceneSweep, write_scene
+from mudg.formats.importers.images import brown_conrady, equidistant, fit_images, image_notes
 from mudg.scene import check as scene_check
 from mudg.scene import schema
 from mudg.scene.check import Finding
@@ -172,15 +172,6 @@ class LogIndex(StrictRecord):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LogCamera:
-    """A camera as recorded, its lens (None = rectified images), and where it sits on the vehicle."""
-
-    camera: Camera
-    lens: Lens | None
-    ego_from_sensor: Matrix
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class LogItem:
     """One image or cloud, seconds since the start, with its own pose if the log gives one."""
 
@@ -191,6 +182,12 @@ class LogItem:
     file: Ref
     world_from_sensor: Matrix | None = None
 
+    def pose(self, ego: EgoPath) -> Matrix:
+        """World-from-sensor f64[4, 4]: its own, else by the vehicle's path."""
+        if self.world_from_sensor is not None:
+            return self.world_from_sensor
+        return common.pose_near(ego, self.time_s) @ self.ego_from_sensor
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CustomLog:
@@ -200,7 +197,7 @@ class CustomLog:
     root: Path
     name: str
     source: Source
-    cameras: Mapping[str, LogCamera]
+    cameras: Mapping[str, CameraOptics]
     lidars: Mapping[str, LogLidar]
     ego: EgoPath
     images: tuple[LogItem, ...]
@@ -209,19 +206,68 @@ class CustomLog:
     start: float
     units_per_s: int
 
+    def file(self, record: LogItem) -> Path:
+        """The file of a record, which no link may lead out of the log."""
+        path = self.root / record.file.path
+        if not path.resolve().is_relative_to(self.root.resolve()):
+            raise InputError("a link leads out of the log", where=str(path), expected="a file inside the log")
+        return path
+
+    def read_sweep(self, sweep: LogItem, options: ImportOptions) -> SweepPoints:
+        """The points of a sweep, motion-compensated to its time. Raises InputError: no points, or they contradict what
+        the log declares of their fields."""
+        lidar, path = self.lidars[sweep.sensor], self.file(sweep)
+        cloud = read_cloud(path, known=(lidar.intensity_field, lidar.time_field))
+        if len(cloud.xyz) == 0:
+            remedy = "export it again, or take the sweep out of log.json"
+            raise InputError("cloud has no points", where=str(path), expected="at least one return", remedy=remedy)
+        dt_s = self._delays(cloud, sweep, path)
+        intensity, name = np.zeros(len(cloud.xyz), np.float32), lidar.intensity_field
+        if name:
+            there = f"log.json: lidars.{sweep.sensor}"
+            remedy = f"name the field in {there}.intensity_field; an empty text if there is none"
+            values = np.nan_to_num(cloud.field(name, "intensity", path, remedy).astype(np.float64))
+            remedy = f"give the largest possible value in {there}.intensity_max (often 255)"
+            intensity = common.unit_intensity(values, lidar.intensity_max, path, remedy)
+        points = SweepPoints(cloud.xyz.astype(np.float32), intensity, dt_s, no_returns=cloud.missing)
+        if options.untwist == "no" or (options.untwist == "auto" and lidar.motion_compensated):
+            return points
+        if not lidar.time_field:
+            what = "sweeps are not motion-compensated, and their points have no times"
+            where, expected = f"{self.root / INDEX}: lidars.{sweep.sensor}", "time_field and time_unit"
+            remedy = "name the field with the time of each point, or add --untwist no"
+            raise InputError(what, where=where, expected=expected, remedy=remedy)
+        lidar_at = lambda time_s: common.pose_near(self.ego, time_s) @ sweep.ego_from_sensor
+        return replace(points, xyz=common.deskew(points.xyz, points.dt_s, lidar_at, sweep.time_s))
+
+    def _delays(self, cloud: Cloud, sweep: LogItem, path: Path) -> NDArray[np.float32]:
+        """Seconds of each point relative to the sweep's time; 0 where clouds have no times."""
+        lidar = self.lidars[sweep.sensor]
+        if not lidar.time_field or lidar.time_unit is None:
+            return np.zeros(len(cloud.xyz), np.float32)
+        values, per_second = cloud.field(lidar.time_field, "times", path), common.UNITS_PER_SECOND[lidar.time_unit]
+        if lidar.time_from == "log":
+            # whole numbers are subtracted before they are scaled: nanoseconds of the epoch keep their digits
+            values = values.astype(np.int64) if values.dtype.kind == "u" else values
+            start = self.start * per_second
+            start = start // self.units_per_s if isinstance(start, int) else start / self.units_per_s
+            dt_s = (values - np.asarray(start, values.dtype)).astype(np.float64) / per_second - sweep.time_s
+        else:
+            dt_s = values.astype(np.float64) / per_second
+        if not np.isfinite(dt_s).all() or np.abs(dt_s).max() > MAX_DELAY_S:
+            expected, got = f"within {MAX_DELAY_S:g} s", f"up to {np.abs(dt_s).max():.3g} s"
+            what = "times of points are far from their sweep's"
+            remedy = "check time_unit and time_from of the LiDAR in log.json"
+            raise InputError(what, where=str(path), expected=expected, got=got, remedy=remedy)
+        return dt_s.astype(np.float32)
+
 
 # --- parsing --------------------------------------------------------------------------------------
 
 
 def read_log(root: Path, complain: schema.Complain = schema.raise_first) -> CustomLog:
-    """Parse ``root/log.json``.
-
-    Args:
-        complain: called with each problem, as in ``scene/schema.py``; a record with a problem is left out.
-
-    Raises:
-        InputError: the frame of the file or the vehicle's path is wrong, or ``complain`` raised.
-    """
+    """Parse ``root/log.json``. ``complain`` is called with each problem, as in ``scene/schema.py``; a record with a
+    problem is left out. InputError: the frame of the file or the vehicle's path is wrong, or ``complain`` raised."""
     where = str(root / INDEX)
     value = schema.parse_object(store.read_bytes(root / INDEX), where)
     stated = value.get("format"), value.get("version")
@@ -230,9 +276,9 @@ def read_log(root: Path, complain: schema.Complain = schema.raise_first) -> Cust
         expected = f'"format": "{FORMAT}", "version": {VERSION}'
         raise InputError(what, where=where, expected=expected, got=f"{stated[0]!r}, {stated[1]!r}"[:80])
     top = parse_record(LogIndex, value, f"{where}: ")
-    cameras = schema.parse_table(top.cameras, f"{where}: cameras", _parse_camera, complain)
+    placed = schema.parse_table(top.cameras, f"{where}: cameras", _parse_camera, complain)
     lidars = schema.parse_table(top.lidars, f"{where}: lidars", _parse_lidar, complain)
-    if not cameras:
+    if not placed:
         expected = "at least one camera by name"
         complain(InputError("the log has no cameras", where=f"{where}: cameras", expected=expected))
     if not top.ego:
@@ -250,7 +296,7 @@ def read_log(root: Path, complain: schema.Complain = schema.raise_first) -> Cust
         moved[:3, 3] -= origin_m
         return moved
 
-    def items(name: str, key: str, entry_type: type[LogImageEntry | LogCloudEntry], usable: Mapping[str, Any]) -> Any:
+    def items(name: str, key: str, entry_type: type[LogImageEntry | LogCloudEntry], mounts: Mapping[str, Any]) -> Any:
         """``images`` or ``sweeps`` in time order per sensor; a sensor whose times are wrong is complained about and
         left out."""
         declared = getattr(top, f"{key}s")
@@ -266,7 +312,7 @@ def read_log(root: Path, complain: schema.Complain = schema.raise_first) -> Cust
 
         entries = schema.parse_each(getattr(top, name), f"{where}: {name}", parse, complain)
         records: list[LogItem] = []
-        for sensor, parsed in usable.items():
+        for sensor, mount in mounts.items():
             own, here = [entry for entry in entries if getattr(entry, key) == sensor], f"{where}: {name} of {sensor}"
             if not own:
                 remedy = f"add them, or remove {sensor}"
@@ -277,13 +323,11 @@ def read_log(root: Path, complain: schema.Complain = schema.raise_first) -> Cust
             except InputError as problem:
                 complain(problem)
                 continue
-            mounted = np.asarray(parsed.ego_from_sensor)
+            kind, mount = "image" if key == "camera" else "cloud", np.asarray(mount)
             for entry, time_s in zip(own, times, strict=True):
                 pose = getattr(entry, "world_from_camera", None)
-                placed = None if pose is None else in_scene(pose)
-                records.append(
-                    LogItem("image" if key == "camera" else "cloud", sensor, mounted, time_s, Ref(entry.file), placed)
-                )
+                pose = None if pose is None else in_scene(pose)
+                records.append(LogItem(kind, sensor, mount, time_s, Ref(entry.file), pose))
         return tuple(records)
 
     def parse_track(value: object, where: str) -> Track:
@@ -295,8 +339,8 @@ def read_log(root: Path, complain: schema.Complain = schema.raise_first) -> Cust
 
     poses = np.stack([in_scene(entry.world_from_ego) for entry in path])
     ego = EgoPath(seconds(path, f"{where}: ego"), poses)
-    images = items("images", "camera", LogImageEntry, cameras)
-    sweeps = items("sweeps", "lidar", LogCloudEntry, lidars)
+    images = items("images", "camera", LogImageEntry, {name: mount for name, (_, mount) in placed.items()})
+    sweeps = items("sweeps", "lidar", LogCloudEntry, {name: one.ego_from_sensor for name, one in lidars.items()})
     tracks = schema.parse_each(top.tracks, f"{where}: tracks", parse_track, complain)
     for twice in schema.repeated(track.id for track in tracks):
         complain(InputError("two tracks have one id", where=f"{where}: tracks", got=twice))
@@ -306,11 +350,13 @@ def read_log(root: Path, complain: schema.Complain = schema.raise_first) -> Cust
         notes.append(f"world origin moved to the first vehicle position, ({coordinates}) in the log")
     source = Source(top.dataset, top.licence, None, tuple(notes))
     units_per_s = common.UNITS_PER_SECOND[top.time_unit]
+    cameras = {name: optics for name, (optics, _) in placed.items()}
     parts = cameras, lidars, ego, images, sweeps, tuple(tracks), path[0].time, units_per_s
     return CustomLog(root, top.name, source, *parts)
 
 
-def _parse_camera(name: str, value: object, where: str) -> LogCamera:
+def _parse_camera(name: str, value: object, where: str) -> tuple[CameraOptics, Matrix]:
+    """A camera as recorded, with its lens, and where it sits on the vehicle."""
     entry = parse_record(LogCameraEntry, value, where)
     if entry.pixel_centre not in (0.0, 0.5):
         expected = "0 (the middle of the top-left pixel is (0, 0), as in OpenCV) or 0.5"
@@ -328,7 +374,7 @@ def _parse_camera(name: str, value: object, where: str) -> LogCamera:
             what, where = "distortion model takes another number of coefficients", place(where, "distortion")
             raise InputError(what, where=place(where, "coefficients"), expected=expected, got=got)
         lens = make(*coefficients) if any(coefficients) else None
-    return LogCamera(camera, lens, np.asarray(entry.ego_from_camera))
+    return CameraOptics(camera, lens), np.asarray(entry.ego_from_camera)
 
 
 def _parse_lidar(name: str, value: object, where: str) -> LogLidar:
@@ -356,24 +402,21 @@ def looks_like_custom(source: Path) -> bool:
 
 
 def import_custom(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import a log in the neutral layout into the scene directory ``out``. Raises UsageError: an option that this
-    format does not have, or a camera that the log does not have. InputError: something is missing, malformed or
-    contradictory; nothing is left at ``out``."""
+    """Import a log in the neutral layout into the scene directory ``out``."""
     common.refuse_options(options, "neutral-layout", "sequence", "poses", "boxes")
     log_read, notes = read_log(source), []
     content = _chosen(replace(log_read, ego=common.mended_path(log_read.ego, notes)), options)
-    fits = {name: fit_images(c.camera, options, c.lens) for name, c in content.cameras.items()}
+    fits = {name: fit_images(c.recorded, options, c.lens) for name, c in content.cameras.items()}
     moments = _moments(content.images)
     as_scene(content, schema.raise_first)  # records without a pose are refused before anything is read
 
     def convert(item: Numbered) -> Iterator[SceneImage | SceneSweep]:
         number, record = item
+        about = record.sensor, number, record.time_s, record.pose(content.ego)
         if record.kind == "image":
-            path, pose = _file(content, record), pose_of(content.ego, record)
-            yield SceneImage(record.sensor, number, record.time_s, pose, path, moment=moments[record])
+            yield SceneImage(*about, content.file(record), moment=moments[record])
         else:
-            points = read_sweep(content, record, options)
-            yield SceneSweep(record.sensor, number, record.time_s, pose_of(content.ego, record), points)
+            yield SceneSweep(*about, content.read_sweep(record, options))
 
     origin = replace(content.source, notes=(*content.source.notes, *notes, *image_notes(fits)))
     items, tracks = [*_numbered(content.images), *_numbered(content.sweeps)], lambda: (content.tracks, ())
@@ -431,84 +474,6 @@ def _numbered(records: Sequence[LogItem]) -> list[Numbered]:
     return [(next(counts[record.sensor]), record) for record in records]
 
 
-# --- one record -----------------------------------------------------------------------------------
-
-
-def _file(content: CustomLog, record: LogItem) -> Path:
-    path = content.root / record.file.path
-    if not path.resolve().is_relative_to(content.root.resolve()):
-        raise InputError("a link leads out of the log", where=str(path), expected="a file inside the log")
-    return path
-
-
-def pose_of(ego: EgoPath, record: LogItem) -> NDArray[np.float64]:
-    """World-from-sensor f64[4, 4] of an image or cloud: its own, else by the vehicle's path."""
-    if record.world_from_sensor is not None:
-        return record.world_from_sensor
-    return common.pose_near(ego, record.time_s) @ record.ego_from_sensor
-
-
-def read_sweep(content: CustomLog, sweep: LogItem, options: ImportOptions) -> SweepPoints:
-    """The points of a sweep, motion-compensated to its time. Raises InputError: no points, or they contradict what the
-    log declares of their fields."""
-    lidar, path = content.lidars[sweep.sensor], _file(content, sweep)
-    cloud = read_cloud(path, known=(lidar.intensity_field, lidar.time_field))
-    if len(cloud.xyz) == 0:
-        remedy = "export it again, or take the sweep out of log.json"
-        raise InputError("cloud has no points", where=str(path), expected="at least one return", remedy=remedy)
-    dt_s = _delays(cloud, sweep, content, path)
-    intensity, name = np.zeros(len(cloud.xyz), np.float32), lidar.intensity_field
-    if name:
-        there = f"log.json: lidars.{sweep.sensor}"
-        remedy = f"name the field in {there}.intensity_field; an empty text if there is none"
-        values = np.nan_to_num(_field(cloud, name, "intensity", path, remedy).astype(np.float64))
-        remedy = f"give the largest possible value in {there}.intensity_max (often 255)"
-        intensity = common.unit_intensity(values, lidar.intensity_max, path, remedy)
-    points = SweepPoints(cloud.xyz.astype(np.float32), intensity, dt_s, no_returns=cloud.missing)
-    if options.untwist == "no" or (options.untwist == "auto" and lidar.motion_compensated):
-        return points
-    if not lidar.time_field:
-        what, expected = "sweeps are not motion-compensated, and their points have no times", "time_field and time_unit"
-        remedy = "name the field with the time of each point, or add --untwist no"
-        raise InputError(what, where=f"{content.root / INDEX}: lidars.{sweep.sensor}", expected=expected, remedy=remedy)
-
-    def world_from_lidar(time_s: float) -> NDArray[np.float64]:
-        return common.pose_near(content.ego, time_s) @ sweep.ego_from_sensor
-
-    return replace(points, xyz=common.deskew(points.xyz, points.dt_s, world_from_lidar, sweep.time_s))
-
-
-def _field(cloud: Cloud, name: str, what: str, path: Path, remedy: str = "") -> NDArray[Any]:
-    """A declared field of a cloud, else InputError."""
-    values = cloud.fields.get(name)
-    if values is None:
-        got = ", ".join(cloud.fields) or "coordinates only"
-        raise InputError(f"cloud has no {what}", where=str(path), expected=f"a field {name!r}", got=got, remedy=remedy)
-    return values
-
-
-def _delays(cloud: Cloud, sweep: LogItem, content: CustomLog, path: Path) -> NDArray[np.float32]:
-    """Seconds of each point relative to the sweep's time; 0 where clouds have no times."""
-    lidar = content.lidars[sweep.sensor]
-    if not lidar.time_field or lidar.time_unit is None:
-        return np.zeros(len(cloud.xyz), np.float32)
-    values, per_second = _field(cloud, lidar.time_field, "times", path), common.UNITS_PER_SECOND[lidar.time_unit]
-    if lidar.time_from == "log":
-        # whole numbers are subtracted before they are scaled: nanoseconds of the epoch keep their digits
-        values = values.astype(np.int64) if values.dtype.kind == "u" else values
-        start, units_per_s = content.start * per_second, content.units_per_s
-        start = start // units_per_s if isinstance(start, int) else start / units_per_s
-        dt_s = (values - np.asarray(start, values.dtype)).astype(np.float64) / per_second - sweep.time_s
-    else:
-        dt_s = values.astype(np.float64) / per_second
-    if not np.isfinite(dt_s).all() or np.abs(dt_s).max() > MAX_DELAY_S:
-        expected, got = f"within {MAX_DELAY_S:g} s", f"up to {np.abs(dt_s).max():.3g} s"
-        what = "times of points are far from their sweep's"
-        remedy = "check time_unit and time_from of the LiDAR in log.json"
-        raise InputError(what, where=str(path), expected=expected, got=got, remedy=remedy)
-    return dt_s.astype(np.float32)
-
-
 # --- checking -------------------------------------------------------------------------------------
 
 
@@ -528,12 +493,12 @@ def check_log(source: Path) -> list[Finding]:
     findings.extend(scene_check.check_records(scene))
 
     def check_image(frame: Frame, image: LogItem) -> Iterator[Finding]:
-        path = _file(content, image)
+        path = content.file(image)
         pixels = decode_image(store.read_bytes(path), str(path), frame.view.camera)
         yield from scene_check.check_image(frame, pixels)
 
     def check_sweep(sweep: Sweep, cloud: LogItem) -> Iterator[Finding]:
-        points = read_sweep(content, cloud, ImportOptions())
+        points = content.read_sweep(cloud, ImportOptions())
         if points.no_returns:
             marked = f"{points.no_returns} of {points.no_returns + len(points.xyz)} points mark beams without a return"
             yield Finding("note", f"sweep {sweep.id}", f"{marked}; ingest leaves them out")
@@ -554,9 +519,9 @@ def as_scene(content: CustomLog, complain: schema.Complain) -> tuple[Scene, list
     for item in (*_numbered(content.images), *_numbered(content.sweeps)):
         record, name = item[1], _id_of(item)
         try:
-            pose = pose_of(content.ego, record)
+            pose = record.pose(content.ego)
             if record.kind == "image":
-                view = View(content.cameras[record.sensor].camera, pose, record.time_s)
+                view = View(content.cameras[record.sensor].recorded, pose, record.time_s)
                 frames[record] = Frame(name, view, record.file)
             else:
                 sweeps[record] = Sweep(name, record.sensor, record.time_s, pose, record.file)
@@ -566,7 +531,6 @@ def as_scene(content: CustomLog, complain: schema.Complain) -> tuple[Scene, list
     for record, moment in _moments(list(frames)).items():
         groups.setdefault(moment, []).append(frames[record].id)
     split = common.holdout_split([groups[moment] for moment in sorted(groups)], ImportOptions().test_every)
-    cameras = {name: camera.camera for name, camera in content.cameras.items()}
-    name, root, tracks, ego = content.name, str(content.root), content.tracks, content.ego
-    parts = tuple(frames.values()), tuple(sweeps.values()), tracks, ego, split, content.source
-    return Scene(name, root, cameras, *parts), list(frames), list(sweeps)
+    cameras = {name: one.recorded for name, one in content.cameras.items()}
+    parts = tuple(frames.values()), tuple(sweeps.values()), content.tracks, content.ego, split, content.source
+    return Scene(content.name, str(content.root), cameras, *parts), list(frames), list(sweeps)

@@ -46,8 +46,7 @@ _TURN_STEPS: Final = 36
 
 
 def read_scan(path: Path) -> SweepPoints:
-    """A velodyne scan: float32 rows x, y, z, reflectance (0..1). Beams without a return are left out and counted.
-    Raises InputError: cut off, values that are not finite, or a reflectance outside of 0..1."""
+    """A velodyne scan: float32 rows x, y, z, reflectance (0..1). Beams without a return are left out and counted."""
     rows, returns = read_float_rows(path, 4)
     xyz, dt_s = np.ascontiguousarray(rows[returns, :3]), np.zeros(int(returns.sum()), np.float32)
     intensity = unit_intensity(rows[returns, 3], 1, path, "divide the reflectance by its largest value, often 255")
@@ -68,10 +67,6 @@ def untwist_scan(points: SweepPoints, velo_at: Callable[[float], Matrix], time_s
 
 
 # calib --------------------------------------------------------------------------------------------
-#
-# KITTI counts pixels from the centre of the top-left pixel; this package from its corner. So 0.5 is added to the
-# principal point here, once.
-PIXEL_CENTRE_PX: Final = 0.5
 _NUMBERED = tuple(
     f"{name}_{number:02d}" for name in ("S", "K", "D", "R", "T", "S_rect", "R_rect", "P_rect") for number in range(4)
 )
@@ -101,7 +96,8 @@ class KittiCalibration:
 
     def camera(self, number: int, name: str, width: int, height: int) -> Camera:
         """Pinhole intrinsics of the rectified camera ``number``."""
-        return pinhole_camera(self._projection(number), name, (width, height), f"{self.source}: P{number}")
+        where = f"{self.source}: P{number}"
+        return common.pinhole_camera(name, (width, height), self._projection(number)[:, :3], where)
 
     def velo_from_cam(self, number: int) -> Matrix:
         """Velodyne from rectified camera ``number``, f64[4, 4]; rectified cameras differ by a translation only."""
@@ -116,24 +112,9 @@ class KittiCalibration:
         return self.projections[number]
 
 
-def pinhole_camera(projection: Matrix, name: str, size: tuple[int, int], where: str) -> Camera:
-    """The rectified pinhole camera of a KITTI projection matrix f64[3, 4], whose pixels are counted from the centre of
-    the top-left one. Raises InputError: skew, another last row than 0 0 1, or a focal length that is not positive."""
-    if abs(projection[0, 1]) > 1e-6 or abs(projection[2, 2] - 1) > 1e-6:
-        what = "projection matrix is not of a rectified pinhole camera"
-        raise InputError(what, where=where, expected="no skew, last row 0 0 1", got=str(projection[:, :3].tolist()))
-    fx, fy, cx, cy = (float(projection[index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    if fx <= 0 or fy <= 0:
-        what, expected, got = "focal length is not positive", "pixels, about 700 for KITTI", f"fx={fx:g}, fy={fy:g}"
-        raise InputError(what, where=where, expected=expected, got=got, remedy="check the calibration file")
-    return Camera(name, *size, fx, fy, cx + PIXEL_CENTRE_PX, cy + PIXEL_CENTRE_PX)
-
-
 def read_number_table(path: Path) -> dict[str, NDArray[np.float64]]:
-    """``key: numbers`` lines of a KITTI text file; lines whose value is not numbers (dates) are left out.
-
-    The colon after the key is optional (some benchmark files leave it out for ``R_rect`` and ``Tr_velo_cam``).
-    """
+    """``key: numbers`` lines of a KITTI text file; lines whose value is not numbers (dates) are left out. The colon is
+    optional (some benchmark files leave it out for ``R_rect`` and ``Tr_velo_cam``)."""
     table: dict[str, NDArray[np.float64]] = {}
     for line in store.read_text(path).splitlines():
         match = re.match(r"\s*([A-Za-z][\w]*)\s*:?\s+(.*)$", line)
@@ -154,17 +135,15 @@ def read_number_table(path: Path) -> dict[str, NDArray[np.float64]]:
 def table_entry(
     table: Mapping[str, NDArray[np.float64]], keys: tuple[str, ...], shape: tuple[int, ...], where: object
 ) -> Matrix:
-    """The first entry of ``keys`` that the table has, as an array of ``shape``. Raises InputError: there is none of
-    them, or it has another number of values."""
+    """The first entry of ``keys`` that the table has, as an array of ``shape``."""
     key = next((key for key in keys if key in table), None)
     if key is None:
         what, expected = f"calibration lacks {keys[0]}", " or ".join(keys)
         remedy = "use the calibration file that belongs to this recording"
         raise InputError(what, where=str(where), expected=expected, got=", ".join(table) or "no entries", remedy=remedy)
     if table[key].size != np.prod(shape):
-        what, where = "calibration entry has the wrong number of values", f"{where}: {key}"
-        expected = f"{np.prod(shape)} numbers"
-        raise InputError(what, where=where, expected=expected, got=f"{table[key].size}", remedy="is the file cut off?")
+        what, got = "calibration entry has the wrong number of values", f"{table[key].size}"
+        raise InputError(what, where=f"{where}: {key}", expected=f"{np.prod(shape)} numbers", got=got)
     return table[key].reshape(shape)
 
 
@@ -179,28 +158,29 @@ def rotation_entry(table: Mapping[str, NDArray[np.float64]], keys: tuple[str, ..
     return from_rotation_translation(rotation, np.zeros(3))
 
 
+def _projections(table: Mapping[str, NDArray[np.float64]], name: str, path: Path) -> dict[int, Matrix]:
+    return {n: table_entry(table, (f"{name}{n}",), (3, 4), path) for n in range(4) if f"{name}{n}" in table}
+
+
 def read_calibration_text(path: Path) -> KittiCalibration:
     """Object, tracking or odometry calibration: P0..P3, R0_rect (odometry: none), Tr_velo_to_cam, Tr_imu_to_velo."""
     table = read_number_table(path)
-    projections = {n: table_entry(table, (f"P{n}",), (3, 4), path) for n in range(4) if f"P{n}" in table}
-    rectify, rectify_keys, imu_keys = np.eye(4), ("R0_rect", "R_rect"), ("Tr_imu_to_velo", "Tr_imu_velo")
-    if any(key in table for key in rectify_keys):
-        rectify = rotation_entry(table, rectify_keys, path)
-    velo_to_cam = pose_entry(table, ("Tr_velo_to_cam", "Tr_velo_cam", "Tr"), path)
-    velo_from_imu = pose_entry(table, imu_keys, path) if any(key in table for key in imu_keys) else None
-    return KittiCalibration(projections, rectify @ velo_to_cam, velo_from_imu, str(path))
+    rectify, imu_keys = ("R0_rect", "R_rect"), ("Tr_imu_to_velo", "Tr_imu_velo")
+    rect0_from_velo = pose_entry(table, ("Tr_velo_to_cam", "Tr_velo_cam", "Tr"), path)
+    if table.keys() & rectify:
+        rect0_from_velo = rotation_entry(table, rectify, path) @ rect0_from_velo
+    velo_from_imu = pose_entry(table, imu_keys, path) if table.keys() & imu_keys else None
+    return KittiCalibration(_projections(table, "P", path), rect0_from_velo, velo_from_imu, str(path))
 
 
 def read_calibration_day(folder: Path) -> KittiCalibration:
     """Raw-data calibration of one day: ``calib_cam_to_cam.txt``, ``calib_velo_to_cam.txt``,
     ``calib_imu_to_velo.txt``."""
-    path = folder / "calib_cam_to_cam.txt"
+    path, imu_path = folder / "calib_cam_to_cam.txt", folder / "calib_imu_to_velo.txt"
     table = read_number_table(path)
-    projections = {n: table_entry(table, (f"P_rect_0{n}",), (3, 4), path) for n in range(4) if f"P_rect_0{n}" in table}
     rect0_from_velo = rotation_entry(table, ("R_rect_00",), path) @ _pose_file(folder / "calib_velo_to_cam.txt")
-    imu_path = folder / "calib_imu_to_velo.txt"
     velo_from_imu = _pose_file(imu_path) if imu_path.is_file() else None
-    return KittiCalibration(projections, rect0_from_velo, velo_from_imu, str(folder))
+    return KittiCalibration(_projections(table, "P_rect_0", path), rect0_from_velo, velo_from_imu, str(folder))
 
 
 def _pose_file(path: Path) -> Matrix:
@@ -256,10 +236,7 @@ def read_pose_file(path: Path, frame_numbers: Sequence[int]) -> tuple[dict[int, 
             what, got = "pose file does not cover the frames", f"{count} lines"
             expected = f"{len(frame_numbers)} (one per frame) or at least {max(frame_numbers) + 1} (one per number)"
             raise InputError(what, where=str(path), got=got, expected=expected)
-        poses = dict(zip(frame_numbers, rows.values(), strict=True))
-        if frame_numbers[-1] - frame_numbers[0] >= count:
-            words = f"{path} has a line for each of the {count} frames"
-            log.warn(f"kitti: {words}: line k is taken for the k-th of them, gaps or not")
+        poses = _by_rank(path, frame_numbers, rows, frame_numbers[-1] - frame_numbers[0] >= count)
     if widths == {13}:
         poses = {int(row[0]): row[1:] for row in rows.values()}
         if len(poses) != len(rows) or any(number != row[0] for number, row in zip(poses, rows.values(), strict=True)):
@@ -282,12 +259,9 @@ def read_packets(path: Path, frames: Sequence[int]) -> dict[int, NDArray[np.floa
 
 
 def poses_from_packets(packets: NDArray[np.float64], where: str) -> Matrix:
-    """World-from-IMU poses f64[n, 4, 4] of GPS/IMU packets f64[n, 30].
-
-    Latitude and longitude are projected as Mercator, scaled at the first packet's latitude, so that distances near the
-    start are true; roll, pitch and yaw turn about x, y and z in that order. World: the first position is the origin, x
-    along the first heading, z against gravity.
-    """
+    """World-from-IMU poses f64[n, 4, 4] of GPS/IMU packets f64[n, 30]. Latitude and longitude are projected as
+    Mercator, scaled at the first packet's latitude, so that distances near the start are true; roll, pitch and yaw turn
+    about x, y and z in that order. World: the first position is the origin, x along the first heading, z up."""
     if (np.abs(packets[:, 0]) > 89).any() or (np.abs(packets[:, 1]) > 180).any():
         raise InputError("latitude or longitude is out of range", where=where, expected="degrees")
     latitude, longitude = np.deg2rad(packets[:, 0]), np.deg2rad(packets[:, 1])
@@ -306,23 +280,26 @@ def poses_from_packets(packets: NDArray[np.float64], where: str) -> Matrix:
 
 def read_timestamps(path: Path, numbers: Sequence[int], last: int) -> dict[int, float]:
     """Seconds by number: plain seconds, or ``2011-09-26 13:02:25.964389445`` (nanoseconds kept; seconds of the epoch).
-
     Line k is number k, and an empty line a number without a stamp. A file without empty lines that is too short for
-    that, but has just one line per recorded file, counts those instead. Raises InputError: no times, or too few.
-    ``numbers``: of the recorded files, increasing. ``last``: the highest number that is needed.
-    """
-    lines = read_lines(path)
-    stamps = {number: _stamp(line, f"{path}: line {number + 1}") for number, line in lines.items()}
+    that, but has just one line per recorded file, counts those instead. ``numbers``: of the recorded files, increasing.
+    ``last``: the highest number that is needed."""
+    stamps = {number: _stamp(line, f"{path}: line {number + 1}") for number, line in read_lines(path).items()}
     count = len(store.read_text(path).splitlines())
     if count > last:
         return stamps
     if len(stamps) == max(stamps, default=-1) + 1 == len(numbers) > 0:
-        lines = f"{path} has a line for each of the {len(numbers)} files"
-        log.warn(f"kitti: {lines}: line k is taken for the k-th of them, gaps or not")
-        return dict(zip(numbers, stamps.values(), strict=True))
+        return _by_rank(path, numbers, stamps, True)
     what, got = "timestamps do not cover the frames", f"{count} lines, {len(numbers)} files"
     expected = f"at least {last + 1} lines (line k = frame k, empty where it is missing), or one per file"
     raise InputError(what, where=str(path), got=got, expected=expected, remedy="is the file cut off?")
+
+
+def _by_rank(path: Path, numbers: Sequence[int], values: Mapping[int, Any], gaps: bool) -> dict[int, Any]:
+    """The lines of a file that has just one for each of the ``numbers``."""
+    if gaps:
+        words = f"{path} has a line for each of the {len(numbers)} frames"
+        log.warn(f"kitti: {words}: line k is taken for the k-th of them, gaps or not")
+    return dict(zip(numbers, values.values(), strict=True))
 
 
 def _stamp(line: str, where: str) -> float:
@@ -352,52 +329,45 @@ _TRACKLET_POSE = frozenset(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KittiBox:
-    """One annotated box. ``track``: its number; object labels count lines. ``label``: lower-case class, e.g. ``car``.
-    ``size_m``: length, width, height. ``sensor_from_box``: box frame (x forward, y left, z up, origin in the centre) to
-    the velodyne, f64[4, 4]."""
+    """One annotated box. ``track``: its name; object labels count lines. ``label``: lower-case class, e.g. ``car``.
+    ``size_m``: length, width, height. ``pose``: box frame (x forward, y left, z up, origin in the centre) to the
+    velodyne, or to the world of KITTI-360, f64[4, 4]."""
 
     frame: int
-    track: int
+    track: str
     label: str
     size_m: tuple[float, float, float]
-    sensor_from_box: Matrix
+    pose: Matrix
 
 
 def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = None) -> list[KittiBox]:
     """Boxes of a tracking label file (17 columns and optionally a score), or, with the number of its ``frame``, of an
-    object label file (15). They are given in rectified camera 0; ``DontCare`` regions are left out. Raises InputError:
-    another number of columns, values that are no finite numbers, or a size that makes no sense."""
+    object label file (15). They are given in rectified camera 0; ``DontCare`` regions are left out."""
     velo_from_rect0 = invert(rect0_from_velo)
     boxes = []
     skip = 2 if frame is None else 0
     for index, line in read_lines(path).items():
         columns, where = line.split(), f"{path}: line {index + 1}"
-        if len(columns) - skip not in (15, 16):
-            what, expected = "label line has the wrong number of columns", f"{15 + skip} (or {16 + skip} with a score)"
-            remedy = "is this a tracking or an object label file?"
-            raise InputError(what, where=where, got=str(len(columns)), expected=expected, remedy=remedy)
-        if columns[skip] == "DontCare":
+        label = columns.pop(skip) if len(columns) > skip else ""
+        if label == "DontCare":
             continue
-        try:
-            number, track = (frame, index) if frame is not None else (int(columns[0]), int(columns[1]))
-            values = [float(text) for text in columns[skip + 1 :]]
-        except ValueError as error:
-            raise InputError("label value is not a number", where=where, got=str(error)) from error
-        if not np.isfinite(values).all():
-            raise InputError("label value is not finite", where=where, got=line.strip()[:100])
-        height, width, length, x, y, z, turn = values[7:14]
+        values = line_numbers(" ".join(columns), (14 + skip, 15 + skip), where, "label").tolist()
+        number, track = (frame, index) if frame is not None else values[:2]
+        if number % 1 or track % 1:
+            raise InputError("number of a frame or track is not whole", where=where, got=line)
+        height, width, length, x, y, z, turn = values[skip + 7 : skip + 14]
         size_m = box_size(length, width, height, where)
         # bottom centre (y down), and the turn about the camera's y axis
         c, s = np.cos(turn), np.sin(turn)
         rotation = np.array([(c, 0.0, -s), (s, 0.0, c), (0.0, -1.0, 0.0)]).T
         pose = velo_from_rect0 @ from_rotation_translation(rotation, np.array([x, y - height / 2, z]))
-        boxes.append(KittiBox(number, track, columns[skip].lower(), size_m, pose))
+        boxes.append(KittiBox(int(number), str(int(track)), label.lower(), size_m, pose))
     return boxes
 
 
 def xml_elements(path: Path, depth: int) -> Iterator[ElementTree.Element]:
-    """The elements of an XML file that lie ``depth`` below the top one, each freed after use. Raises InputError:
-    missing, cut off, malformed, or it declares entities or another encoding."""
+    """The elements of an XML file that lie ``depth`` below the top one, each freed after use. A file that declares
+    entities or another encoding is refused."""
     parser = ElementTree.XMLPullParser(("start", "end"))
     open_elements: list[ElementTree.Element] = []
     tail = b""
@@ -432,26 +402,28 @@ def read_tracklets(path: Path) -> list[KittiBox]:
     for track, item in enumerate(item for item in xml_elements(path, 2) if item.tag == "item"):
         where = f"{path}: tracklet {track}"
         note_unknown(path.name, [field.tag for field in item], _TRACKLET)
-        length, width, height = (_xml_number(item, key, where) for key in ("l", "w", "h"))
+        length, width, height = (xml_number(item, key, where) for key in ("l", "w", "h"))
         size_m = box_size(length, width, height, where)
-        first = int(_xml_number(item, "first_frame", where))
+        first = int(xml_number(item, "first_frame", where))
         label = (item.findtext("objectType") or "").strip().lower()
         for step, pose in enumerate(item.findall("./poses/item")):
             here = f"{where} pose {step}"
             note_unknown(path.name, [field.tag for field in pose], _TRACKLET_POSE)
-            tx, ty, tz, rz = (_xml_number(pose, key, here) for key in ("tx", "ty", "tz", "rz"))
-            boxes.append(KittiBox(first + step, track, label, size_m, yaw_matrix(rz, (tx, ty, tz + height / 2))))
+            tx, ty, tz, rz = (xml_number(pose, key, here) for key in ("tx", "ty", "tz", "rz"))
+            boxes.append(KittiBox(first + step, str(track), label, size_m, yaw_matrix(rz, (tx, ty, tz + height / 2))))
     return boxes
 
 
-def _xml_number(element: ElementTree.Element, key: str, where: str) -> float:
+def xml_number(element: ElementTree.Element, key: str, where: str, kind: type[int] | type[float] = float) -> Any:
+    """A field as a finite number, or as a whole one for ``int``."""
     text = element.findtext(key)
     try:
-        value = float(text or "nan")
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise InputError(f"tracklet field {key!r} is missing or not a number", where=where, got=repr(text))
+        value = kind(text or "")
+        if kind is float and not np.isfinite(value):
+            raise ValueError("not finite")
+    except ValueError as error:
+        what = f"field {key!r} is missing or no {'finite' if kind is float else 'whole'} number"
+        raise InputError(what, where=where, got=repr(text)) from error
     return value
 
 
@@ -463,25 +435,23 @@ def build_tracks(
     velo_at: Callable[[float], Matrix] | None = None,
 ) -> tuple[list[Track], list[str]]:
     """Tracks in the world from boxes per frame, in the order of their numbers, and notes (splits, boxes left out).
-
     ``world_from_velo``, ``times_s``: pose of the velodyne f64[4, 4] and time of the scan, seconds, by frame number;
     boxes of other frames are left out. ``velo_at``: pose of the velodyne at any time, when boxes were drawn into scans
     that were still twisted: each box then belongs to the moment its azimuth was measured, and is moved to the scan's
-    time with the track's velocity.
-    """
+    time with the track's velocity."""
     collected = BoxTracks(where, {label: label for label in LABELS})
     outside = 0
     for box in boxes:
         if box.frame not in world_from_velo:
             outside += 1
             continue
-        name, time_s, pose, late_s = str(box.track), times_s[box.frame], world_from_velo[box.frame], 0.0
+        time_s, pose, late_s = times_s[box.frame], world_from_velo[box.frame], 0.0
         if velo_at is not None:
-            x, y = box.sensor_from_box[:2, 3]
+            x, y = box.pose[:2, 3]
             late_s = float(np.arctan2(y, x)) / (2 * np.pi) * TURN_PERIOD_S
             pose = velo_at(time_s + late_s)
-        label, here = collected.label_of(box.label), f"{where}: track {name}, frame {box.frame}"
-        collected.add(name, label, time_s, box.size_m, pose @ box.sensor_from_box, late_s=late_s, where=here)
+        label, here = collected.label_of(box.label), f"{where}: track {box.track}, frame {box.frame}"
+        collected.add(box.track, label, time_s, box.size_m, pose @ box.pose, late_s=late_s, where=here)
     found, notes = collected.tracks(_speeds)
     if outside:
         notes.insert(0, f"{outside} boxes lie in frames that were not imported and were left out")

@@ -7,7 +7,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 from xml.etree import ElementTree
@@ -26,8 +26,8 @@ from mudg.formats.importers.drive_log import BoxTracks, SceneContent, SceneImage
 from mudg.formats.importers.images import ImageFit, fit_images, image_notes, image_size
 from mudg.formats.importers.kitti import (
     SENSOR,
+    KittiBox,
     line_numbers,
-    pinhole_camera,
     pose_entry,
     read_lines,
     read_number_table,
@@ -36,6 +36,7 @@ from mudg.formats.importers.kitti import (
     rotation_entry,
     table_entry,
     xml_elements,
+    xml_number,
 )
 from mudg.formats.unknown_fields import note_unknown
 from mudg.scene.labels import decode_grey
@@ -61,68 +62,41 @@ _OFFICIAL: Final = frozenset(
 )
 """Fields of the data set's objects, read or not."""
 VEHICLES: Final = frozenset(("car", "truck", "bus", "caravan", "trailer", "train", "motorcycle", "bicycle"))
-_MAX_VALUES: Final = 100_000
 _MAX_SHEAR: Final = 0.05
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Kitti360Box:
-    """One box in the data set's world.
-
-    ``label``: class as in ``LABEL_OF``. ``frame``: number of a box that moves; -1 for an object that stands.
-    ``window``: first and last frame of the part of the drive the box was drawn in. ``size_m``: length, width, height.
-    ``world_from_box``: f64[4, 4], x forward, y left, z up, origin in the centre.
-    """
-
-    object_id: str
-    label: str
-    frame: int
-    window: tuple[int, int]
-    size_m: tuple[float, float, float]
-    world_from_box: Matrix
-
-
-def read_boxes(path: Path, left_out: Counter[str]) -> Iterator[Kitti360Box]:
-    """Boxes of the classes in ``LABEL_OF`` in an XML file, one by one; ``left_out`` is filled with what is not read
-    (``that are not cuboids``) and how often. Raises InputError: missing, cut off, malformed, or it declares XML
-    entities."""
+def read_boxes(path: Path, left_out: Counter[str]) -> Iterator[tuple[KittiBox, tuple[int, int]]]:
+    """Boxes of the classes in ``LABEL_OF`` in an XML file, one by one (``frame`` -1: an object that stands), each with
+    the first and last frame of the part of the drive it was drawn in; ``left_out`` is filled with what is not read
+    (``that are not cuboids``) and how often."""
     for number, item in enumerate(xml_elements(path, 1)):
         where = f"{path}: object {number} ({item.tag})"
         if item.find("transform") is None:
             continue
         note_unknown(path.name, [field.tag for field in item], _OFFICIAL)
         if item.find("semanticId") is not None:
-            label = LABEL_OF_ID.get(_integer(item, "semanticId", where), "")
+            label = LABEL_OF_ID.get(xml_number(item, "semanticId", where, int), "")
         else:  # words are told apart by capital letters only
             label = re.sub("([A-Z])", r" \1", item.findtext("label", "").strip()).lower().strip()
         if label not in LABEL_OF:
             left_out["of classes that do not move"] += 1
             continue
-        frame = _integer(item, "timestamp", where)
+        frame = xml_number(item, "timestamp", where, int)
         shape = _shape(_matrix(item, "transform", where), _matrix(item, "vertices", where), label, where)
         if shape is None:
             left_out["that are not cuboids"] += 1
             continue
         size_m, pose = shape
+        window = (0, 2**31) if frame < 0 else (frame, frame)
         if item.find("start_frame") is not None:
-            window = (_integer(item, "start_frame", where), _integer(item, "end_frame", where))
-        else:
-            window = (0, 2**31) if frame < 0 else (frame, frame)
+            window = xml_number(item, "start_frame", where, int), xml_number(item, "end_frame", where, int)
         if item.find("instanceId") is not None and item.find("semanticId") is not None:
-            name = f"{_integer(item, 'semanticId', where)}-{_integer(item, 'instanceId', where)}"
+            name = "-".join(str(xml_number(item, key, where, int)) for key in ("semanticId", "instanceId"))
         elif frame >= 0 and item.find("dynamicSeq") is not None:
-            name = f"d-{_integer(item, 'dynamicSeq', where)}"
+            name = f"d-{xml_number(item, 'dynamicSeq', where, int)}"
         else:
-            name = f"i-{_integer(item, 'index', where)}"
-        yield Kitti360Box(name, label, frame, window, size_m, pose)
-
-
-def _integer(item: ElementTree.Element, key: str, where: str) -> int:
-    text = item.findtext(key)
-    try:
-        return int(text) if text is not None else int("")
-    except ValueError as error:
-        raise InputError(f"field {key!r} is missing or no whole number", where=where, got=repr(text)[:40]) from error
+            name = f"i-{xml_number(item, 'index', where, int)}"
+        yield KittiBox(frame, name, label, size_m, pose), window
 
 
 def _matrix(item: ElementTree.Element, key: str, where: str) -> Matrix:
@@ -130,18 +104,10 @@ def _matrix(item: ElementTree.Element, key: str, where: str) -> Matrix:
     if node is None:
         raise InputError(f"box has no {key}", where=where)
     where = f"{where}.{key}"
-    rows, columns = _integer(node, "rows", where), _integer(node, "cols", where)
-    texts = node.findtext("data", "").split()
-    if rows * columns != len(texts) or not 0 < rows * columns <= _MAX_VALUES:
-        what, expected = "matrix does not have the size it declares", f"{rows} x {columns} numbers"
-        raise InputError(what, where=where, expected=expected, got=f"{len(texts)} values")
-    try:
-        values = np.array([float(text) for text in texts])
-    except ValueError as error:
-        raise InputError("matrix holds no number", where=where, got=str(error)) from error
-    if not np.isfinite(values).all():
-        raise InputError("matrix holds a value that is not finite", where=where)
-    return values.reshape(rows, columns)
+    rows, columns = (xml_number(node, side, where, int) for side in ("rows", "cols"))
+    if min(rows, columns) < 1:
+        raise InputError("matrix has no size", where=where, got=f"{rows} x {columns}", expected="rows and columns")
+    return line_numbers(node.findtext("data", ""), (rows * columns,), where, "matrix").reshape(rows, columns)
 
 
 def _shape(
@@ -180,8 +146,7 @@ IMU_FROM_EGO: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def read_calibration(folder: Path) -> tuple[dict[str, Matrix], Matrix]:
-    """Poses f64[4, 4] on the vehicle of the rectified cameras ``image_00``, ``image_01`` and of the velodyne. Raises
-    InputError: a file or entry is missing, or a matrix is not a rigid motion."""
+    """Poses f64[4, 4] on the vehicle of the rectified cameras ``image_00``, ``image_01`` and of the velodyne."""
     path, perspective = folder / "calib_cam_to_pose.txt", folder / "perspective.txt"
     table, rectified = read_number_table(path), read_number_table(perspective)
     imu_from_camera = {n: pose_entry(table, (n,), path) for n in CAMERAS if n == "image_00" or n in table}
@@ -204,7 +169,8 @@ def _fit(path: Path, camera: str, size: tuple[int, int], options: ImportOptions)
         what, expected = "images do not have the size that the calibration is for", f"{declared[0]}x{declared[1]}"
         got, remedy = f"{size[0]}x{size[1]}", "use the images as the data set ships them"
         raise InputError(what, where=f"{path}: {entry}", expected=expected, got=got, remedy=remedy)
-    return fit_images(pinhole_camera(projection, CAMERAS[camera], size, f"{path}: P_rect_{camera[-2:]}"), options)
+    where = f"{path}: P_rect_{camera[-2:]}"
+    return fit_images(common.pinhole_camera(CAMERAS[camera], size, projection[:, :3], where), options)
 
 
 # importer -----------------------------------------------------------------------------------------
@@ -410,26 +376,26 @@ def _read_tracks(
     tracks = BoxTracks(str(path), LABEL_OF)
     left_out: Counter[str] = Counter()
     outside = 0
-    standing: dict[str, tuple[Kitti360Box, list[int]]] = {}
+    standing: dict[str, tuple[KittiBox, list[int]]] = {}
     moving: dict[str, set[int]] = {}
 
-    def add(name: str, box: Kitti360Box, frame: int) -> None:
-        pose, still = world_from_source @ box.world_from_box, box.frame < 0
+    def add(name: str, box: KittiBox, frame: int) -> None:
+        pose, still = world_from_source @ box.pose, box.frame < 0
         tracks.add(name, tracks.label_of(box.label), time_of[frame], box.size_m, pose, standing=still)
 
-    for box in read_boxes(path, left_out):
+    for box, (first, last) in read_boxes(path, left_out):
         if box.frame < 0:
-            inside = numbers[(numbers >= box.window[0]) & (numbers <= box.window[1])]
-            outside += not len(inside)
-            if len(inside):
-                standing.setdefault(box.object_id, (box, []))[1].extend((int(inside[0]), int(inside[-1])))
+            inside = numbers[(numbers >= first) & (numbers <= last)].tolist()
+            outside += not inside
+            if inside:
+                standing.setdefault(box.track, (box, []))[1].extend((inside[0], inside[-1]))
             continue
-        seen = moving.setdefault(box.object_id, set())
+        seen = moving.setdefault(box.track, set())
         if box.frame in seen:  # the parts of a drive overlap; the data set's own reader keeps one box, too
             left_out["that an object has twice in a frame"] += 1
         elif box.frame in time_of:
             seen.add(box.frame)
-            add(box.object_id, box, box.frame)
+            add(box.track, box, box.frame)
         else:
             outside += 1
     for name, (box, frames) in standing.items():

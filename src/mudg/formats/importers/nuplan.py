@@ -165,15 +165,10 @@ class NuplanLog:
             channel = text_of(channel, f"{self.path}: camera.channel")
             where = f"{self.path}: camera {channel}"
             matrix = np.array(self._numbers(values[2], f"{where}.intrinsic", 9)).reshape(3, 3)
-            skewed = abs(matrix[0, 1]) > 1e-6 or np.abs(matrix[2] - [0, 0, 1]).max() > 1e-6
-            if skewed or min(matrix[0, 0], matrix[1, 1]) <= 0:
-                what, where, got = "intrinsics are not of a pinhole camera", f"{where}.intrinsic", str(matrix.tolist())
-                raise InputError(what, where=where, got=got, expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels")
             size = _whole(values[4], f"{where}.width"), _whole(values[5], f"{where}.height")
             lens = () if values[3] is None else tuple(self._numbers(values[3], f"{where}.distortion", 5))
-            (fx, fy), (cx, cy) = np.diag(matrix)[:2].tolist(), matrix[:2, 2].tolist()
-            # the calibration counts pixels from the centre of the top-left one, as OpenCV does
-            camera = Camera(CAMERAS.get(channel, channel), *size, fx, fy, cx + 0.5, cy + 0.5, lens)
+            name = CAMERAS.get(channel, channel)
+            camera = common.pinhole_camera(name, size, matrix.tolist(), f"{where}.intrinsic", lens)
             found[token_of(token, f"{where}.token")] = channel, camera, self._pose(values[0], values[1], where)
         return found
 
@@ -256,16 +251,14 @@ class NuplanLog:
         xyz = self._numbers(translation, f"{where}.translation", 3)
         return common.pose_from_quaternion(self._numbers(rotation, f"{where}.rotation", 4), xyz, where)
 
-    def _numbers(self, blob: Any, where: str, count: int | None) -> list[float]:
+    def _numbers(self, blob: Any, where: str, count: int) -> list[float]:
         """Numbers of a pickled list, or list of lists, row by row."""
-        if blob is None and count is None:
-            return []
         if not isinstance(blob, bytes):
             raise InputError("calibration is no pickled list", where=where, got=type(blob).__name__)
         flat: list[float] = []
         for item in as_list(read_pickle(blob, where, _MAKERS), where)[:_MAX_NUMBERS]:
             flat += [_finite(value, where) for value in (item if isinstance(item, list | tuple) else [item])]
-        if count is not None and len(flat) != count:
+        if len(flat) != count:
             what = "calibration has the wrong number of values"
             raise InputError(what, where=where, expected=str(count), got=str(len(flat)))
         return flat

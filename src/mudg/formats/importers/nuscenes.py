@@ -55,19 +55,6 @@ _OWN_VEHICLE_M: Final = ((-1.05, 1.05), (-2.2, 3.1), (-2.2, 0.5))
 """The recording car in the LiDAR's axes: x right, y forward, z up."""
 
 
-def camera_from_intrinsics(name: str, size: tuple[int, int], intrinsics: Any, where: str) -> Camera:
-    """A camera from 3x3 intrinsics, whose pixel centres are whole numbers: half a pixel is added here."""
-    try:
-        k = np.array(intrinsics, np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError("intrinsics are not numbers", where=where, got=str(error)) from error
-    off = k[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1] if k.shape == (3, 3) else np.array([np.nan])
-    if not np.isfinite(k).all() or not (np.abs(off) < 1e-6).all():
-        what = "intrinsics are malformed"
-        raise InputError(what, where=where, expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", got=str(intrinsics)[:120])
-    return Camera(name, *size, k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5)
-
-
 def read_scan(path: Path) -> SweepPoints:
     """A ``LIDAR_TOP`` file: float32 rows x, y, z, intensity (0..255), ring; LiDAR axes x right, y forward, z up.
     Returns of the recording vehicle are dropped, and beams without a return, which are counted; intensity becomes 0..1.
@@ -360,7 +347,7 @@ def read_log(source: Path, options: ImportOptions) -> DriveLog:
         if name not in cameras:
             here = f"{calibrations.where}: record {calibration['token']!r}"
             size = integer(row, "width", data.where), integer(row, "height", data.where)
-            cameras[name] = camera_from_intrinsics(name, size, calibration.get("camera_intrinsic"), here)
+            cameras[name] = common.pinhole_camera(name, size, calibration.get("camera_intrinsic"), here)
     cameras = {name: cameras[name] for name in chosen if name in cameras}
     tracks, notes = _read_tracks(folder, samples, zero_us)
     if not sweeps:

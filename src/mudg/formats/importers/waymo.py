@@ -20,7 +20,6 @@ is that of the image recorded with the same pose (the front camera's).
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -30,7 +29,6 @@ from scipy.spatial.transform import Rotation
 
 from mudg.base import log
 from mudg.base.errors import InputError
-from mudg.base.geometry import CAM_FROM_EGO_AXES
 from mudg.base.palette import ID, UNLABELLED
 from mudg.base.types import Camera, EgoPath, Scene, Shutter, Source, SweepPoints
 from mudg.formats.importers import common
@@ -62,12 +60,7 @@ MAX_POSE_SHIFT_S: Final = 0.05
 _SAME_POSE: Final = 1e-6
 _SUFFIX: Final = ".tfrecord"
 _GLOBAL_SHUTTER: Final = 5
-_SHUTTERS: Final[Mapping[int, Shutter]] = {
-    1: "top_to_bottom",
-    2: "left_to_right",
-    3: "bottom_to_top",
-    4: "right_to_left",
-}
+_SHUTTERS: Final[Sequence[Shutter]] = ("global", "top_to_bottom", "left_to_right", "bottom_to_top", "right_to_left")
 """How a camera reads its image, by the data set's number; others are unknown."""
 _EGO_CLASS: Final = 1
 _SKY_CLASS: Final = 25
@@ -102,35 +95,26 @@ def import_waymo(source: Path, out: Path, options: ImportOptions) -> Scene:
     there = {name: name for name in CAMERAS.values() if any(name in frame.shots for frame in waymo.frames)}
     cameras = common.chosen_cameras(there, options, str(source), tuple(CAMERAS.values()))
     lasers = sorted({name for frame in waymo.frames for name in frame.lasers})
-    for what, used, known in (
-        ("cameras have images", cameras, waymo.cameras),
-        ("LiDARs have scans", lasers, waymo.lasers),
-    ):
-        if without := ", ".join(name for name in used if name not in known):
-            expected = ", ".join(known) or "a calibration for each"
-            raise InputError(f"{what} and no calibration", where=str(source), got=without, expected=expected)
+    if without := [*({*cameras} - {*waymo.cameras}), *({*lasers} - {*waymo.lasers})]:
+        got, expected = ", ".join(sorted(without)), f"those of {', '.join((*waymo.cameras, *waymo.lasers))}"
+        raise InputError("sensors have data and no calibration", where=str(source), got=got, expected=expected)
     streams = {name: [frame.number for frame in waymo.frames if name in frame.shots] for name in cameras}
     streams |= {f"LiDAR {name}": [f.number for f in waymo.frames if name in f.lasers] for name in lasers}
     complete = set(common.complete_frames(streams, options, str(source), "waymo"))
     frames = [frame for frame in waymo.frames if frame.number in complete]
     if not lasers:
         log.warn("waymo: no range images found: the scene has images only, and there is nothing to fuse")
-    plan = _plan(waymo, frames, cameras, options)
-    tracks, track_notes = _tracks(plan, frames)
+    plan = _Plan(waymo, frames, cameras, options)
+    tracks, track_notes = plan.tracks()
+    origin = Source("waymo", LICENCE, None, (*plan.notes, *track_notes))
     items = ((index, frame, waymo.read(frame, cameras)) for index, frame in enumerate(frames))
     path = EgoPath(np.array([plan.pose_s(f) for f in frames]), np.stack([plan.world_from_vehicle(f) for f in frames]))
-    content = SceneContent(
-        name=waymo.name,
-        source=Source("waymo", LICENCE, None, (*plan.notes, *track_notes)),
-        fits=plan.fits,
-        items=items,
-        convert=lambda item: _converted(plan, *item),
-        item_name=lambda item: item[1].where,
-        ego=path,
-        tracks=lambda: (tracks, ()),
-        total=len(frames),
+    convert, item_name, found = (lambda item: plan.converted(*item)), (lambda item: item[1].where), (tracks, ())
+    return write_scene(
+        SceneContent(waymo.name, origin, plan.fits, items, convert, item_name, path, lambda: found, len(frames)),
+        out,
+        options,
     )
-    return write_scene(content, out, options)
 
 
 def files_of_waymo(source: Path, options: ImportOptions) -> LogFiles:
@@ -156,17 +140,38 @@ def _find(source: Path, options: ImportOptions) -> tuple[Path | None, str]:
 # --- time, world, cameras -------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _Plan:
     """What is known before the bulky parts are read. ``start_us``: zero of the scene's clock, microseconds of the
-    epoch. ``middle_s``: frame number -> seconds after the frame's timestamp to which its pose belongs."""
+    epoch. ``middle_s``: frame number -> seconds after the frame's timestamp to which its pose belongs: those of the
+    image with the same pose, else the middle of the turn."""
 
-    waymo: WaymoLog
-    world_from_global: Matrix
-    start_us: int
-    middle_s: Mapping[int, float]
-    fits: Mapping[str, ImageFit]
-    notes: Sequence[str]
+    def __init__(
+        self, waymo: WaymoLog, frames: Sequence[FrameRecord], cameras: Sequence[str], options: ImportOptions
+    ) -> None:
+        self.waymo, self.frames, first = waymo, frames, frames[0]
+        self.start_us, self.world_from_global = first.timestamp_us, common.world_from_first(first.global_from_vehicle)
+        where = f"{waymo.name}, from frame {first.number}"
+        common.seconds([frame.timestamp_us for frame in frames], "us", where, self.start_us)
+        self.middle_s = dict.fromkeys((frame.number for frame in frames), TURN_S / 2)
+        posed = {}
+        for frame in frames:
+            for shot in reversed([*frame.shots.values()]):
+                if np.abs(shot.global_from_vehicle - frame.global_from_vehicle).max() < _SAME_POSE:
+                    posed[frame.number] = shot.pose_time_s - frame.timestamp_us / 1e6
+        self.middle_s |= posed
+        self.fits: dict[str, ImageFit] = {}
+        for name in cameras:
+            camera, lens = recorded_camera(name, waymo.cameras[name], first.shots[name])
+            self.fits[name] = fit_images(camera, options, lens)
+        notes = [f"Waymo Open Dataset, {waymo.form}", common.origin_note(first.global_from_vehicle)]
+        self.notes = [*notes, *image_notes(self.fits)]
+        if not any(frame.lasers for frame in frames):
+            self.notes.append("no range images: images and boxes only")
+        if assumed := len(frames) - len(posed):
+            words = "frames is no image's: taken to belong to the middle of the LiDAR's turn"
+            self.notes.append(f"the pose of {assumed} {words}")
+        if any(fit.camera.readout_s > 0 for fit in self.fits.values()):
+            self.notes.append("shutters roll; a view is that of the middle of the exposure")
 
     def pose_s(self, frame: FrameRecord) -> float:
         """Time of the frame's pose, and so of its sweeps."""
@@ -176,81 +181,43 @@ class _Plan:
         """The vehicle at the frame's pose."""
         return self.world_from_global @ frame.global_from_vehicle
 
+    def converted(self, index: int, frame: FrameRecord, content: FrameContent) -> Iterator[SceneImage | SceneSweep]:
+        """The images, labels and scans of a frame."""
+        for name, fit in self.fits.items():
+            where = f"{frame.where}: image of camera {name}"
+            labels = {}
+            if name in content.panoptic:
+                labels = panoptic_labels(*content.panoptic[name], fit, f"{where}: panoptic label")
+            pose, time_s = middle_of_exposure(frame.shots[name])
+            pose = self.world_from_global @ pose @ self.waymo.cameras[name].vehicle_from_cam()
+            yield SceneImage(name, index, time_s - self.start_us / 1e6, pose, content.images[name], where, labels)
+        for name, scan in content.scans.items():
+            laser, where = self.waymo.lasers[name], f"{frame.where}: LiDAR {name}"
+            middle_s = self.middle_s[frame.number] if name == TOP else None
+            points = points_of_scan(scan, laser, frame.global_from_vehicle, middle_s, where)
+            pose = self.world_from_vehicle(frame) @ laser.vehicle_from_lidar
+            yield SceneSweep(f"lidar_{name}", index, self.pose_s(frame), pose, points, where)
 
-def _plan(waymo: WaymoLog, frames: Sequence[FrameRecord], cameras: Sequence[str], options: ImportOptions) -> _Plan:
-    first = frames[0]
-    start_us = first.timestamp_us
-    common.seconds([f.timestamp_us for f in frames], "us", f"{waymo.name}, from frame {first.number}", start_us)
-    middles = {frame.number: _pose_moment(frame) for frame in frames}
-    fits = {}
-    for name in cameras:
-        camera, lens = recorded_camera(name, waymo.cameras[name], first.shots[name])
-        fits[name] = fit_images(camera, options, lens)
-    notes = [f"Waymo Open Dataset, {waymo.form}", common.origin_note(first.global_from_vehicle), *image_notes(fits)]
-    if not any(frame.lasers for frame in frames):
-        notes.append("no range images: images and boxes only")
-    if assumed := sum(middle is None for middle in middles.values()):
-        notes.append(f"the pose of {assumed} frames is no image's: taken to belong to the middle of the LiDAR's turn")
-    if any(fit.camera.readout_s > 0 for fit in fits.values()):
-        notes.append("shutters roll; a view is that of the middle of the exposure")
-    middle_s = {number: TURN_S / 2 if middle is None else middle for number, middle in middles.items()}
-    return _Plan(waymo, common.world_from_first(first.global_from_vehicle), start_us, middle_s, fits, notes)
-
-
-def _pose_moment(frame: FrameRecord) -> float | None:
-    """When the vehicle was at the frame's pose, in seconds after the frame's timestamp: the time of the image with the
-    same pose; None without one."""
-    for shot in frame.shots.values():
-        if np.abs(shot.global_from_vehicle - frame.global_from_vehicle).max() < _SAME_POSE:
-            return shot.pose_time_s - frame.timestamp_us / 1e6
-    return None
-
-
-# --- frames and boxes -----------------------------------------------------------------------------
-
-
-def _converted(plan: _Plan, index: int, frame: FrameRecord, content: FrameContent) -> Iterator[SceneImage | SceneSweep]:
-    for name, fit in plan.fits.items():
-        where = f"{frame.where}: image of camera {name}"
-        labels: dict[str, NDArray[Any]] = {}
-        if name in content.panoptic:
-            divisor, png = content.panoptic[name]
-            ids = panoptic_ids(png, fit.recorded, f"{where}: panoptic label")
-            if divisor < 1:
-                what, expected = "panoptic label has no divisor", "a positive number"
-                raise InputError(what, where=where, expected=expected, got=str(divisor))
-            labels = _panoptic_labels(fit.ids(ids), divisor)
-        pose, time_s = middle_of_exposure(frame.shots[name])
-        pose = plan.world_from_global @ pose @ vehicle_from_cam(plan.waymo.cameras[name])
-        yield SceneImage(name, index, time_s - plan.start_us / 1e6, pose, content.images[name], where, labels)
-    for name, scan in content.scans.items():
-        laser, where = plan.waymo.lasers[name], f"{frame.where}: LiDAR {name}"
-        middle_s = plan.middle_s[frame.number] if name == TOP else None
-        points = points_of_scan(scan, laser, frame.global_from_vehicle, middle_s, where)
-        pose = plan.world_from_vehicle(frame) @ laser.vehicle_from_lidar
-        yield SceneSweep(f"lidar_{name}", index, plan.pose_s(frame), pose, points, where)
-
-
-def _tracks(plan: _Plan, frames: Sequence[FrameRecord]) -> Tracks:
-    """Tracks from the first image of their first frame to the last image of their last one: some hundredths of a second
-    are added to either end with the object's velocity, or else images there would lack the object."""
-    tracks = BoxTracks(frames[0].where, {label: label for label in LABELS.values()})
-    images_s: dict[float, tuple[float, float]] = {}
-    for frame in frames:
-        time_s, middle_s = plan.pose_s(frame), plan.middle_s[frame.number]
-        taken_s = [middle_of_exposure(shot)[1] - plan.start_us / 1e6 for shot in frame.shots.values()] or [time_s]
-        images_s[time_s] = min(taken_s), max(taken_s)
-        for box in frame.boxes:
-            late_s = 0.0
-            if TOP in frame.lasers:
-                place = box.vehicle_from_box[:2, 3] - plan.waymo.lasers[TOP].vehicle_from_lidar[:2, 3]
-                turn = (0.5 - np.arctan2(place[1], place[0]) / (2 * np.pi)) % 1.0
-                late_s = float(turn * TURN_S - middle_s)
-            # a track's name begins with no sign, as the data set's random ids may
-            name, where = box.id if box.id[0].isalnum() else f"t{box.id}", f"{frame.where}: object {box.id}"
-            pose = plan.world_from_vehicle(frame) @ box.vehicle_from_box
-            tracks.add(name, tracks.label_of(box.label), time_s, box.size_m, pose, late_s=late_s, where=where)
-    return tracks.tracks(images_s=images_s)
+    def tracks(self) -> Tracks:
+        """Tracks from the first image of their first frame to the last image of their last one: some hundredths of a
+        second are added to either end with the object's velocity, or else images there would lack the object."""
+        tracks = BoxTracks(self.frames[0].where, {label: label for label in LABELS.values()})
+        images_s: dict[float, tuple[float, float]] = {}
+        for frame in self.frames:
+            time_s, middle_s = self.pose_s(frame), self.middle_s[frame.number]
+            taken_s = [middle_of_exposure(shot)[1] - self.start_us / 1e6 for shot in frame.shots.values()] or [time_s]
+            images_s[time_s] = min(taken_s), max(taken_s)
+            for box_id, label, vehicle_from_box, size_m in frame.boxes:
+                late_s = 0.0
+                if TOP in frame.lasers:
+                    place = vehicle_from_box[:2, 3] - self.waymo.lasers[TOP].vehicle_from_lidar[:2, 3]
+                    turn = (0.5 - np.arctan2(place[1], place[0]) / (2 * np.pi)) % 1.0
+                    late_s = float(turn * TURN_S - middle_s)
+                # a track's name begins with no sign, as the data set's random ids may
+                name, where = box_id if box_id[0].isalnum() else f"t{box_id}", f"{frame.where}: object {box_id}"
+                pose = self.world_from_vehicle(frame) @ vehicle_from_box
+                tracks.add(name, tracks.label_of(label), time_s, size_m, pose, late_s=late_s, where=where)
+        return tracks.tracks(images_s=images_s)
 
 
 # --- LiDARs ---------------------------------------------------------------------------------------
@@ -269,14 +236,12 @@ def points_of_scan(
     Where pixels have poses of their own (top LiDAR), a point is carried from where the vehicle was when it was measured
     to where it was at the frame's pose; those without one are left out, and counted. The other LiDARs are recorded as
     if all was measured at the frame's pose. ``middle_s``: when that was, in seconds after the turn began; None: no
-    times. Intensity, which has no limit, is brought to 0..1 by tanh, as is customary. Raises InputError: shapes that
-    contradict each other, or values that are not finite.
-    """
+    times. Intensity, which has no limit, is brought to 0..1 by tanh, as is customary."""
     images = (*scan.returns, *([] if scan.poses is None else [scan.poses]))
     rows, columns = scan.returns[0].shape[:2]
     if any(image.shape[:2] != (rows, columns) for image in images):
         raise InputError("range images of one scan differ in size", where=where, expected=f"[{rows}, {columns}]")
-    inclination = _beam_inclinations(laser, rows, where)
+    inclination = laser.inclination_of_rows(rows, where)
     turn = (np.arange(columns) + 0.5) / columns
     heading = float(np.arctan2(laser.vehicle_from_lidar[1, 0], laser.vehicle_from_lidar[0, 0]))
     azimuth = np.pi - 2 * np.pi * turn - heading
@@ -293,9 +258,7 @@ def points_of_scan(
         row, column = np.divmod(pixel, columns)
         reach = values[:, 0].astype(np.float64)
         flat = reach * np.cos(inclination)[row]
-        xyz = np.stack(
-            [flat * np.cos(azimuth)[column], flat * np.sin(azimuth)[column], reach * np.sin(inclination)[row]], 1
-        )
+        xyz = np.c_[flat * np.cos(azimuth)[column], flat * np.sin(azimuth)[column], reach * np.sin(inclination)[row]]
         if scan.poses is not None:
             poses = scan.poses.reshape(-1, 6)[pixel]
             known = np.isfinite(poses).all(1) & (poses != 0).any(1)
@@ -306,17 +269,6 @@ def points_of_scan(
         parts.append((xyz, intensity, late_s[column]))
     xyz, intensity, dt_s = (np.concatenate(part).astype(np.float32) for part in zip(*parts, strict=True))
     return SweepPoints(xyz, intensity, dt_s, no_returns=without_pose)
-
-
-def _beam_inclinations(laser: LaserCalibration, rows: int, where: str) -> NDArray[np.float64]:
-    """Inclination of every row of a range image, f64[rows] radians; the top row looks highest."""
-    if not laser.inclinations:
-        low, high = laser.limits
-        return high - (np.arange(rows, dtype=np.float64) + 0.5) * ((high - low) / rows)
-    if len(laser.inclinations) != rows:
-        what, expected = "range image does not have a row for every beam", f"{len(laser.inclinations)} rows"
-        raise InputError(what, where=where, expected=f"{expected} (calibration of the LiDAR)", got=f"{rows} rows")
-    return np.array(laser.inclinations)[::-1]
 
 
 def _carried(
@@ -351,7 +303,7 @@ def recorded_camera(name: str, calibration: CameraCalibration, shot: CameraShot)
     rolls = shot.done_s and calibration.direction != _GLOBAL_SHUTTER
     readout_s = max(0.0, shot.done_s - shot.trigger_s - shot.shutter_s) if rolls else 0.0
     size = calibration.width, calibration.height
-    shutter: Shutter = _SHUTTERS.get(calibration.direction, "global")
+    shutter = _SHUTTERS[calibration.direction] if 0 < calibration.direction < len(_SHUTTERS) else "global"
     camera = Camera(name, *size, fx, fy, cx, cy, tuple(coefficients), readout_s, shutter)
     return camera, brown_conrady(*coefficients) if any(coefficients) else None
 
@@ -370,24 +322,14 @@ def middle_of_exposure(shot: CameraShot) -> tuple[Matrix, float]:
     return pose, middle
 
 
-def vehicle_from_cam(calibration: CameraCalibration) -> Matrix:
-    """Camera axes of this package (x right, y down, z forward) to the vehicle, f64[4, 4]."""
-    return calibration.vehicle_from_camera @ CAM_FROM_EGO_AXES.T
-
-
-def panoptic_ids(png: bytes, camera: Camera, where: str) -> NDArray[np.int32]:
-    """Values of a panoptic label, i32[H, W]: class * divisor + instance. Raises InputError: no 16-bit PNG of the
-    camera's size."""
-    ids = decode_grey(png, where, (16,))
-    if ids.shape != (camera.height, camera.width):
-        what, expected = "panoptic label is not of its camera's size", f"{camera.width}x{camera.height}"
-        raise InputError(what, where=where, expected=expected, got=f"{ids.shape[1]}x{ids.shape[0]}")
-    return ids.astype(np.int32)
-
-
-def _panoptic_labels(ids: NDArray[np.int32], divisor: int) -> dict[str, NDArray[Any]]:
-    """Labels of one image: ``semantics`` u8[H, W] train ids, ``instance`` i32[H, W], ``sky`` and ``ego`` bool[H, W]. An
-    instance is called class * divisor + number, 0 where there is none: it means the same thing in this image only."""
+def panoptic_labels(divisor: int, png: bytes, fit: ImageFit, where: str) -> dict[str, NDArray[Any]]:
+    """Labels of one image by a 16-bit PNG of class * divisor + instance: ``semantics`` u8[H, W] train ids, ``instance``
+    i32[H, W], ``sky`` and ``ego`` bool[H, W]. An instance is called as in the PNG, 0 where there is none: it means the
+    same thing in this image only."""
+    ids = fit.ids(decode_grey(png, where, (16,)).astype(np.int32))
+    if divisor < 1:
+        what, expected = "panoptic label has no divisor", "a positive number"
+        raise InputError(what, where=where, expected=expected, got=str(divisor))
     classes, numbers = np.divmod(ids, divisor)
     table = np.full(256, UNLABELLED, np.uint8)
     table[list(_TRAIN_IDS)] = list(_TRAIN_IDS.values())

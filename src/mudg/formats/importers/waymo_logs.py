@@ -1,5 +1,6 @@
 """Logs of the Waymo Open Dataset: format 1 (a TFRecord file of ``Frame`` messages) and format 2 (a folder per component
 with one Parquet file per log). Opening one keeps what is small; ``read`` gives images, labels and scans of a frame.
+Whatever is damaged or contradictory is an ``InputError``.
 
 Poses are f64[4, 4]. ``global`` is the data set's own world, tens of kilometres from the car. Its camera frame is x
 forward, y left, z up.
@@ -9,18 +10,18 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, BinaryIO, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import log, store
 from mudg.base.errors import InputError
-from mudg.base.geometry import yaw_matrix
+from mudg.base.geometry import CAM_FROM_EGO_AXES, yaw_matrix
 from mudg.formats.importers.common import arrow_files, require_columns, rigid_pose, unpacked
 from mudg.formats.unknown_fields import note_unknown
 
@@ -37,6 +38,10 @@ MAX_UNPACKED_BYTES: Final = 128 * 1024 * 1024
 MAX_CLOCK_GAP_S: Final = 1.0
 
 
+WaymoBox = tuple[str, str, Matrix, tuple[float, float, float]]
+"""Id and label of a box of a frame, its centre and heading in the vehicle, and length, width, height in metres."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraCalibration:
     """A camera: ``intrinsic`` is f_u, f_v, c_u, c_v (pixels, the image's left edge is 0), k1, k2, p1, p2, k3;
@@ -48,6 +53,18 @@ class CameraCalibration:
     height: int
     direction: int
 
+    @classmethod
+    def of(cls, name: str, intrinsic: Numbers, extrinsic: Numbers, image: Sequence[int], where: str) -> Self:
+        """From the numbers of either format; ``image``: width, height and the direction of the shutter."""
+        where, values = f"{where}: calibration of camera {name}", tuple(float(value) for value in intrinsic)
+        if len(values) != 9 or not np.isfinite(values).all():
+            raise InputError("intrinsics are incomplete", where=where, expected="9 finite numbers", got=str(values))
+        return cls(values, _transform(extrinsic, where), *image)
+
+    def vehicle_from_cam(self) -> Matrix:
+        """Camera axes of this package (x right, y down, z forward) to the vehicle, f64[4, 4]."""
+        return self.vehicle_from_camera @ CAM_FROM_EGO_AXES.T
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LaserCalibration:
@@ -56,6 +73,26 @@ class LaserCalibration:
     inclinations: tuple[float, ...]
     limits: tuple[float, float]
     vehicle_from_lidar: Matrix
+
+    @classmethod
+    def of(cls, name: str, beams: Numbers, limits: tuple[float, float], extrinsic: Numbers, where: str) -> Self:
+        """From the numbers of either format."""
+        where, beams = f"{where}: calibration of LiDAR {name}", tuple(float(value) for value in beams)
+        if not np.isfinite(beams or limits).all() or not (beams or limits[0] < limits[1]):
+            got = str(beams or limits)
+            raise InputError("beam inclinations make no sense", where=where, expected="radians", got=got)
+        return cls(beams, limits, _transform(extrinsic, where))
+
+    def inclination_of_rows(self, rows: int, where: str) -> NDArray[np.float64]:
+        """Inclination of every row of a range image, f64[rows] radians; the top row looks highest."""
+        if not self.inclinations:
+            low, high = self.limits
+            return high - (np.arange(rows, dtype=np.float64) + 0.5) * ((high - low) / rows)
+        if len(self.inclinations) != rows:
+            what = "range image does not have a row for every beam"
+            expected = f"{len(self.inclinations)} rows (calibration of the LiDAR)"
+            raise InputError(what, where=where, expected=expected, got=f"{rows} rows")
+        return np.array(self.inclinations)[::-1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,23 +110,10 @@ class CameraShot:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class WaymoBox:
-    """A box of a frame: its centre and heading in the vehicle, and length, width, height in metres."""
-
-    id: str
-    label: str
-    vehicle_from_box: Matrix
-    size_m: tuple[float, float, float]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class FrameRecord:
-    """The facts of a frame that fit into memory for a whole log.
-
-    ``number``: place in the log. ``timestamp_us``: of the epoch, when the top LiDAR began its turn.
-    ``global_from_vehicle``: what boxes and compensated points refer to, not the pose at that time. ``shots``: by camera
-    with an image. ``lasers``: those with a range image.
-    """
+    """The facts of a frame that fit into memory for a whole log. ``number``: place in the log. ``timestamp_us``: of the
+    epoch, when the top LiDAR began its turn. ``global_from_vehicle``: what boxes and compensated points refer to, not
+    the pose at that time. ``shots``: by camera with an image. ``lasers``: those with a range image."""
 
     number: int
     timestamp_us: int
@@ -98,6 +122,23 @@ class FrameRecord:
     lasers: tuple[str, ...]
     boxes: tuple[WaymoBox, ...]
     where: str
+
+    def __post_init__(self) -> None:
+        """Refuse images far from the frame's time, and two images or scans of one sensor."""
+        if len(set(self.lasers)) < len(self.lasers):
+            raise InputError("frame has two scans of one LiDAR", where=self.where, got=", ".join(self.lasers))
+        for name, shot in self.shots.items():
+            where, exposure_s = f"{self.where}: image of camera {name}", shot.done_s - shot.trigger_s
+            times = (shot.pose_time_s, *((shot.trigger_s, shot.done_s) if shot.done_s else ()))
+            if not max(abs(time - self.timestamp_us / 1e6) for time in times) <= MAX_CLOCK_GAP_S:
+                what, got = "image and frame are not of one time", ", ".join(f"{time!r}" for time in times)
+                expected = f"seconds within {MAX_CLOCK_GAP_S} s of the frame's {self.timestamp_us} microseconds"
+                remedy = "are the units seconds (images) and microseconds (frames)?"
+                raise InputError(what, where=where, expected=expected, got=got, remedy=remedy)
+            if shot.done_s and not 0 <= shot.shutter_s <= exposure_s < MAX_CLOCK_GAP_S:
+                what, got = "exposure times contradict each other", f"{shot.shutter_s:g} and {exposure_s:g}"
+                expected = "0 <= shutter <= readout end - trigger, seconds"
+                raise InputError(what, where=where, expected=expected, got=got)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,62 +171,24 @@ def _transform(values: Numbers, where: str) -> Matrix:
     return rigid_pose(np.asarray(values, np.float64).reshape(4, 4), where)
 
 
-def _camera(name: str, intrinsic: Numbers, extrinsic: Numbers, image: Sequence[int], where: str) -> CameraCalibration:
-    """``image``: width, height and the direction of the shutter."""
-    where, values = f"{where}: calibration of camera {name}", tuple(float(value) for value in intrinsic)
-    if len(values) != 9 or not np.isfinite(values).all():
-        raise InputError("intrinsics are incomplete", where=where, expected="9 finite numbers", got=str(values))
-    return CameraCalibration(values, _transform(extrinsic, where), *image)
-
-
-def _laser(name: str, beams: Numbers, limits: tuple[float, float], extrinsic: Numbers, where: str) -> LaserCalibration:
-    where, beams = f"{where}: calibration of LiDAR {name}", tuple(float(value) for value in beams)
-    if not np.isfinite(beams or limits).all() or not (beams or limits[0] < limits[1]):
-        raise InputError("beam inclinations make no sense", where=where, expected="radians", got=str(beams or limits))
-    return LaserCalibration(beams, limits, _transform(extrinsic, where))
-
-
 def _box(box_id: str, kind: int, values: Numbers, where: str) -> WaymoBox:
     """``kind``: number of the class. ``values``: x, y, z, length, width, height, heading."""
     x, y, z, length, width, height, heading = (float(value) for value in values)
     if not box_id:
         raise InputError("box has no id", where=where)
     pose = rigid_pose(yaw_matrix(heading, (x, y, z)), f"{where}: box {box_id}")
-    return WaymoBox(box_id, LABELS.get(kind, f"type_{kind}"), pose, (length, width, height))
+    return box_id, LABELS.get(kind, f"type_{kind}"), pose, (length, width, height)
 
 
-def _frame(
-    number: int,
-    timestamp_us: int,
-    pose: Numbers,
-    shots: Sequence[tuple[str, CameraShot]],
-    lasers: Sequence[str],
-    boxes: Iterable[WaymoBox],
-    where: str,
-) -> FrameRecord:
-    """A frame whose images have times near its own; two images or scans of one sensor are refused."""
-    for what, names in (("images of one camera", [name for name, _ in shots]), ("scans of one LiDAR", lasers)):
-        if len(set(names)) < len(names):
-            raise InputError(f"frame has two {what}", where=where, got=", ".join(names))
-    for name, shot in shots:
-        here, exposure_s = f"{where}: image of camera {name}", shot.done_s - shot.trigger_s
-        times = (shot.pose_time_s, *((shot.trigger_s, shot.done_s) if shot.done_s else ()))
-        if not max(abs(time - timestamp_us / 1e6) for time in times) <= MAX_CLOCK_GAP_S:
-            what, got = "image and frame are not of one time", ", ".join(f"{time!r}" for time in times)
-            expected = f"seconds within {MAX_CLOCK_GAP_S} s of the frame's {timestamp_us} microseconds"
-            remedy = "are the units seconds (images) and microseconds (frames)?"
-            raise InputError(what, where=here, expected=expected, got=got, remedy=remedy)
-        if shot.done_s and not 0 <= shot.shutter_s <= exposure_s < MAX_CLOCK_GAP_S:
-            what, expected = "exposure times contradict each other", "0 <= shutter <= readout end - trigger, seconds"
-            got = f"shutter {shot.shutter_s:g}, trigger to readout end {exposure_s:g}"
-            raise InputError(what, where=here, expected=expected, got=got)
-    pose = _transform(pose, f"{where}: pose")
-    return FrameRecord(number, timestamp_us, pose, dict(shots), tuple(lasers), tuple(boxes), where)
+def _by_camera(shots: Sequence[tuple[str, CameraShot]], where: str) -> dict[str, CameraShot]:
+    """The images of a frame; two of one camera are refused."""
+    if len(found := dict(shots)) < len(shots):
+        raise InputError("frame has two images of one camera", where=where, got=", ".join(name for name, _ in shots))
+    return found
 
 
 def range_image(packed: bytes | memoryview, channels: int, where: str) -> NDArray[np.float32]:
-    """A zlib-packed matrix of floats as f32[H, W, channels]. Raises InputError: damaged, too large, or of another
-    shape."""
+    """A zlib-packed matrix of floats as f32[H, W, channels], of at most ``MAX_UNPACKED_BYTES``."""
     content = unpacked(zlib.decompressobj(), packed, MAX_UNPACKED_BYTES, "range image", where)
     values = parse_message(content, MATRIX_FLOAT, where)
     return _shaped(values["data"], values.get("shape", {}).get("dims", ()), channels, where)
@@ -232,10 +235,8 @@ def parse_message(data: bytes | memoryview, message: Message, where: str) -> dic
 
     def broken(place: int, got: str) -> InputError:
         what, expected = "message cannot be decoded", "a protocol-buffer message of the Waymo Open Dataset"
-        remedy = "is this a file of another data set, or of the motion data?"
-        return InputError(
-            what, where=f"{where}: {message.title}, byte {place}", expected=expected, got=got, remedy=remedy
-        )
+        here, remedy = f"{where}: {message.title}, byte {place}", "is this a file of another data set, or of motions?"
+        return InputError(what, where=here, expected=expected, got=got, remedy=remedy)
 
     values: dict[str, Any] = {name: [] for name, kind, _ in message.fields.values() if kind in _REPEATED}
     for start, number, wire, raw in _fields(memoryview(data), broken):
@@ -256,7 +257,11 @@ def parse_message(data: bytes | memoryview, message: Message, where: str) -> dic
             value = np.frombuffer(raw, _DTYPE[kind])
             value = value if kind in _REPEATED else value[0].item()
         elif kind == "ints":
-            value = np.array(list(_varints(raw, broken)) if packed else [raw], np.uint64).view(np.int64)
+            found, place = [] if packed else [raw], 0
+            while packed and place < len(raw):
+                one, place = _varint(raw, place, broken)
+                found.append(one)
+            value = np.array(found, np.uint64).view(np.int64)
         elif kind == "int":
             value = raw - (raw >> 63 << 64)
         elif kind == "text":
@@ -270,10 +275,8 @@ def parse_message(data: bytes | memoryview, message: Message, where: str) -> dic
             values[name] = value
     for name, kind, _ in message.fields.values():
         if kind in _REPEATED and kind != "messages":
-            parts = values[name]
-            values[name] = (
-                parts[0] if len(parts) == 1 else np.concatenate([np.zeros(0, _DTYPE.get(kind, "<i8")), *parts])
-            )
+            parts, none = values[name], np.zeros(0, _DTYPE.get(kind, "<i8"))
+            values[name] = parts[0] if len(parts) == 1 else np.concatenate([none, *parts])
     return values
 
 
@@ -307,13 +310,6 @@ def _varint(view: memoryview, start: int, broken: Callable[[int, str], InputErro
             return value & 0xFFFFFFFFFFFFFFFF, start + count + 1
     many = len(view) - start >= 10
     raise broken(start, "a number of more than ten bytes" if many else "it ends inside a number")
-
-
-def _varints(view: memoryview, broken: Callable[[int, str], InputError]) -> Iterator[int]:
-    place = 0
-    while place < len(view):
-        value, place = _varint(view, place, broken)
-        yield value
 
 
 _TRANSFORM = Message("Transform", "values 1 doubles")
@@ -382,12 +378,9 @@ for _ in range(8):
 
 
 def crc32c(data: bytes | memoryview) -> int:
-    """CRC-32C of ``data``, 0 .. 2^32 - 1.
-
-    Long data is first folded: leading words are added (exclusive or) to later ones, where a sparse multiple of the
-    polynomial says that the remainder stays the same. That needs three additions a word and runs at memory speed in
-    numpy; the two kilobytes that are left go through the usual table.
-    """
+    """CRC-32C of ``data``, 0 .. 2^32 - 1. Long data is first folded: leading words are added (exclusive or) to later
+    ones, where a sparse multiple of the polynomial says that the remainder stays the same. That needs three additions a
+    word and runs at memory speed in numpy; the two kilobytes that are left go through the usual table."""
     rest, crc = bytes(data), 0xFFFFFFFF
     if len(data) >= 64:
         padded = np.zeros(-len(data) % 8 + len(data), np.uint8)  # zeros in front change nothing
@@ -416,8 +409,7 @@ def masked_crc32c(data: bytes | memoryview) -> int:
 
 def record_places(path: Path) -> Iterator[tuple[str, int, int]]:
     """What the records of a file are called in messages, offset and length of their payloads, in order; only headers
-    are read, and their checksums compared. Raises InputError: not a TFRecord file, cut off, a damaged header, or a
-    length that no record has."""
+    are read, and their checksums compared."""
     try:
         with store.open_file(path) as file:
             size, offset, number = file.seek(0, 2), 0, 0
@@ -453,8 +445,7 @@ def _payload_bytes(header: bytes, path: Path, where: str, left: int, *, first: b
 
 
 def read_payload(file: BinaryIO, where: str, offset: int, length: int) -> bytes:
-    """The payload of a record, its checksum compared. Raises InputError: cut off since the headers were read, or
-    damaged."""
+    """The payload of a record, its checksum compared."""
     file.seek(offset)
     content = file.read(length + _FOOTER_BYTES)
     if len(content) != length + _FOOTER_BYTES:
@@ -474,9 +465,8 @@ def _cut_off(where: str, got: str) -> InputError:
 
 
 class TfrecordLog:
-    """A TFRecord file. Opening it reads the wanted records once, compares all their checksums and keeps what is small.
-    Raises InputError: the file or a wanted record is damaged, or no Waymo frame. ``path``: the file. ``wanted``: record
-    numbers (first, end) to keep, or None."""
+    """A TFRecord file. Opening it reads the ``wanted`` records (first, end; None: all) once, compares their checksums
+    and keeps what is small."""
 
     form = "v1 TFRecord"
 
@@ -508,11 +498,13 @@ class TfrecordLog:
         self.cameras: dict[str, CameraCalibration] = {}
         for camera, item in _named(context["cameras"], CAMERAS):
             image = item.get("width", 0), item.get("height", 0), item.get("direction", 0)
-            self.cameras[camera] = _camera(camera, item["intrinsic"], _sixteen(item, "extrinsic"), image, where)
+            pose = _sixteen(item, "extrinsic")
+            self.cameras[camera] = CameraCalibration.of(camera, item["intrinsic"], pose, image, where)
         self.lasers: dict[str, LaserCalibration] = {}
         for laser, item in _named(context["lasers"], LASERS):
             limits = item.get("inclination_min", np.nan), item.get("inclination_max", np.nan)
-            self.lasers[laser] = _laser(laser, item["inclinations"], limits, _sixteen(item, "extrinsic"), where)
+            pose = _sixteen(item, "extrinsic")
+            self.lasers[laser] = LaserCalibration.of(laser, item["inclinations"], limits, pose, where)
 
     def read(self, frame: FrameRecord, cameras: Sequence[str]) -> FrameContent:
         """The bulky parts of a frame, for the chosen cameras."""
@@ -555,18 +547,16 @@ def _frame_of_message(message: dict[str, Any], number: int, where: str) -> Frame
         values = [box.get(key, np.nan) for key in ("x", "y", "z", "length", "width", "height")]
         boxes.append(_box(item.get("id", ""), item.get("type", 0), [*values, box.get("heading", 0.0)], where))
     lasers = [name for name, item in _named(message["lasers"], LASERS) if item.get("return1", {}).get("ranges")]
-    return _frame(number, message.get("timestamp_us", 0), _sixteen(message, "pose"), shots, lasers, boxes, where)
+    time_us, pose = message.get("timestamp_us", 0), _transform(_sixteen(message, "pose"), f"{where}: pose")
+    return FrameRecord(number, time_us, pose, _by_camera(shots, where), tuple(lasers), tuple(boxes), where)
 
 
 # --- format 2: a folder per component (``camera_image``, ``lidar``, ...) with one Parquet file per log ----------------
 #
 # Rows are read one at a time and in the order of the file, so that memory stays at one page of a column; the keys of
 # all rows are read first and tell which row belongs to which frame.
-_SEGMENT: Final = "key.segment_context_name"
-_TIME: Final = "key.frame_timestamp_micros"
-_CAMERA: Final = "key.camera_name"
-_LASER: Final = "key.laser_name"
-_OBJECT: Final = "key.laser_object_id"
+_NAMES: Final = "segment_context_name frame_timestamp_micros camera_name laser_name laser_object_id".split()
+_SEGMENT, _TIME, _CAMERA, _LASER, _OBJECT = (f"key.{name}" for name in _NAMES)
 _KEYS: Final = (_SEGMENT, _TIME, _CAMERA, _LASER, _OBJECT, "index", "__index_level_0__")
 """Columns that every table may have; the last two are the index of pandas."""
 _INTRINSIC: Final = tuple(f"intrinsic.{name}" for name in "f_u f_v c_u c_v k1 k2 p1 p2 k3".split())
@@ -577,31 +567,20 @@ _EXPOSURE: Final = tuple(
 _CUBOID: Final = (*(f"box.{part}.{axis}" for part in ("center", "size") for axis in "xyz"), "box.heading")
 _RETURNS: Final = [f"range_image_return{number}.{part}" for number in (1, 2) for part in ("values", "shape")]
 _BEAMS: Final = "beam_inclination.min beam_inclination.max beam_inclination.values".split()
-OFFICIAL: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
+_LENS: Final = ("extrinsic.transform", "width", "height", "rolling_shutter_direction", *_INTRINSIC)
+_LABELLED: Final = """panoptic_label panoptic_label_divisor sequence_id num_cameras_covered
+    instance_id_to_global_id_mapping.local_instance_ids instance_id_to_global_id_mapping.global_instance_ids
+    instance_id_to_global_id_mapping.is_tracked""".split()
+_OF_BOX: Final = """type num_lidar_points_in_box num_top_lidar_points_in_box speed.x speed.y speed.z acceleration.x
+    acceleration.y acceleration.z difficulty_level.detection difficulty_level.tracking""".split()
+OFFICIAL: Final[Mapping[str, tuple[str, Sequence[str]]]] = {
     "camera_image": ("CameraImage", ("image", "pose.transform", "pose_timestamp", *_SPEEDS, *_EXPOSURE)),
-    "camera_calibration": (
-        "CameraCalibration",
-        ("extrinsic.transform", "width", "height", "rolling_shutter_direction", *_INTRINSIC),
-    ),
-    "camera_segmentation": (
-        "CameraSegmentationLabel",
-        tuple(
-            "panoptic_label panoptic_label_divisor sequence_id num_cameras_covered "
-            "instance_id_to_global_id_mapping.local_instance_ids instance_id_to_global_id_mapping.global_instance_ids "
-            "instance_id_to_global_id_mapping.is_tracked".split()
-        ),
-    ),
-    "lidar": ("LiDAR", tuple(_RETURNS)),
-    "lidar_box": (
-        "LiDARBox",
-        (
-            *_CUBOID,
-            *"type num_lidar_points_in_box num_top_lidar_points_in_box speed.x speed.y speed.z acceleration.x "
-            "acceleration.y acceleration.z difficulty_level.detection difficulty_level.tracking".split(),
-        ),
-    ),
+    "camera_calibration": ("CameraCalibration", _LENS),
+    "camera_segmentation": ("CameraSegmentationLabel", _LABELLED),
+    "lidar": ("LiDAR", _RETURNS),
+    "lidar_box": ("LiDARBox", (*_CUBOID, *_OF_BOX)),
     "lidar_calibration": ("LiDARCalibration", ("extrinsic.transform", *_BEAMS)),
-    "lidar_pose": ("LiDARPose", tuple(_RETURNS[:2])),
+    "lidar_pose": ("LiDARPose", _RETURNS[:2]),
     "vehicle_pose": ("VehiclePose", ("world_from_vehicle.transform",)),
 }
 """Folders that are read -> name of the component, and its columns, read or not. Source: the data set's published
@@ -611,10 +590,9 @@ REQUIRED: Final = ("camera_image", "camera_calibration", "vehicle_pose")
 
 
 class ParquetLog:
-    """One log of a format-2 folder. Opening it reads all small tables and the keys of the large ones. Raises
-    InputError: a component is missing, or a table is damaged or contradictory. ResourceError: pyarrow is not installed.
-    ``root``: folder with the component folders. ``segment``: name of the log, that of its files. ``wanted``: frames
-    (first, end) in the order of time, or None."""
+    """One log of a format-2 folder. Opening it reads all small tables and the keys of the large ones. ``root``: folder
+    with the component folders. ``segment``: name of the log, that of its files. ``wanted``: frames (first, end) in the
+    order of time; None: all. ResourceError: pyarrow is not installed."""
 
     form = "v2 Parquet"
 
@@ -631,25 +609,22 @@ class ParquetLog:
 
     def read(self, frame: FrameRecord, cameras: Sequence[str]) -> FrameContent:
         """The bulky parts of a frame, for the chosen cameras. Reading frames in the order of time is fastest."""
-        time, images, panoptic, scans = frame.timestamp_us, {}, {}, {}
-        for name, row in self._images.rows(time, _CAMERA, CAMERAS):
-            if name in cameras:
-                images[name] = bytes(self._images.value(row, "image"))
-        if self._labels is not None:
-            for name, row in self._labels.rows(time, _CAMERA, CAMERAS):
-                if name in cameras:
-                    divisor = int(self._labels.value(row, "panoptic_label_divisor"))
-                    panoptic[name] = divisor, bytes(self._labels.value(row, "panoptic_label"))
+        time, shown, labels, scans = frame.timestamp_us, self._images, self._labels, {}
+        images = {name: bytes(shown.value(n, "image")) for name, n in shown.rows(time, _CAMERA, CAMERAS, cameras)}
+        panoptic = {}
+        if labels is not None:
+            for name, row in labels.rows(time, _CAMERA, CAMERAS, cameras):
+                divisor, png = labels.value(row, "panoptic_label_divisor"), labels.value(row, "panoptic_label")
+                panoptic[name] = int(divisor), bytes(png)
         if self._lidar is not None and self._poses is not None:
             rows = dict(self._poses.rows(time, _LASER, LASERS))
             for name, row in self._lidar.rows(time, _LASER, LASERS):
                 found = [self._lidar.image(row, f"range_image_return{n}", 4) for n in (1, 2)]
-                poses = None
-                if name == TOP:
-                    poses = self._poses.image(rows[TOP], "range_image_return1", 6) if TOP in rows else None
-                    if poses is None:
-                        what, where = "frame has no pixel poses", f"{frame.where}: lidar_pose"
-                        raise InputError(what, where=where, expected="a row for the top LiDAR")
+                top = name == TOP and TOP in rows
+                poses = self._poses.image(rows[TOP], "range_image_return1", 6) if top else None
+                if name == TOP and poses is None:
+                    what, where = "frame has no pixel poses", f"{frame.where}: lidar_pose"
+                    raise InputError(what, where=where, expected="a row for the top LiDAR")
                 scans[name] = LaserScan([image for image in found if image is not None], poses)
         return FrameContent(images, panoptic, scans)
 
@@ -669,7 +644,8 @@ class ParquetLog:
         for number, time in chosen:
             here = f"{self._root}: {self.name}, frame {number}"
             lasers = [] if self._lidar is None else [name for name, _ in self._lidar.rows(time, _LASER, LASERS)]
-            frames.append(_frame(number, time, poses[time], shots.get(time, ()), lasers, boxes.get(time, ()), here))
+            pose, taken = _transform(poses[time], f"{here}: pose"), _by_camera(shots.get(time, ()), here)
+            frames.append(FrameRecord(number, time, pose, taken, tuple(lasers), tuple(boxes.get(time, ())), here))
         return frames
 
     def _shots(self) -> dict[int, list[tuple[str, CameraShot]]]:
@@ -713,7 +689,8 @@ def _cameras(table: ParquetTable) -> Iterator[tuple[str, CameraCalibration]]:
     for where, row in table.records((_CAMERA,), required, (direction,)):
         if row[_CAMERA] in CAMERAS:
             name, image = CAMERAS[row[_CAMERA]], (int(row["width"]), int(row["height"]), int(row[direction] or 0))
-            yield name, _camera(name, [row[n] for n in _INTRINSIC], row["extrinsic.transform"], image, where)
+            intrinsic, pose = [row[n] for n in _INTRINSIC], row["extrinsic.transform"]
+            yield name, CameraCalibration.of(name, intrinsic, pose, image, where)
 
 
 def _lasers(table: ParquetTable) -> Iterator[tuple[str, LaserCalibration]]:
@@ -721,13 +698,12 @@ def _lasers(table: ParquetTable) -> Iterator[tuple[str, LaserCalibration]]:
     for where, row in table.records((_LASER,), ("extrinsic.transform", low, high), (beams,)):
         if row[_LASER] in LASERS:
             name, limits = LASERS[row[_LASER]], (float(row[low]), float(row[high]))
-            yield name, _laser(name, row[beams] or (), limits, row["extrinsic.transform"], where)
+            yield name, LaserCalibration.of(name, row[beams] or (), limits, row["extrinsic.transform"], where)
 
 
 class ParquetTable:
     """The Parquet file of a component, whose columns go by their short names: whole columns of small values, or single
-    large values row by row. Raises InputError: not a Parquet file, damaged, or a column is missing. ResourceError:
-    pyarrow is not installed."""
+    large values row by row."""
 
     def __init__(self, path: Path, component: str) -> None:
         self.path = path
@@ -765,14 +741,16 @@ class ParquetTable:
                 raise InputError("table has an empty value", where=f"{self.path}: row {index}", got=got)
             yield f"{self.path}: row {index}", dict(zip(chosen, row, strict=True))
 
-    def rows(self, timestamp_us: int, sensor: str, names: Mapping[int, str]) -> list[tuple[str, int]]:
-        """Sensor names and rows of one frame, in the order of the file."""
+    def rows(
+        self, timestamp_us: int, sensor: str, names: Mapping[int, str], chosen: Sequence[str] | None = None
+    ) -> list[tuple[str, int]]:
+        """Names and rows of the ``chosen`` sensors (None: all) in one frame, in the order of the file."""
         if self._by_time is None:
             self._by_time = {}
             for index, (_, row) in enumerate(self.records((_TIME, sensor), ())):
                 if row[sensor] in names:
                     self._by_time.setdefault(int(row[_TIME]), []).append((names[row[sensor]], index))
-        return self._by_time.get(timestamp_us, [])
+        return [one for one in self._by_time.get(timestamp_us, []) if chosen is None or one[0] in chosen]
 
     def value(self, row: int, name: str) -> Any:
         """One value as a plain one (bytes, number, list)."""
