@@ -11,6 +11,7 @@ import copy
 import functools
 import io
 import re
+import shutil
 import struct
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -70,6 +71,23 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return whole_city(shared(tmp_path_factory) / "city")
 
 
+def fixtures(write: Callable[[Scene, Path], object], name: str) -> tuple[Any, Any]:
+    """Fixtures of a test module: the whole city as a log, which all of its tests share, and a copy to spoil, called
+    ``name``."""
+
+    @pytest.fixture(scope="module")
+    def pristine(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+        folder = tmp_path_factory.mktemp("logs") / name
+        write(truth, folder)
+        return folder
+
+    @pytest.fixture
+    def source(pristine: Path, tmp_path: Path) -> Path:
+        return shutil.copytree(pristine, tmp_path / name)
+
+    return pristine, source
+
+
 @functools.cache
 def whole_city(folder: Path) -> Scene:
     """All moments of the small city."""
@@ -93,7 +111,6 @@ def written(kind: str, folder: Path) -> Files | write_waymo.Log:
     if kind in NEEDS_PYARROW:
         pytest.importorskip("pyarrow")
     if kind == "kitti":
-        (folder / "kitti").mkdir()
         root = kitti_folders.write_derived(folder / "kitti")
         return Files(root, root / "image_02/data/0000000003.png", root / "velodyne_points/data/0000000003.bin")
     truth = city(folder / "truth")

@@ -20,15 +20,8 @@ LUMA = np.array([0.299, 0.587, 0.114])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilmicResponse:
-    """A camera with exposure, white balance, vignetting, a filmic shoulder, saturation and contrast.
-
-    Args:
-        exposure: factor on linear light.
-        white: factors of red, green and blue, f64[3].
-        saturation: colour about its own grey, 1 = unchanged.
-        contrast: slope of display values about 0.5.
-        vignette: share of the light lost in the corners.
-    """
+    """A camera with exposure (a factor on linear light), white balance, vignetting (share of the light lost in the
+    corners), a filmic shoulder, saturation (about its own grey) and contrast (slope of display values about 0.5)."""
 
     exposure: float = 1.0
     white: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -102,8 +95,6 @@ def surfaces(world: CityWorld, view: View) -> CitySurfaces:
     """Exact surfaces behind the pixel centres of a view, as ``CityWorld.render`` sees them."""
     camera, handle = view.camera, world._handle._handle
     planes = np.empty((camera.height, camera.width, 10), np.float32)
-    poses = np.ascontiguousarray(world._object_keys_at(np.array([view.time_s]))[0])
-    phases, pose = world._phases(view.time_s), np.ascontiguousarray(view.world_from_cam)
-    frame = (np.array(camera.intrinsics), camera.width, camera.height, pose)
-    assert library().mudg_city_planes(handle, poses, phases, *frame, planes) == 0
+    frame = (np.array(camera.intrinsics), camera.width, camera.height, np.ascontiguousarray(view.world_from_cam))
+    assert library().mudg_city_planes(handle, *world._objects_at(view.time_s), *frame, planes) == 0
     return CitySurfaces(planes[..., :3], planes[..., 3:6], *(planes[..., i] for i in range(6, 10)))

@@ -59,6 +59,13 @@ def small_log(folder: Path, **changes: object) -> Scene:
     return replace(scene, tracks=tuple(tracks))
 
 
+def mounts(scene: Scene) -> dict[str, NDArray[np.float64]]:
+    """Camera or LiDAR -> where it sits on the vehicle, f64[4, 4], by its first record."""
+    placed = [(frame.view.camera.name, frame.view.time_s, frame.view.world_from_cam) for frame in scene.frames]
+    placed += [(sweep.sensor, sweep.time_s, sweep.world_from_lidar) for sweep in scene.sweeps]
+    return {name: invert(scene.ego.pose_at(time_s)) @ pose for name, time_s, pose in reversed(placed)}
+
+
 def assert_same_log(
     scene: Scene,
     truth: Scene,

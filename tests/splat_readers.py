@@ -159,15 +159,8 @@ def read_sog(content: bytes) -> list[Splat]:
             for k in range(coefficients):
                 rgb = loaded[index % 64 * coefficients + k, index // 64]
                 sh.append([meta["shN"]["codebook"][v] for v in rgb[:3]])
-        found.append(
-            Splat(
-                place,
-                three_and_largest(turn[3] - 252, three),
-                [math.exp(meta["scales"]["codebook"][v]) for v in size[:3]],
-                color[3] / 255,
-                sh,
-            )
-        )
+        sizes = [math.exp(meta["scales"]["codebook"][v]) for v in size[:3]]
+        found.append(Splat(place, three_and_largest(turn[3] - 252, three), sizes, color[3] / 255, sh))
     return found
 
 
@@ -199,11 +192,11 @@ def read_glb_mesh(document: dict[str, Any], content: bytes, mesh: int) -> list[S
     prefix = "KHR_gaussian_splatting:"
     bands = [name for name in given if name.startswith(prefix + "SH_DEGREE_")]
     bands.sort(key=lambda name: [int(word) for word in re.findall(r"\d+", name)])
+    columns = [given["POSITION"], *(given[prefix + name] for name in ("ROTATION", "SCALE", "OPACITY"))]
+    harmonics = zip(*(given[name] for name in bands), strict=True)
     return [
-        Splat(place, [turn[3], *turn[:3]], size, opacity[0], [given[name][n] for name in bands])
-        for n, (place, turn, size, opacity) in enumerate(
-            zip(given["POSITION"], *(given[prefix + name] for name in ("ROTATION", "SCALE", "OPACITY")), strict=True)
-        )
+        Splat(place, [turn[3], *turn[:3]], size, opacity[0], list(sh))
+        for place, turn, size, opacity, sh in zip(*columns, harmonics, strict=True)
     ]
 
 
@@ -273,13 +266,6 @@ def read_usd_splats(prim: dict[str, Any], places: list[list[float]] | None = Non
     count = len(prim["orientations"])
     harmonics = prim["radiance:sphericalHarmonicsCoefficients"]
     each = len(harmonics) // count
-    return [
-        Splat(
-            place,
-            prim["orientations"][n],
-            prim["scales"][n],
-            prim["opacities"][n],
-            harmonics[n * each : (n + 1) * each],
-        )
-        for n, place in enumerate(prim["positions"] if places is None else places)
-    ]
+    sh = [harmonics[n * each : (n + 1) * each] for n in range(count)]
+    columns = (prim["orientations"], prim["scales"], prim["opacities"], sh)
+    return [Splat(*one) for one in zip(prim["positions"] if places is None else places, *columns, strict=True)]

@@ -17,15 +17,17 @@ import numpy as np
 import pytest
 import toy_splats
 import yaml
+from refusals import refused
 from toy_fitted import toy_fitted
 
 from mudg.base import geometry
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import UsageError
 from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Source, View
 from mudg.core.edit import HeightMap
 from mudg.exporting.settings import ExportConfig
 from mudg.formats.exporters import alpasim
 from mudg.formats.exporters.alpasim import LANE_M, lanes_beside, opendrive, to_alpasim
+from mudg.formats.exporters.ncore import intrinsics_of
 from mudg.formats.splats.cloud import SplatScene
 from mudg.gaussians.storage import save_model
 from mudg.scene.motion import Road
@@ -40,9 +42,8 @@ def drive(readout_s: float = 0.0) -> Scene:
     cameras, frames = {}, []
     for number, name in enumerate(("front", "left")):
         cameras[name] = Camera(name, 64, 48, 50.0, 51.0, 31.0, 25.0, readout_s=readout_s)
-        mount = geometry.yaw_matrix(0.8 * number, (1.5, 0.4 * number, 1.6)) @ geometry.invert(
-            geometry.CAM_FROM_EGO_AXES
-        )
+        turned = geometry.yaw_matrix(0.8 * number, (1.5, 0.4 * number, 1.6))
+        mount = turned @ geometry.invert(geometry.CAM_FROM_EGO_AXES)
         for index, time_s in enumerate((0.05 + 0.03 * number, 0.25)):
             pose = ego.pose_at(time_s)
             assert pose is not None
@@ -53,6 +54,17 @@ def drive(readout_s: float = 0.0) -> Scene:
 def ground() -> HeightMap:
     x, y = np.meshgrid(np.arange(-20, 40, 0.25), np.arange(-10, 10, 0.25), indexing="ij")
     return HeightMap.from_points(np.column_stack([x.ravel(), y.ravel(), 0.02 * x.ravel()]))
+
+
+def mesh_of(content: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a PLY file."""
+    head, _, body = content.partition(b"end_header\n")
+    counts = [int(line.split()[2]) for line in head.decode().splitlines() if line.startswith("element")]
+    assert b"property list uchar int vertex_indices" in head
+    vertices = np.frombuffer(body, "<f4", 3 * counts[0]).reshape(-1, 3)
+    rows = list(struct.iter_unpack("<B3i", body[12 * counts[0] :]))
+    assert len(rows) == counts[1] and {row[0] for row in rows} == {3}
+    return vertices.astype(np.float64), np.array([row[1:] for row in rows])
 
 
 class Package:
@@ -71,16 +83,6 @@ class Package:
         pose = geometry.pose_at(times, np.array(self.trajectory["T_rig_worlds"]), time_us, 0.5)
         assert pose is not None
         return pose
-
-    def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        content = self.archive.read("mesh_ground.ply")
-        head, _, body = content.partition(b"end_header\n")
-        counts = [int(line.split()[2]) for line in head.decode().splitlines() if line.startswith("element")]
-        assert b"property list uchar int vertex_indices" in head
-        vertices = np.frombuffer(body, "<f4", 3 * counts[0]).reshape(-1, 3)
-        rows = list(struct.iter_unpack("<B3i", body[12 * counts[0] :]))
-        assert len(rows) == counts[1] and {row[0] for row in rows} == {3}
-        return vertices.astype(np.float64), np.array([row[1:] for row in rows])
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +149,7 @@ def test_objects_have_their_paths_sizes_and_flags(package: Package) -> None:
 
 
 def test_the_ground_lies_where_it_is_and_faces_up(package: Package) -> None:
-    vertices, faces = package.mesh()
+    vertices, faces = mesh_of(package.archive.read("mesh_ground.ply"))
     assert faces.min() == 0 and faces.max() == len(vertices) - 1
     inside = (np.abs(vertices[:, 1]) < 8) & (vertices[:, 0] > -18) & (vertices[:, 0] < 38)
     assert np.abs(vertices[inside, 2] - 0.02 * vertices[inside, 0]).max() < 0.02
@@ -160,13 +162,7 @@ def test_unknown_ground_is_a_hole_and_the_mesh_turns_with_the_file() -> None:
     heights = np.zeros((3, 4))
     heights[1, 1] = np.nan
     turn = geometry.yaw_matrix(np.pi / 2, (10.0, 0.0, 1.0))
-    mesh = alpasim.ground_mesh(HeightMap(np.array([1.0, 2.0]), 0.5, heights), turn)
-    package = object.__new__(Package)
-    archive = io.BytesIO()
-    with zipfile.ZipFile(archive, "w") as written:
-        written.writestr("mesh_ground.ply", mesh)
-    package.archive = zipfile.ZipFile(archive)
-    vertices, faces = package.mesh()
+    vertices, faces = mesh_of(alpasim.ground_mesh(HeightMap(np.array([1.0, 2.0]), 0.5, heights), turn))
     assert len(vertices) == 11 and len(faces) == 2 * 2  # of six cells four touch the unknown corner
     assert np.allclose(vertices[0], [10.0 - 2.0, 1.0, 1.0], atol=1e-6)
 
@@ -178,7 +174,7 @@ def test_shutters_and_the_same_bytes(package: Package) -> None:
     told = next(iter(rolling.rig["camera_calibrations"].values()))["camera_model"]["parameters"]
     assert told["shutter_type"] == "ROLLING_TOP_TO_BOTTOM"
     camera = Camera("a", 64, 48, 50.0, 51.0, 31.0, 25.0, (), 0.02, "left_to_right")
-    assert alpasim.intrinsics(camera)["shutter_type"] == "ROLLING_LEFT_TO_RIGHT"
+    assert intrinsics_of(camera)["shutter_type"] == "ROLLING_LEFT_TO_RIGHT"
     assert to_alpasim(toy_splats.scene(1), drive(), ground()) == package.content
     other = toy_splats.scene(1)
     moved = replace(other, nodes=(replace(other.nodes[0], cloud=toy_splats.cloud(4)), *other.nodes[1:]))
@@ -188,26 +184,20 @@ def test_shutters_and_the_same_bytes(package: Package) -> None:
 def test_intrinsics_are_those_of_the_vendors_package() -> None:
     data = pytest.importorskip("ncore.data")
     camera = Camera("a", 64, 48, 50.0, 51.0, 31.0, 25.0, readout_s=0.01)
-    found = data.OpenCVPinholeCameraModelParameters.from_dict(alpasim.intrinsics(camera))
-    assert found.to_dict() == alpasim.intrinsics(camera)
+    found = data.OpenCVPinholeCameraModelParameters.from_dict(intrinsics_of(camera))
+    assert found.to_dict() == intrinsics_of(camera)
 
 
 def test_the_command_needs_a_drive(tmp_path: Path) -> None:
     scene = SplatScene("toy", toy_splats.scene().nodes)
-    with pytest.raises(InputError, match="none is known"):
-        to_alpasim(scene, None, ground())
+    refused("none is known", to_alpasim, scene, None, ground())
     parked = EgoPath(np.zeros(0), np.zeros((0, 4, 4)))
-    with pytest.raises(InputError, match="none is known"):
-        to_alpasim(scene, replace(drive(), ego=parked), ground())
-    with pytest.raises(InputError, match="ground"):
-        to_alpasim(scene, drive(), None)
+    refused("none is known", to_alpasim, scene, replace(drive(), ego=parked), ground())
+    refused("ground", to_alpasim, scene, drive(), None)
     save_model(toy_fitted(0), tmp_path / "fit")
-    with pytest.raises(InputError, match="--scene"):
-        Export(format="alpasim", source=tmp_path / "fit", out=tmp_path / "a.usdz", settings=ExportConfig()).run()
-    with pytest.raises(UsageError, match="holds all moments"):
-        Export(
-            format="alpasim", source=tmp_path / "fit", out=tmp_path / "a.usdz", settings=ExportConfig(time_s=0.2)
-        ).run()
+    step = Export(format="alpasim", source=tmp_path / "fit", out=tmp_path / "a.usdz", settings=ExportConfig())
+    refused("--scene", step.run)
+    refused("holds all moments", replace(step, settings=ExportConfig(time_s=0.2)).run, raises=UsageError)
     assert not (tmp_path / "a.usdz").exists()
 
 
@@ -254,10 +244,8 @@ def test_the_maps_line_is_the_path_driven() -> None:
 )
 def test_lanes_are_as_many_as_the_road_is_wide(left: float, right: float, lanes: tuple[int, int]) -> None:
     road, rng = bend(0.0), np.random.default_rng(0)
-    stations, sides = rng.uniform(0, road.length_m, 4000), rng.uniform(-right, left, 4000)
-    surface = np.stack(
-        [geometry.transform_points(road.recorded(s), np.array([[0.0, d, 0.0]]))[0] for s, d in zip(stations, sides)]
-    )
+    stations, sides = rng.uniform(0, road.length_m, 2000), rng.uniform(-right, left, 2000)
+    surface = np.stack([(road.recorded(s) @ [0.0, d, 0.0, 1.0])[:3] for s, d in zip(stations, sides)])
     assert lanes_beside(road, surface) == lanes
     assert lanes_beside(road, surface[rng.permutation(len(surface))]) == lanes
     xml = ET.fromstring(opendrive(road, surface, "x"))

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import io
 import struct
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -54,11 +53,7 @@ def test_a_bad_image_is_refused_by_name(kind: str, case: str, folder: Path, tmp_
 @needs_native
 @pytest.mark.parametrize("kind", FORMATS)
 def test_a_grey_image_is_taken_and_noted(kind: str, folder: Path, tmp_path: Path) -> None:
-    log = bad_logs.written(kind, folder)
-
-    def grey(content: bytes) -> bytes:
-        return bad_logs.png(bad_logs.opened(content).convert("L"))
-
+    log, grey = bad_logs.written(kind, folder), lambda content: bad_logs.png(bad_logs.opened(content).convert("L"))
     with bad_logs.damaged(log, kind, "image", grey, tmp_path) as (source, _):
         scene = bad_logs.ingest(kind, source, tmp_path / "out", bad_logs.options_of(log))
     assert "1 images of camera front are grey" in scene.source.notes
@@ -104,11 +99,7 @@ CAMERA = Camera("front", 60_000, 60_000, 100.0, 100.0, 30_000.0, 30_000.0)
 
 def huge_png(mode: str) -> bytes:
     """A PNG of one pixel whose header states another size, with the right checksum."""
-    out = io.BytesIO()
-    Image.new(mode, (1, 1)).save(out, "PNG")
-    content = out.getvalue()
-    header = b"IHDR" + struct.pack(">II", 60_000, 60_000) + content[24:29]
-    return content[:12] + header + struct.pack(">I", zlib.crc32(header)) + content[33:]
+    return bad_logs.declaring(60_000, 60_000)(bad_logs.png(Image.new(mode, (1, 1))))
 
 
 def huge_jpeg(_mode: str) -> bytes:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,8 +47,8 @@ def cut(path: Path, share: float = 0.6) -> None:
 
 
 def nan_row(root: Path) -> None:
-    rows = np.fromfile(root / SCAN, "<f4").reshape(-1, 4)
-    rows[5, 1] = np.nan
+    rows = np.fromfile(root / SCAN, "<f4")
+    rows[21] = np.nan
     rows.tofile(root / SCAN)
 
 
@@ -61,12 +61,13 @@ def third_line(name: str, change: Callable[[list[str]], list[str]]) -> Callable[
     return spoil
 
 
-def rewriting(name: str, change: Callable[[str], str]) -> Callable[[Path], None]:
+def text(name: str, change: Callable[[str], str]) -> Callable[[Path], None]:
     return lambda root: rewrite(root / name, change)
 
 
-POSES, LABELS = "derived/poses_velo.txt", "derived/label_02.txt"
-FIRST_P2 = made.numbers(made.projection(2))
+POSES, LABELS, CALIB = "derived/poses_velo.txt", "derived/label_02.txt", "calib.txt"
+FIRST_P2, ONE, TWICE = made.numbers(made.projection(2)), made.numbers(np.eye(3)), made.numbers(2 * np.eye(3))
+NO_FOCAL = "0 " + FIRST_P2.split(" ", 1)[1]
 
 
 KITTI: dict[str, tuple[str, str, Callable[[Path], object]]] = {
@@ -77,97 +78,58 @@ KITTI: dict[str, tuple[str, str, Callable[[Path], object]]] = {
     "image of another size": ("camera's size", IMAGE, lambda r: Image.new("RGB", (50, 20)).save(r / IMAGE)),
     "truncated scan": ("cut off", SCAN, lambda r: (r / SCAN).write_bytes((r / SCAN).read_bytes()[:-7])),
     "NaN in scan": ("not finite", SCAN, nan_row),
-    "truncated pose file": ("wrong number of values", "poses_velo.txt", lambda r: cut(r / POSES, 0.57)),
-    "pose file without a frame": (
-        "lacks frames",
-        "poses_velo.txt",
-        rewriting(POSES, lambda t: t[: t.rindex("\n5 ") + 1]),
-    ),
+    "poses cut off": ("wrong number of values", "poses_velo.txt", lambda r: cut(r / POSES, 0.57)),
+    "pose lost": ("lacks frames", "poses_velo.txt", text(POSES, lambda t: t[: t.rindex("\n5 ") + 1])),
     "empty pose file": ("empty", "poses_velo.txt", lambda r: (r / POSES).write_text("")),
     "no pose file": ("no vehicle poses", "", lambda r: (r / POSES).unlink()),
     "NaN pose": ("not finite", "line 3", third_line(POSES, lambda w: [*w[:4], "nan", *w[5:]])),
     "text in pose": ("not a number", "line 3", third_line(POSES, lambda w: [*w[:4], "1,5", *w[5:]])),
     "binary pose file": ("not text", "poses_velo.txt", lambda r: (r / POSES).write_bytes(b"\xff\xfe\x00" * 9)),
     "no calibration": ("no calibration", "", lambda r: (r / "calib.txt").unlink()),
-    "calibration cut off": (
-        "lacks Tr_velo_to_cam",
-        "calib.txt",
-        rewriting("calib.txt", lambda t: t[: t.index("Tr_velo")]),
-    ),
-    "zero focal length": (
-        "pinhole camera",
-        "P2",
-        rewriting("calib.txt", lambda t: t.replace(FIRST_P2, "0 " + FIRST_P2.split(" ", 1)[1])),
-    ),
-    "calibration scaled": (
-        "is scaled",
-        "R0_rect",
-        rewriting("calib.txt", lambda t: t.replace(made.numbers(np.eye(3)), made.numbers(2 * np.eye(3)))),
-    ),
+    "calibration cut off": ("lacks Tr_velo_to_cam", CALIB, text(CALIB, lambda t: t[: t.index("Tr_velo")])),
+    "zero focal length": ("pinhole camera", "P2", text(CALIB, lambda t: t.replace(FIRST_P2, NO_FOCAL))),
+    "calibration scaled": ("is scaled", "R0_rect", text(CALIB, lambda t: t.replace(ONE, TWICE))),
     "label columns": ("number of values", "label_02.txt: line 3", third_line(LABELS, lambda w: w[:-3])),
     "label text": ("not a number", "label_02.txt: line 3", third_line(LABELS, lambda w: [*w[:-1], "left"])),
     "label NaN": ("not finite", "label_02.txt: line 3", third_line(LABELS, lambda w: [*w[:-1], "nan"])),
     "flat box": ("makes no sense", "label_02.txt: line 3", third_line(LABELS, lambda w: [*w[:10], "0", *w[11:]])),
-    "two boxes of one track": ("two boxes", "label_02.txt", rewriting(LABELS, lambda t: t + t.splitlines()[1] + "\n")),
+    "two boxes of one track": ("two boxes", "label_02.txt", text(LABELS, lambda t: t + t.splitlines()[1] + "\n")),
+}
+
+
+PACKET, TRACKLETS, STAMPS = "oxts/data/0000000002.txt", "tracklet_labels.xml", "image_02/timestamps.txt"
+SCANNED, BAIT = "velodyne_points/timestamps.txt", '<!DOCTYPE b [<!ENTITY a "b">]>'
+RAW: dict[str, tuple[str, str, Callable[[Path], object]]] = {
+    "missing packet": ("packets are missing", "", lambda r: (r / PACKET).unlink()),
+    "packet cut off": ("wrong number of values", "", lambda r: cut(r / PACKET, 0.5)),
+    "packet empty": ("packets are missing", "", lambda r: (r / PACKET).write_text("")),
+    "latitude": ("out of range", "", text(PACKET, lambda t: "149" + t[2:])),
+    "timestamps cut off": ("do not cover", "", lambda r: cut(r / STAMPS, 0.5)),
+    "timestamps unsorted": ("do not increase", "", text(SCANNED, lambda t: "\n".join(reversed(t.splitlines())))),
+    "no such day": ("no date", "", text(STAMPS, lambda t: t.replace("09-26", "09-31", 1))),
+    "tracklets cut off": ("not valid XML", "", lambda r: cut(r / TRACKLETS, 0.7)),
+    "entities": ("entities", "", text(TRACKLETS, lambda t: t.replace("<!DOCTYPE boost_serialization>", BAIT))),
+    "tracklet without place": ("'tx'", "", text(TRACKLETS, lambda t: re.sub("(</?)tx>", r"\1xx>", t, count=2))),
+    "no IMU calibration": ("where the IMU is", "", lambda r: (r.parent / "calib_imu_to_velo.txt").unlink()),
 }
 
 
 @pytest.fixture
 def drive(tmp_path: Path) -> Path:
-    (tmp_path / "drive").mkdir()
     return made.write_derived(tmp_path / "drive")
 
 
-@pytest.mark.parametrize("case", KITTI)
-def test_broken_kitti_log(case: str, drive: Path, tmp_path: Path) -> None:
-    words, where, spoil = KITTI[case]
-    spoil(drive)
+@pytest.mark.parametrize(("layout", "case"), [*(("derived", case) for case in KITTI), *(("raw", case) for case in RAW)])
+def test_broken_kitti_log(layout: str, case: str, tmp_path: Path) -> None:
+    words, where, spoil = (KITTI if layout == "derived" else RAW)[case]
+    log = (made.write_derived if layout == "derived" else made.write_raw_drive)(tmp_path / "drive")
+    spoil(log)
     with pytest.raises(InputError) as caught:
-        ingest(drive, tmp_path / "out")
+        ingest(log, tmp_path / "out")
     error = caught.value
-    assert words in error.what
-    assert where in error.where
-    assert error.exit_code == 3
-    assert str(drive) in error.where or str(drive) in error.got
+    assert words in error.what and where in error.where and error.exit_code == 3
+    assert str(tmp_path / "drive") in error.where or str(tmp_path / "drive") in error.got
     assert sorted(p.name for p in tmp_path.iterdir()) == ["drive"], "something half-written is left"
-
-
-PACKET, TRACKLETS = "oxts/data/0000000002.txt", "tracklet_labels.xml"
-BAIT = '<!DOCTYPE b [<!ENTITY a "b">]>'
-RAW: dict[str, tuple[str, Callable[[Path], object]]] = {
-    "missing packet": ("packets are missing", lambda r: (r / PACKET).unlink()),
-    "packet cut off": ("wrong number of values", lambda r: cut(r / PACKET, 0.5)),
-    "packet empty": ("packets are missing", lambda r: (r / PACKET).write_text("")),
-    "latitude": ("out of range", rewriting(PACKET, lambda t: "149" + t[2:])),
-    "timestamps cut off": ("do not cover", lambda r: cut(r / "image_02/timestamps.txt", 0.5)),
-    "timestamps unsorted": (
-        "do not increase",
-        rewriting("velodyne_points/timestamps.txt", lambda t: "\n".join(reversed(t.splitlines()))),
-    ),
-    "no such day": ("no date", rewriting("image_02/timestamps.txt", lambda t: t.replace("09-26", "09-31", 1))),
-    "tracklets cut off": ("not valid XML", lambda r: cut(r / TRACKLETS, 0.7)),
-    "tracklets with entities": (
-        "entities",
-        rewriting(TRACKLETS, lambda t: t.replace("<!DOCTYPE boost_serialization>", BAIT)),
-    ),
-    "tracklet without place": (
-        "'tx'",
-        rewriting(TRACKLETS, lambda t: t.replace("<tx>", "<xx>", 1).replace("</tx>", "</xx>", 1)),
-    ),
-    "no IMU calibration": ("where the IMU is", lambda r: (r.parent / "calib_imu_to_velo.txt").unlink()),
-}
-
-
-@pytest.mark.parametrize("case", RAW)
-def test_broken_raw_drive(case: str, tmp_path: Path) -> None:
-    words, spoil = RAW[case]
-    folder = made.write_raw_drive(tmp_path / "day")
-    spoil(folder)
-    with pytest.raises(InputError) as caught:
-        ingest(folder, tmp_path / "out")
-    assert words in caught.value.what
-    assert caught.value.where
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["day"]
 
 
 def test_incomplete_frames_can_be_left_out_on_request(drive: Path, tmp_path: Path) -> None:
@@ -209,7 +171,6 @@ def test_a_log_without_tracks_and_with_a_scan_without_points_is_fused(drive: Pat
 
 
 def test_one_frame(tmp_path: Path) -> None:
-    (tmp_path / "drive").mkdir()
     source = made.write_derived(tmp_path / "drive", made.Drive((0,)))
     (source / "derived/poses_velo.txt").unlink()
     scene, cloud = through(source, tmp_path)
@@ -235,9 +196,8 @@ def test_no_lidar(drive: Path, tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def good_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("good") / "scene"
-    ToyStreet(car_start=(12, 0), car_velocity=(3, 0), times=(0.0, 0.1, 0.2)).write(
-        root, labels=False, width=80, height=40
-    )
+    street = ToyStreet(car_start=(12, 0), car_velocity=(3, 0), times=(0.0, 0.1, 0.2))
+    street.write(root, labels=False, width=80, height=40)
     (root / store.MANIFEST).unlink()
     return root
 
@@ -261,7 +221,7 @@ SCENES: dict[str, tuple[str, Callable[[Path], object]]] = {
     "truncated image": ("cannot be decoded", lambda r: cut(r / FRAME)),
     "truncated sweep": ("safetensors", lambda r: cut(r / SWEEP)),
     "missing sweep": ("missing", lambda r: (r / SWEEP).unlink()),
-    "NaN pose": ("JSON", rewriting("scene.json", lambda t: t.replace('_from_cam": [0.0', '_from_cam": [NaN', 1))),
+    "NaN pose": ("JSON", text("scene.json", lambda t: t.replace('_from_cam": [0.0', '_from_cam": [NaN', 1))),
     "bent track": ("not a rigid motion", bend_track),
     "index cut off": ("JSON", lambda r: cut(r / "scene.json")),
     "sweep is an image": ("safetensors", lambda r: (r / SWEEP).write_bytes((r / FRAME).read_bytes())),
@@ -278,11 +238,9 @@ def test_broken_scene(case: str, verb: str, good_scene: Path, tmp_path: Path) ->
     root = tmp_path / "scene"
     shutil.copytree(good_scene, root)
     spoil(root)
-    step = {"fuse": partial(Fuse, settings=FuseConfig()), "annotate": partial(Annotate, settings=AnnotateConfig())}[
-        verb
-    ]
+    step, settings = {"fuse": (Fuse, FuseConfig()), "annotate": (Annotate, AnnotateConfig())}[verb]
     with pytest.raises(InputError) as caught:
-        step(scene=root, out=tmp_path / "out").run()
+        step(scene=root, out=tmp_path / "out", settings=settings).run()
     assert words in str(caught.value)
     assert str(root) in caught.value.where
     for finished in ("fuse.json", "scene.json", "manifest.json"):

@@ -15,13 +15,14 @@ from mudg.base import geometry
 from mudg.base.errors import UsageError
 from mudg.benchmarks import loop
 from mudg.benchmarks.settings import BenchConfig
-from mudg.city.logs import LISTS, LogRules, log_config
+from mudg.city.config import CityConfig
+from mudg.city.logs import LISTS, log_config
 from mudg.city.world import CityWorld
 from mudg.sim.lidar import BeamTable
 
 pytestmark = needs_native
 
-RULES = LogRules(frames=8, width=96, height=64, cameras=("front",))
+RULES = CityConfig(n_frames=8, width=96, height=64, cameras=("front",))
 
 
 @pytest.fixture(scope="module")
@@ -74,15 +75,13 @@ def test_worse_pictures_score_worse_by_what_was_done_to_them(course: loop.Course
 def test_a_vehicle_on_the_sidewalk_and_in_another_is_judged(course: loop.Course) -> None:
     drive = course.begin()
     assert not course.judge(drive)["off_road"] and not course.judge(drive)["hit"]
-    name, box = next(iter(drive.boxes().items()))
+    box = next(iter(drive.boxes().values()))
     x, y = box.world_from_box[:2, 3]
     drive.motion = type(drive.motion)(float(x), float(y), drive.motion.heading_rad, 0.0)
     assert course.judge(drive)["hit"]
     aside = course.begin()
-    left = np.array([-math.sin(aside.motion.heading_rad), math.cos(aside.motion.heading_rad)]) * 30
-    aside.motion = type(aside.motion)(
-        aside.motion.x_m + left[0], aside.motion.y_m + left[1], aside.motion.heading_rad, 0.0
-    )
+    x, y = (aside.pose @ [0, 30, 0, 1])[:2]
+    aside.motion = type(aside.motion)(float(x), float(y), aside.motion.heading_rad, 0.0)
     assert course.judge(aside)["off_road"]
 
 

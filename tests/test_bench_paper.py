@@ -6,30 +6,26 @@ import math
 
 import numpy as np
 import pytest
+from bench_logs import city_scene, fused
 from PIL import Image
+from refusals import refused
 from tiny_networks import saved_mdm
 
 from mudg.base import config as configuration
 from mudg.base import store
-from mudg.base.errors import InputError, UsageError
-from mudg.base.html import best_of
+from mudg.base.errors import UsageError
 from mudg.benchmarks import chain, paper, places
 from mudg.benchmarks import run as bench
 from mudg.benchmarks.chain import FillViews
 from mudg.benchmarks.rows import LONGER, PAPERS, SCENE_LISTS, TABLES, paper_rows, read_papers
 from mudg.benchmarks.settings import BenchConfig
 from mudg.city import logs as city_logs
-from mudg.city.config import CityConfig
 from mudg.core import trajectory
 from mudg.core.feature_distances import frechet_distance, kernel_distance
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing.settings import ScoreConfig
-from mudg.formats import ingest
-from mudg.formats.settings import IngestConfig
 from mudg.gaussians.settings import METHODS, FitConfig
 from mudg.scene.read import read_scene
-from mudg.scene.settings import FuseConfig
-from mudg.steps.ingest import Fuse, Ingest
 
 PSNR, FID = PAPERS.columns["psnr"], PAPERS.columns["fid"]
 TOY_YAML = """
@@ -68,9 +64,9 @@ def test_a_table_is_complete_and_its_rows_change_something(table):
     assert len(set(cells)) == len(cells) and table.scenes in {"", *SCENE_LISTS}
     assert table.published and {(place, key) for row in table.published for place, key, _ in row.values} <= set(cells)
     assert not (table.virtual_shifts_m and any(any(place.shifts_m) or place.paths for place in table.places))
-    rows = paper_rows(BenchConfig(table=table.name), table)
+    names = [row.name for row in paper_rows(BenchConfig(table=table.name), table)]
+    assert len(set(names)) == len(names)
     assert {key for keys in PAPERS.further.values() for key in keys} <= set(PAPERS.columns)
-    assert len({row.name for row in rows}) == len(rows)
     for row in table.rows:
         kind = SynthesizeConfig if METHODS[row.method].made_by == "synthesize" else FitConfig
         usual = kind() if kind is SynthesizeConfig else FitConfig(method=row.method)
@@ -89,9 +85,7 @@ def test_a_table_is_complete_and_its_rows_change_something(table):
 )
 def test_what_is_wrong_with_a_file_of_tables_is_said(old, new, what):
     assert old in TOY_YAML
-    with pytest.raises(InputError) as caught:
-        read_papers(TOY_YAML.replace(old, new), "toy.yaml")
-    assert what in str(caught.value)
+    refused(what, read_papers, TOY_YAML.replace(old, new), "toy.yaml")
 
 
 def test_one_sided_places_follow_the_side_of_their_scene():
@@ -104,8 +98,7 @@ def test_one_sided_places_follow_the_side_of_their_scene():
 def test_published_rows_are_read_in_order():
     first, other = TOY.published
     assert (first.title, first.source) == ("Paper's method", "a paper")
-    assert first.values == [("2", "fid", 50.0), ("3", "fid", 60.5)]
-    assert other.values == [("3", "fid", 70.0)]
+    assert (first.values, other.values) == ([("2", "fid", 50.0), ("3", "fid", 60.5)], [("3", "fid", 70.0)])
     mudg = {row.title: row.values for row in TABLES["mudg1"].published}
     assert ("3", "fid", 49.42) in mudg["MuDG, diffusion output"] and ("4", "fvd", 1269.99) in mudg["Street Gaussians"]
 
@@ -115,10 +108,8 @@ def test_methods_are_all_of_this_version_unless_some_are_named():
     assert [name for name in names("mudg1") if name != LONGER] == list(METHODS) and LONGER in names("mudg1")
     assert names("mudg1", methods=("nearest_fill", "gs3d")) == ["gs3d"]
     assert names("mudg3") == ["street_gaussians", "only_I", "only_I_D", "only_I_S", "mudg_s"]
-    with pytest.raises(UsageError, match="unknown method"):
-        paper_rows(BenchConfig(methods=("nerf",)), TABLES["mudg1"])
-    with pytest.raises(UsageError, match="rows of its own"):
-        paper_rows(BenchConfig(methods=("gs3d",)), TABLES["mudg3"])
+    for method, table, what in (("nerf", "mudg1", "unknown method"), ("gs3d", "mudg3", "rows of its own")):
+        refused(what, paper_rows, BenchConfig(methods=(method,)), TABLES[table], raises=UsageError)
 
 
 def test_how_rows_are_scored(tmp_path):
@@ -138,10 +129,9 @@ def test_how_rows_are_scored(tmp_path):
 # ---- numbers -------------------------------------------------------------------------------------
 
 
-def metrics(values, *, views=8, n=None):
+def metrics(values):
     """Contents of a ``metrics.json``: trajectory -> values."""
-    extra = {} if n is None else {"distribution": {"n": n, "n_reference": 24}, "video": {"n": 2, "n_reference": 3}}
-    row = {"method": "m", "views": views, **extra}
+    row = {"method": "m", "views": 8, "distribution": {"n": 6, "n_reference": 24}}
     results = [{"trajectory": name, "values": of, **row} for name, of in values.items()]
     return {"metrics": [{"name": name} for name in ("psnr", "fid", "fvd", "kid")], "results": results}
 
@@ -150,7 +140,7 @@ NAMES = ("front_shift+2.0", "front_shift-2.0")
 
 
 def test_a_place_is_the_mean_over_its_trajectories_and_the_sum_of_their_views():
-    document = metrics({NAMES[0]: {"psnr": 20.0, "fid": 30.0}, NAMES[1]: {"psnr": 24.0, "fid": 40.0}}, n=6)
+    document = metrics({NAMES[0]: {"psnr": 20.0, "fid": 30.0}, NAMES[1]: {"psnr": 24.0, "fid": 40.0}})
     found = paper.at_place([document], NAMES, (PSNR, FID))
     assert found == {"psnr": {"value": 22.0, "n": 16}, "fid": {"value": 35.0, "n": 12, "n_reference": 48}}
     floors = [{"trajectory": NAMES[0], "fid": 5.0, "n": 4, "n_reference": 4}]
@@ -161,13 +151,11 @@ def test_a_place_is_the_mean_over_its_trajectories_and_the_sum_of_their_views():
 def test_every_cell_without_a_number_has_its_reason():
     fids = dict(zip(NAMES, ("not computed", 3.0)))
     document = metrics({name: {"psnr": "no truth", "fid": fid} for name, fid in fids.items()})
-    columns = (PSNR, FID, PAPERS.columns["nta_iou"], PAPERS.columns["imaging_quality"])
-    found = paper.at_place([document], NAMES, columns)
+    found = paper.at_place([document], NAMES, (PSNR, FID, PAPERS.columns["nta_iou"]))
     assert {key: of["value"] for key, of in found.items()} == {
         "psnr": "no truth off the path on a recorded log",
         "fid": "no weights: --score.fid-weights",
         "nta_iou": "no score of this version",
-        "imaging_quality": "no score of this version",
     }
     assert paper.at_place([metrics({})], NAMES, (PSNR,))["psnr"]["value"] == "not produced"
 
@@ -213,21 +201,11 @@ def test_different_numbers_of_views_are_refused_and_such_a_floor_is_not_in_the_t
     cell = document["cells"]["truth"]["2"]["fid"]
     assert cell["reason"] == "other n" and cell["floor"]["mean"] == 6.0
     assert "mean" in document["cells"]["truth"]["3"]["fid"]
-    logs[1]["values"]["mudg_s"]["3"]["fid"]["n"] = 11
-    with pytest.raises(InputError, match=r"different numbers of views.*"):
-        paper.document(TOY, logs, ROWS, SETTINGS)
-
-
-def test_a_mean_is_over_all_logs_or_there_is_none():
-    logs = toy_logs(FIDS)
-    logs[1]["values"]["gs3d"]["2"]["fid"] = {"value": "too few views"}
+    logs[1]["values"]["gs3d"]["2"]["fid"] = {"value": "too few views"}  # a mean is over all logs, or there is none
     cell = paper.document(TOY, logs, ROWS, SETTINGS)["cells"]["gs3d"]["2"]["fid"]
     assert cell == {"reason": "too few views (1 of 2 logs)"}
-
-
-def test_the_best_of_a_column():
-    for better, best in (("higher", ["b"]), ("lower", ["a"]), ("one", ["c"])):
-        assert best_of(better, {"a": 0.4, "b": 1.3, "c": 0.9}) == best and best_of(better, {"a": 1.0}) == []
+    logs[1]["values"]["mudg_s"]["3"]["fid"]["n"] = 11
+    refused("different numbers of views", paper.document, TOY, logs, ROWS, SETTINGS)
 
 
 # ---- sets of all logs ----------------------------------------------------------------------------
@@ -254,17 +232,14 @@ def test_views_of_all_logs_are_one_set(tmp_path):
         half = {"distributions": {"made": [], "reference": files["distributions"]["reference"]}}
         logs.append({"features": {"a": {"2": files}, "truth": {"2": half}}})
         parts.append(kept)
-    found = paper.pooled(logs, tmp_path)
-    made = np.concatenate([kept[name] for kept in parts for name in NAMES])
+    found, made_of = paper.pooled(logs, tmp_path), lambda kept: [kept[name] for name in NAMES]
+    made = np.concatenate([rows for kept in parts for rows in made_of(kept)])
     reference = np.concatenate([kept["reference"] for kept in parts])
-    cells = found["a"]["2"]
-    assert cells["fid"]["mean"] == pytest.approx(frechet_distance(made, reference), abs=1e-5)
-    assert cells["kid"]["mean"] == pytest.approx(kernel_distance(made, reference), abs=1e-5)
-    assert cells["kid"]["standard_error"] is None or cells["kid"]["standard_error"] > 0
-    assert cells["fvd"]["mean"] == pytest.approx(frechet_distance(made, reference), abs=1e-5)
-    of_log = lambda kept: frechet_distance(np.concatenate([kept[n] for n in NAMES]), kept["reference"])
-    single = np.mean(list(map(of_log, parts)))
-    assert abs(cells["fid"]["mean"] - single) > 0.01  # not the mean over logs
+    means = {name: cell["mean"] for name, cell in found["a"]["2"].items()}
+    fid, kid = frechet_distance(made, reference), kernel_distance(made, reference)
+    assert means == pytest.approx({"fid": fid, "kid": kid, "fvd": fid}, abs=1e-5)
+    singles = [frechet_distance(np.concatenate(made_of(kept)), kept["reference"]) for kept in parts]
+    assert abs(means["fid"] - np.mean(singles)) > 0.01  # not the mean over logs
     one, other = (np.concatenate([kept["reference"][start::2] for kept in parts]) for start in (0, 1))
     assert found["truth"]["2"]["fid"]["mean"] == pytest.approx(frechet_distance(one, other), abs=1e-5)
     part, _ = log_of(tmp_path, 2, ("distributions",))  # a log without features of videos takes fvd from the table
@@ -316,27 +291,28 @@ def test_the_forms_of_a_table():
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     """A scene of 8 frames and two cameras, whose folder bears the name of a segment."""
-    size = {"n_frames": 8, "width": 64, "height": 48, "cameras": ("front", "front_left")}
-    city = CityConfig(**size, seed=2100000, lidar_azimuth_step_deg=1.0)
     out = tmp_path_factory.mktemp("logs") / "segment-12820461091157089924_with_camera_labels"
-    return Ingest(log=ingest.CITY, out=out, settings=IngestConfig(test_every=0, contact_sheet=False, city=city)).run()
+    return city_scene(out, n_frames=8, cameras=("front", "front_left"))
 
 
 def test_lists_of_cities_and_folders(recorded):
     config = BenchConfig(logs=2, resolution="96x64", frames="0:6")
     logs = places.logs_of(config, ("city:reported",), TABLES["recondreamer"])
-    assert [log.seed for log in logs] == list(city_logs.REPORTED[:2])
-    assert (logs[0].rules.frames, logs[0].rules.width, logs[0].rules.cameras) == (6, 96, ("front",))
+    assert [log.source.seed for log in logs] == list(city_logs.REPORTED[:2])
+    assert (logs[0].source.n_frames, logs[0].source.width, logs[0].source.cameras) == (6, 96, ("front",))
     (log,) = places.logs_of(BenchConfig(), (recorded,), TABLES["drivedreamer4d"])
     assert (log.frames, log.note, log.side) == ((0, 39), "", 1)
     assert len(places.missing_scenes(TABLES["drivedreamer4d"], [log])) == 7
     (log,) = places.logs_of(BenchConfig(), (recorded,), TABLES["recondreamer"])
     assert log.note == "not in the table's list B"
-    for sources in ((), ("city:nowhere",), ("city:reported", recorded)):
-        with pytest.raises(UsageError):
-            places.logs_of(BenchConfig(), sources, TABLES["mudg1"])
-    with pytest.raises(UsageError, match="from 0 on"):
-        places.logs_of(BenchConfig(frames="2:6"), ("city:reported",), TABLES["mudg1"])
+    for changes, sources, what in (
+        ({}, (), "no logs"),
+        ({}, ("city:nowhere",), "no such list"),
+        ({}, ("city:reported", recorded), "stands alone"),
+        ({"frames": "2:6"}, ("city:reported",), "from 0 on"),
+        ({"logs": 2}, (recorded,), "counted by naming them"),
+    ):
+        refused(what, places.logs_of, BenchConfig(**changes), sources, TABLES["mudg1"], raises=UsageError)
 
 
 def test_a_recorded_log_is_cut_to_the_table(recorded, tmp_path):
@@ -347,18 +323,17 @@ def test_a_recorded_log_is_cut_to_the_table(recorded, tmp_path):
     assert [frame.id for frame in scene.frames] == [frame.id for frame in frames]
     assert [frame.id for frame in scene.frames_in("test")] == [frames[2].id, frames[4].id]
     assert len(scene.sweeps) == 5 and scene.source.recipe is None
-    with pytest.raises(InputError, match="fewer frames"):
-        places.make_scene(dataclasses.replace(log, frames=(0, 39)), table, tmp_path / "more", "cpu", False)
+    more = dataclasses.replace(log, frames=(0, 39))
+    refused("fewer frames", places.make_scene, more, table, tmp_path / "more", "cpu", False)
 
 
 def test_pictures_without_truth(recorded, tmp_path):
     """Rows of colour and depth alone, all columns; nothing for a column without the trajectory."""
     scene = read_scene(recorded)
     paths = [trajectory.shifted(scene, "front", 2.0), trajectory.named(scene, "front", "lane+0.1")]
-    fused = Fuse(scene=recorded, out=tmp_path / "fused", settings=FuseConfig()).run()
-    fill = lambda n: FillViews(scene=recorded, fused=fused, paths=tuple(paths[:n]), out=tmp_path / f"fill{n}")
-    views = {"one": (fill(1).run(),), "both": (fill(2).run(),)}
-    out = chain.Film(views=views, paths=tuple(paths), out=tmp_path / "film").run()
+    given = {"scene": recorded, "fused": fused(recorded, tmp_path / "fused")}
+    fill = lambda n: FillViews(**given, paths=tuple(paths[:n]), out=tmp_path / f"fill{n}").run()
+    out = chain.Film(views={"one": (fill(1),), "both": (fill(2),)}, paths=tuple(paths), out=tmp_path / "film").run()
     assert sorted(path.name for path in out.glob("*.jpg")) == ["front_lane+0.1.jpg", "front_shift+2.0.jpg"]
     with Image.open(out / "front_lane+0.1.jpg") as picture:
         seen = np.asarray(picture.convert("L"))
@@ -383,11 +358,11 @@ def test_the_command_writes_every_form_of_the_table(tmp_path, monkeypatch):
     assert [row["name"] for row in document["rows"]] == ["truth", "nearest_fill", "gs3d"]
     assert document["settings"]["score"]["fid_resize"] == "pytorch-fid"
     absent = dataclasses.replace(config, score=ScoreConfig(fid_weights=str(tmp_path / "absent.pth")))
-    with pytest.raises(InputError, match="no such file"):
-        bench.run("paper", absent, tmp_path / "other", sources=("city:development",))
+    given = {"sources": ("city:development",)}
+    refused("no such file", bench.run, "paper", absent, tmp_path / "other", **given)
     assert not (tmp_path / "other").exists()
-    with pytest.raises(UsageError, match="do not belong"):
-        bench.run("paper", dataclasses.replace(config, table="spvc"), out, sources=("city:development",))
+    other = dataclasses.replace(config, table="spvc")
+    refused("do not belong", bench.run, "paper", other, out, **given, raises=UsageError)
 
 
 @pytest.fixture(scope="module")
@@ -403,25 +378,21 @@ def filled(tmp_path_factory):
 def test_a_table_on_cities_end_to_end(filled):
     out, config = filled
     document = store.read_json(out / "bench.json")
-    assert [entry["log"] for entry in document["logs"]] == [str(seed) for seed in city_logs.DEVELOPMENT[:2]]
+    seed, _ = (entry["log"] for entry in document["logs"])
     for row in ("nearest_fill", "street_gaussians", "mudg_r", "mudg_s"):
         cell = document["cells"][row]["3"]["psnr"]
         assert cell["n"] == [10, 10] and cell["standard_error"] > 0
         assert document["cells"][row]["3"]["fid"] == {"reason": "no weights: --score.fid-weights"}
     assert document["cells"]["truth"]["3"]["flicker"]["mean"] == pytest.approx(1.0)
-    seed = document["logs"][0]["log"]
     assert not (out / seed / "film").exists()
-    names = ("fit/mudg_s", "virtual", "score/mudg_s")
-    stamps = lambda: [(out / seed / name / "run.json").stat().st_mtime_ns for name in names]
+    stamps = lambda: [
+        (out / seed / n / "run.json").stat().st_mtime_ns for n in ("fit/mudg_s", "virtual", "score/mudg_s")
+    ]
     before = stamps()
     more = dataclasses.replace(config, methods=("gs3d", LONGER, "mudg_s"))
     bench.run("paper", more, out, sources=("city:development",))
-    assert stamps() == before
     rows = [row["name"] for row in store.read_json(out / "bench.json")["rows"]]
-    assert rows == ["truth", "nearest_fill", "gs3d", LONGER, "mudg_s"]
-    control = store.read_json(out / seed / "fit" / LONGER / "run.json")
-    assert control["inputs"]["start"] == store.digest(out / seed / "fit" / "street_gaussians")
-    assert control["summary"]["steps"] == 10
+    assert stamps() == before and rows == ["truth", "nearest_fill", "gs3d", LONGER, "mudg_s"]
 
 
 @pytest.mark.slow

@@ -6,10 +6,11 @@ import math
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from tiny_networks import saved_mdm
 
 from mudg.base import seeds, store
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import UsageError
 from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Camera, View
 from mudg.benchmarks import run as bench
@@ -17,7 +18,7 @@ from mudg.benchmarks import shift
 from mudg.benchmarks.rows import LONGER, method_rows
 from mudg.benchmarks.settings import BenchConfig
 from mudg.city import logs as city_logs
-from mudg.city.logs import LogRules
+from mudg.city.config import CityConfig
 from mudg.city.world import CityWorld
 from mudg.core import metrics
 from mudg.diffusion import city_clips
@@ -25,7 +26,7 @@ from mudg.gaussians.settings import METHODS, PUBLISHED
 from mudg.scene.observations import list_observation_sets, read_observations
 from mudg.scoring import truth as score_truth
 
-TINY = LogRules(frames=4, width=96, height=64, cameras=("front",))
+TINY = CityConfig(n_frames=4, width=96, height=64, cameras=("front",))
 
 
 # ---- lists ---------------------------------------------------------------------------------------
@@ -33,8 +34,7 @@ TINY = LogRules(frames=4, width=96, height=64, cameras=("front",))
 
 def test_lists_are_apart_from_each_other_and_from_all_training_cities():
     development, reported = city_logs.LISTS["development"], city_logs.LISTS["reported"]
-    assert (len(development), len(reported)) == (4, 8)
-    assert not set(development) & set(reported)
+    assert (len(development), len(reported)) == (4, 8) and not set(development) & set(reported)
     for seeds_ in (development, reported):
         turns = [city_logs.turn_deg(city_logs.log_config(seed)) for seed in seeds_]
         assert sum(turn >= city_logs.CURVED_DEG for turn in turns) == len(turns) / 2
@@ -52,8 +52,9 @@ def test_a_list_is_what_the_rule_gives(first, name):
     """Half of the list is curved; seeds are walked upwards."""
     kept, half, seed = {True: [], False: []}, len(city_logs.LISTS[name]) // 2, first
     while min(map(len, kept.values())) < half:
-        curved = city_logs.turn_deg(city_logs.log_config(seed)) >= city_logs.CURVED_DEG
-        if len(kept[curved]) < half and city_logs.facts(seed)["movers"] >= city_logs.MOVING:
+        config = city_logs.log_config(seed)
+        curved = city_logs.turn_deg(config) >= city_logs.CURVED_DEG
+        if len(kept[curved]) < half and city_logs.facts(CityWorld(config))["movers"] >= city_logs.MOVING:
             kept[curved].append(seed)
         seed += 1
     assert tuple(sorted(kept[True] + kept[False])) == city_logs.LISTS[name]
@@ -79,8 +80,7 @@ def test_rows_are_those_that_are_asked_for():
     assert {name: (fit.method, fit.iterations) for name, fit in rows.items()} == {name: (name, 30) for name in rows}
     assert not set(PUBLISHED) & set(BenchConfig().methods)
     assert set(PUBLISHED) < set(METHODS)
-    with pytest.raises(UsageError, match="unknown method"):
-        method_rows(BenchConfig(methods=("nerf",)))
+    refused("unknown method", method_rows, BenchConfig(methods=("nerf",)), raises=UsageError)
 
 
 # ---- tables --------------------------------------------------------------------------------------
@@ -178,8 +178,8 @@ def test_the_command_compares_methods_and_reuses_what_is_there(made):
     again = shift.run(dataclasses.replace(config, **changes), out, rules=TINY, distances_m=(3.0,))
     assert (out / log / "fit" / "street_gaussians" / "run.json").stat().st_mtime_ns == before
     assert [m["name"] for m in store.read_json(again / "bench.json")["methods"]] == ["street_gaussians"]
-    with pytest.raises(UsageError, match="another configuration"):
-        bench.run("shift", dataclasses.replace(config, iterations=31), out)
+    other = dataclasses.replace(config, iterations=31)
+    refused("another configuration", bench.run, "shift", other, out, raises=UsageError)
 
 
 @pytest.mark.slow
@@ -213,7 +213,6 @@ def test_stored_truth_is_the_drawn_truth(made):
     assert np.array_equal(found.seen.semantics.numpy(), drawn.semantics)
     assert float((found.seen.rgb.permute(1, 2, 0).numpy() - drawn.rgb).__abs__().max()) <= 0.5 / 255 + 1e-6
     assert np.array_equal(found.moving[0].numpy(), np.isin(drawn.instance, city_logs.moving_instances(world)))
-    with pytest.raises(InputError, match="another view"):
-        stored.at_view(dataclasses.replace(view, time_s=view.time_s + 0.05), None, "front_shift+3.0")
-    with pytest.raises(InputError, match="lacks a trajectory"):
-        stored.at_view(view, None, "front_shift+9.0")
+    later = dataclasses.replace(view, time_s=view.time_s + 0.05)
+    refused("another view", stored.at_view, later, None, "front_shift+3.0")
+    refused("lacks a trajectory", stored.at_view, view, None, "front_shift+9.0")

@@ -8,8 +8,8 @@ import pytest
 import torch
 from fit_settings import fit_config
 
-from mudg.base import config as configuration
 from mudg.base.types import SAME_COLORS, CameraColors, ColorMap, Photo
+from mudg.city.config import CityConfig
 from mudg.core.calibration import match_cameras
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.diffusion.condition import ConditionRules, DriveInputs, build_conditions
@@ -87,7 +87,9 @@ def test_maps_there_and_back_are_the_identity():
 # ---- through the verbs, on a generated city of which one camera takes darker images --------------
 
 
-SIZE = {"n_frames": 8, "width": 160, "height": 104, "cameras": ("front", "front_left")}
+CITY = CityConfig(
+    n_frames=5, width=120, height=78, cameras=("front", "front_left"), supersample=1, lidar_azimuth_step_deg=0.4
+)
 
 
 @pytest.fixture(scope="module")
@@ -95,8 +97,8 @@ def city(tmp_path_factory) -> tuple[Path, Path]:
     """A scene whose cameras are equal, and the same with a darker second camera; the first frame of each is held
     out."""
     root = tmp_path_factory.mktemp("city")
-    config = configuration.load(IngestConfig, overrides={"city": SIZE, "test_every": 4})
-    Ingest(log="city", out=root / "equal", settings=config).run()
+    settings = IngestConfig(city=CITY, contact_sheet=False)
+    Ingest(log="city", out=root / "equal", settings=settings).run()
     scene = read_scene(root / "equal")
     with SceneWriter(root / "dark", scene.id, scene.source) as writer:
         writer.copy_all_but_frames(scene)

@@ -87,8 +87,7 @@ def test_sums_are_those_of_every_gaussians_weight_in_double_precision():
         images = difference_images(model, rasterize(gaussians, view.view, RASTER), view, UNCORRECTED)
     expected = torch.einsum("nhw,khw->kn", weights, images.double())
     found = weight_sums(model, view, RASTER)
-    assert (expected[0] > 1).sum() > ROWS // 2
-    assert expected[2:].amax(1).min() > 0.1
+    assert (expected[0] > 1).sum() > ROWS // 2 and expected[2:].amax(1).min() > 0.1
     torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-5)
 
 
@@ -98,8 +97,7 @@ def test_images_of_differences():
         render = rasterize(compose(model, 0.0, semantics=False), view.view, RASTER)
     used, color, lidar, depth = difference_images(model, render, view, UNCORRECTED)
     assert used[-4:].sum() == 0 and used[:-4].min() == 1
-    assert color[-4:].abs().sum() == 0 and color.max() > 0.05
-    assert int(lidar.sum()) == 100
+    assert color[-4:].abs().sum() == 0 and color.max() > 0.05 and int(lidar.sum()) == 100
     pixel = int(view.lidar.pixel[50])
     off = abs(float(render.depth.flatten()[pixel]) - 9.0) / 9.0
     assert depth.flatten()[pixel] == pytest.approx(min(1.0, off), rel=1e-5)

@@ -38,8 +38,7 @@ def view(clear: CityWorld) -> View:
 def test_surfaces_are_unit_normals_and_albedos_without_weather(clear: CityWorld, view: View) -> None:
     assert weather_numbers(CLEAR) is None
     surfaces = city_camera.surfaces(clear, view)
-    assert not surfaces.snow.any()
-    assert not surfaces.water.any()
+    assert not surfaces.snow.any() and not surfaces.water.any()
     surfaces, truth = city_camera.surfaces(clear, view), clear.render(view)
     solid = ~truth.sky
     np.testing.assert_allclose(np.linalg.norm(surfaces.normal[solid], axis=-1), 1, atol=2e-3)

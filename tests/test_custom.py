@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -25,21 +24,11 @@ from mudg.formats.importers.custom import read_log
 from mudg.scene.read import read_points
 
 truth = bad_logs.truth
+pristine, log = bad_logs.fixtures(write_custom.write_log, "log")
 
 pytestmark = roundtrip.needs_native
 ingest = bad_logs.importer("custom")
 LIDAR = "lidar"
-
-
-@pytest.fixture(scope="module")
-def written(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_custom.write_log(truth, tmp_path_factory.mktemp("written") / "log")
-
-
-@pytest.fixture
-def log(written: Path, tmp_path: Path) -> Path:
-    """A copy that may be damaged."""
-    return shutil.copytree(written, tmp_path / "log")
 
 
 def edit(log: Path, change: Any) -> None:
@@ -78,16 +67,16 @@ def test_the_template_converter_makes_a_log_that_is_the_recording(
     roundtrip.assert_same_log(scene, truth, time_s=2e-9, dt_s=1e-7)
 
 
-def test_frames_and_cameras_are_chosen_by_the_first_cameras_clock(written: Path, truth: Scene, tmp_path: Path) -> None:
+def test_frames_and_cameras_are_chosen_by_the_first_cameras_clock(pristine: Path, truth: Scene, tmp_path: Path) -> None:
     options = ImportOptions(frames=(1, 4), cameras=("front_left",), resolution=(48, 32))
-    scene = IMPORTERS["custom"](written, tmp_path / "scene", options)
+    scene = IMPORTERS["custom"](pristine, tmp_path / "scene", options)
     assert [f.id for f in scene.frames] == [f"front_left/{n:06d}" for n in range(3)]
     assert len(scene.sweeps) == 3
     camera, original = scene.cameras["front_left"], truth.cameras["front_left"]
     assert (camera.width, camera.height, camera.fx, camera.cy) == (48, 32, original.fx / 2, original.cy / 2)
     for wrong in ({"cameras": ("rear",)}, {"frames": (7, 9)}, {"sequence": "1"}):
         with pytest.raises(UsageError):
-            ingest(written, tmp_path / "other", **wrong)
+            ingest(pristine, tmp_path / "other", **wrong)
 
 
 def test_twisted_sweeps_are_straightened_with_the_times_of_their_points(truth: Scene, tmp_path: Path) -> None:
@@ -96,7 +85,7 @@ def test_twisted_sweeps_are_straightened_with_the_times_of_their_points(truth: S
     def lidar_at(time_s: float) -> np.ndarray:
         return common.pose_near(truth.ego, time_s) @ mounted
 
-    mounted = write_custom.rig(truth)[LIDAR]
+    mounted = roundtrip.mounts(truth)[LIDAR]
 
     def twist(log: dict[str, Any]) -> None:
         for record, sweep in zip(log["sweeps"], truth.sweeps, strict=True):

@@ -18,6 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from PIL import Image
+from refusals import refused
 from roundtrip import needs_native
 from safetensors.numpy import load_file
 from scipy.spatial import KDTree
@@ -325,8 +326,7 @@ def test_a_full_disk_is_said_before_anything_is_drawn(
 ) -> None:
     usage = type("Usage", (), {"free": 1000})
     monkeypatch.setattr(write.shutil, "disk_usage", lambda folder: usage)
-    with pytest.raises(ResourceError, match="too small"):
-        write_set(run, "kitti", tmp_path / "out", cameras=("front",))
+    refused("too small", write_set, run, "kitti", tmp_path / "out", cameras=("front",), raises=ResourceError)
 
 
 def test_objects_seen_from_unknown_sides_and_tiny_ones_are_left_out(run: tuple[Path, Path]) -> None:
@@ -355,8 +355,7 @@ def test_words_for_what_cannot_be(run: tuple[Path, Path], tmp_path: Path) -> Non
         ({"settings": DatasetConfig(lidar="hdl65")}, "no such LiDAR"),
         ({"settings": DatasetConfig(cameras=("rear",))}, "camera"),
     ):
-        with pytest.raises(UsageError, match=said):
-            Dataset(**{**usual, **changes}, out=tmp_path / "a").run()
+        refused(said, Dataset(**{**usual, **changes}, out=tmp_path / "a").run, raises=UsageError)
     assert not (tmp_path / "a").exists() or not any((tmp_path / "a").rglob("*.png"))
 
 
@@ -382,8 +381,7 @@ def test_a_loader_with_workers_gives_what_indexing_gives(run: tuple[Path, Path])
     assert index == len(views)
     with pytest.raises(IndexError):
         views[len(views)]
-    with pytest.raises(UsageError, match="camras"):
-        as_dataset(fit, scene, camras="front")
+    refused("camras", as_dataset, fit, scene, camras="front", raises=UsageError)
 
 
 # -- exact truth -----------------------------------------------------------------------------------
@@ -511,11 +509,9 @@ def test_a_scene_in_memory_is_filmed_saved_and_exported_with_its_edits(run: tupl
     saved = mudg.FittedScene.read(empty.save(tmp_path / "saved"))
     again, before = (one.render(now.camera, now.world_from_cam, now.time_s) for one in (saved, empty))
     assert np.array_equal(again.rgb, before.rgb) and car not in saved.object_ids
-    with pytest.raises(UsageError, match="there already"):
-        empty.save(tmp_path / "saved")
+    refused("there already", empty.save, tmp_path / "saved", raises=UsageError)
     files = [one.export("ply", tmp_path / f"{len(one)}.ply", time_s=now.time_s) for one in (fitted, empty)]
     assert files[0].stat().st_size > files[1].stat().st_size
-    with pytest.raises(UsageError, match="no export format"):
-        fitted.export("obj", tmp_path / "x.obj")
+    refused("no export format", fitted.export, "obj", tmp_path / "x.obj", raises=UsageError)
     above = mudg.camera_path(scene, name="up+1.0").views[0].center_world[2]
     assert above == pytest.approx(scene.frames_of("front")[0].view.center_world[2] + 1.0)

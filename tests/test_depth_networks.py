@@ -3,7 +3,7 @@ comes from."""
 
 from __future__ import annotations
 
-import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +11,10 @@ import pytest
 import tiny_networks
 import torch
 from PIL import Image
+from refusals import refused
 from tiny_networks import package
 
-from mudg.base.errors import InputError, ResourceError
+from mudg.base.errors import ResourceError
 from mudg.core.depth import SKY_M
 from mudg.labels.depth_networks import align_to_lidar, kind_of, lidar_cue, load_depth_network, residual_confidence
 from mudg.labels.inputs import DepthInput, Prediction
@@ -46,12 +47,9 @@ def test_an_affine_map_of_the_truth_comes_back_as_the_truth(
     space: str, scale: float, shift: float, wrong: float
 ) -> None:
     given, truth = street()
-    goal = truth if space == "depth" else 1 / truth
-    rng = np.random.default_rng(1)
-    measured = given.measured.copy()
-    bad = np.isfinite(measured) & (rng.uniform(size=truth.shape) < wrong)
-    measured[bad] = rng.uniform(1, 90, int(bad.sum()))
-    given = DepthInput(given.rgb, measured, given.filled, given.sky)
+    goal, rng = truth if space == "depth" else 1 / truth, np.random.default_rng(1)
+    bad = given.known & (rng.uniform(size=truth.shape) < wrong)
+    given.measured[bad] = rng.uniform(1, 90, int(bad.sum()))
     prediction = Prediction((scale * goal + shift).astype(np.float32), space)
     dense, fit = align_to_lidar(prediction, given)
     assert fit.used and dense is not None and np.abs(dense.depth / truth - 1).max() < 1e-3
@@ -62,21 +60,16 @@ def test_wrong_returns_from_behind_do_not_pull_and_depth_that_does_not_fit_is_no
     """Two fifths of the returns lie 40 % behind the surface, as what shows through gaps does: noise that has one
     sign."""
     given, truth = street()
-    measured = given.measured.copy()
-    bad = np.isfinite(measured) & (np.random.default_rng(2).uniform(size=truth.shape) < 0.4)
-    measured[bad] *= 1.4
-    asked = DepthInput(given.rgb, measured, given.filled, given.sky)
-    dense, fit = align_to_lidar(Prediction(truth / 80 - 0.1, "depth"), asked)
+    bad = given.known & (np.random.default_rng(2).uniform(size=truth.shape) < 0.4)
+    asked = replace(given, measured=np.where(bad, 1.4 * given.measured, given.measured))
+    dense, _ = align_to_lidar(Prediction(truth / 80 - 0.1, "depth"), asked)
     assert dense is not None and np.abs(dense.depth / truth - 1).max() < 1e-3
-    rng = np.random.default_rng(3)
-    noise = rng.uniform(1, 2, truth.shape).astype(np.float32)
-    for values in (noise, -truth, np.full_like(truth, 3.0)):
-        assert align_to_lidar(Prediction(values, "depth"), given)[0] is None
-    few = np.where(np.cumsum(np.isfinite(given.measured)).reshape(truth.shape) <= 20, given.measured, np.nan)
-    asked = DepthInput(given.rgb, few, given.filled, given.sky)
-    assert align_to_lidar(Prediction(truth, "depth"), asked)[0] is None
-    with pytest.raises(InputError, match="size"):
-        align_to_lidar(Prediction(truth[1:], "depth"), given)
+    noise = np.random.default_rng(3).uniform(1, 2, truth.shape).astype(np.float32)
+    few = np.where(np.cumsum(given.known).reshape(truth.shape) <= 20, given.measured, np.nan)
+    unfit = ((noise, given), (-truth, given), (np.full_like(truth, 3.0), given), (truth, replace(given, measured=few)))
+    for values, asked in unfit:
+        assert align_to_lidar(Prediction(values, "depth"), asked)[0] is None
+    refused("size", align_to_lidar, Prediction(truth[1:], "depth"), given)
 
 
 def test_confidence_is_low_where_the_depth_is_off() -> None:
@@ -94,10 +87,9 @@ def test_the_map_for_the_network_has_no_holes_and_no_sky() -> None:
     cue = lidar_cue(given, 36)
     assert tuple(cue.shape) == (1, 1, 24, 36) and bool(torch.isfinite(cue).all())
     assert float(cue.max()) <= float(truth[~given.sky].max())
-    flat = DepthInput(given.rgb, given.measured, np.full_like(truth, 5.0), given.sky)
-    assert float(lidar_cue(flat).max() - lidar_cue(flat).min()) > 0
-    with pytest.raises(InputError, match="LiDAR"):
-        lidar_cue(DepthInput(given.rgb, given.measured, np.full_like(truth, np.nan), given.sky))
+    flat = lidar_cue(replace(given, filled=np.full_like(truth, 5.0)))
+    assert float(flat.max() - flat.min()) > 0
+    refused("LiDAR", lidar_cue, replace(given, filled=np.full_like(truth, np.nan)))
 
 
 # --- folders --------------------------------------------------------------------------------------
@@ -105,22 +97,15 @@ def test_the_map_for_the_network_has_no_holes_and_no_sky() -> None:
 
 def test_what_is_missing_or_wrong_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for nothing in ("", tmp_path):
-        with pytest.raises(ResourceError, match="weights are missing"):
-            kind_of(nothing)
-    (tmp_path / "config.json").write_text(json.dumps({"model_type": "bert"}))
-    with pytest.raises(InputError, match="another kind"):
-        load_depth_network(tmp_path)
-    (tmp_path / "config.json").write_text("[1]")
-    with pytest.raises(InputError, match="JSON object"):
-        kind_of(tmp_path)
-    (tmp_path / "config.json").write_text(json.dumps({"model_type": "depth_anything"}))
+        refused("weights are missing", kind_of, nothing, raises=ResourceError)
+    (tmp_path / "model.json").write_text('{"kind": "published"}')
+    refused("another kind", kind_of, tmp_path)
+    for text, words in (('{"model_type": "bert"}', "another kind"), ("[1]", "JSON object")):
+        (tmp_path / "config.json").write_text(text)
+        refused(words, kind_of, tmp_path)
+    (tmp_path / "config.json").write_text('{"model_type": "depth_anything"}')
     tiny_networks.hide(monkeypatch, "transformers")
-    with pytest.raises(ResourceError, match=r"mudg\[models\]"):
-        load_depth_network(tmp_path)
-    (tmp_path / "d").mkdir()
-    (tmp_path / "d" / "model.json").write_text(json.dumps({"kind": "published"}))
-    with pytest.raises(InputError, match="another kind"):
-        kind_of(tmp_path / "d")
+    refused(r"mudg\[models\]", load_depth_network, tmp_path, raises=ResourceError)
 
 
 @real_packages
@@ -129,13 +114,11 @@ def test_a_folder_without_all_its_weights_is_refused(tmp_path: Path) -> None:
 
     tiny_networks.depth_anything(tmp_path)
     (tmp_path / "model.safetensors").rename(tmp_path / "aside")
-    with pytest.raises(InputError, match="cannot be read"):
-        load_depth_network(tmp_path)
+    refused("cannot be read", load_depth_network, tmp_path)
     weights = load_file(tmp_path / "aside")
     weights.pop("head.conv3.weight")
     save_file(weights, tmp_path / "model.safetensors", metadata={"format": "pt"})
-    with pytest.raises(InputError, match=r"head\.conv3\.weight"):
-        load_depth_network(tmp_path)
+    refused(r"head\.conv3\.weight", load_depth_network, tmp_path)
 
 
 @real_packages

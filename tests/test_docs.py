@@ -59,7 +59,7 @@ FOREIGN_NAMES = (
     "PromptDepthAnything DepthLab DistributedDataParallel DynamiCrafter DeepSpeed SegFormer MergedPointCloud RayCluster"
     " RayJob"
 ).split()
-LONG = "bench_shift paper_tables results simulate/closed_loop start/demo training"
+LONG = "bench_shift gallery paper_tables results simulate/closed_loop start/demo training"
 SLOW = tuple(f"docs/{page}.md" for page in LONG.split())
 """Pages whose examples take longer: benchmarks, the whole chain, drives. So do formats, training and tutorials."""
 

@@ -8,20 +8,17 @@ from pathlib import Path
 
 import pytest
 import torch
+from bench_logs import city_scene, fused
 
 from mudg import native
 from mudg.base.errors import UsageError
-from mudg.city.config import CityConfig
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.formats.settings import IngestConfig
 from mudg.gaussians import fit
 from mudg.gaussians.model import compose
 from mudg.gaussians.rendering import NEAR_M, raster_of, rasterize
 from mudg.gaussians.settings import DrawingConfig, FitConfig, StartConfig
 from mudg.scene.read import read_scene
-from mudg.scene.settings import FuseConfig
 from mudg.steps.fit import Fit
-from mudg.steps.ingest import Fuse, Ingest
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="the city needs the native library")
 USUAL = FitConfig(
@@ -34,10 +31,8 @@ SMOOTH = replace(USUAL, drawing=DrawingConfig(antialias=True))
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A scene of three frames and its clouds."""
     root = tmp_path_factory.mktemp("drawing")
-    city = CityConfig(n_frames=3, width=72, height=48, cameras=("front",), lidar_azimuth_step_deg=1.0)
-    settings = IngestConfig(city=city, contact_sheet=False, test_every=0)
-    scene = Ingest(log="city", out=root / "scene", settings=settings).run()
-    return scene, Fuse(scene=scene, out=root / "fuse", settings=FuseConfig()).run()
+    scene = city_scene(root / "scene", seed=0, n_frames=3, width=72)
+    return scene, fused(scene, root / "fuse")
 
 
 def fitted(config: FitConfig, prepared: tuple[Path, Path], out: Path, start: Path | None = None) -> Path:

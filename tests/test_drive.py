@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 from toy_fitted import toy_fitted, write_toy_run
 
 from mudg.base import geometry
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera
 from mudg.scene.motion import Road
@@ -24,15 +24,10 @@ CAR = Car()
 
 def arc(radius_m: float = 30.0, slope: float = 0.0) -> Road:
     """A left turn about (0, radius), on ground that rises with y."""
-    poses = []
-    for angle in np.linspace(0, 1.5, 60):
-        pose = geometry.yaw_matrix(angle, (radius_m * math.sin(angle), radius_m * (1 - math.cos(angle)), 0.0))
-        tilt = math.atan(slope)
-        lean = np.eye(4)
-        lean[:3, :3] = [[1, 0, 0], [0, math.cos(tilt), -math.sin(tilt)], [0, math.sin(tilt), math.cos(tilt)]]
-        pose = lean @ pose
-        poses.append(pose)
-    return Road(np.stack(poses))
+    tilt, lean, angles = math.atan(slope), np.eye(4), np.linspace(0, 1.5, 60)
+    lean[:3, :3] = [[1, 0, 0], [0, math.cos(tilt), -math.sin(tilt)], [0, math.sin(tilt), math.cos(tilt)]]
+    places = np.stack([radius_m * np.sin(angles), radius_m * (1 - np.cos(angles)), 0 * angles], 1)
+    return Road(np.stack([lean @ geometry.yaw_matrix(angle, place) for angle, place in zip(angles, places)]))
 
 
 def straight(length_m: float = 60.0) -> Road:
@@ -46,9 +41,8 @@ def parked(x: float, y: float = 0.0) -> RoadUser:
 
 def driving(x: float, speed: float, until_s: float = 10.0) -> RoadUser:
     times = np.linspace(0, until_s, 50)
-    return RoadUser(
-        times, np.stack([geometry.yaw_matrix(0.0, (x + speed * t, 0.0, 0.8)) for t in times]), (4.0, 1.8, 1.6)
-    )
+    poses = np.stack([geometry.yaw_matrix(0.0, (x + speed * t, 0.0, 0.8)) for t in times])
+    return RoadUser(times, poses, (4.0, 1.8, 1.6))
 
 
 # -- kinematics ------------------------------------------------------------------------------------
@@ -98,8 +92,7 @@ def test_a_vehicle_beside_the_path_stands_on_the_slope() -> None:
 
 
 def test_a_vehicle_that_never_moved_tells_no_road() -> None:
-    with pytest.raises(InputError, match="stands"):
-        Road(np.tile(np.eye(4), (5, 1, 1)))
+    refused("stands", Road, np.tile(np.eye(4), (5, 1, 1)))
 
 
 # -- bodies ----------------------------------------------------------------------------------------
@@ -132,9 +125,8 @@ def test_solid_gaussians_stop_a_vehicle_and_those_of_the_road_do_not() -> None:
     rng = np.random.default_rng(0)
     wall = np.column_stack([rng.uniform(11.9, 12.1, 900), rng.uniform(-3, 3, 900), rng.uniform(0, 2, 900)])
     ground = np.column_stack([rng.uniform(0, 40, 9000), rng.uniform(-3, 3, 9000), rng.normal(0, 0.05, 9000)])
-    drive = Drive(
-        straight(), {}, BicycleState(0.0, 0.0, 0.0, 8.0), 0.0, solid=np.concatenate([wall, ground]).astype("f4")
-    )
+    solid = np.concatenate([wall, ground]).astype("f4")
+    drive = Drive(straight(), {}, BicycleState(0.0, 0.0, 0.0, 8.0), 0.0, solid=solid)
     hits = []
     for _ in range(15):
         drive.step(Controls(), 0.1)
@@ -162,8 +154,7 @@ def test_a_follower_stops_behind_a_vehicle_that_stops_where_a_recorded_one_drive
 
 def test_controls_that_are_no_numbers_are_refused() -> None:
     drive = Drive(straight(), {}, BicycleState(0.0, 0.0, 0.0, 1.0), 0.0)
-    with pytest.raises(UsageError, match="not finite"):
-        drive.step(Controls(math.nan, 0.0), 0.1)
+    refused("not finite", drive.step, Controls(math.nan, 0.0), 0.1, raises=UsageError)
 
 
 # -- pilots ----------------------------------------------------------------------------------------
@@ -250,14 +241,13 @@ def test_plans_are_driven_along() -> None:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
     scene, fit, _, _ = write_toy_run(tmp_path_factory.mktemp("toy"))
-    return scene, fit
+    return Session(fit, scene=scene)
 
 
-def test_the_vehicle_begins_where_it_was_recorded(run: tuple[Path, Path]) -> None:
-    scene, fit = run
-    cockpit = Cockpit(Session(fit, scene=scene), width_px=80, layers=("rgb", "depth"))
+def test_the_vehicle_begins_where_it_was_recorded(session: Session) -> None:
+    cockpit = Cockpit(session, width_px=80, layers=("rgb", "depth"))
     drive = cockpit.drive()
     ego = cockpit.ego.pose_at(drive.time_s)
     assert ego is not None
@@ -268,47 +258,35 @@ def test_the_vehicle_begins_where_it_was_recorded(run: tuple[Path, Path]) -> Non
     assert drive.pose @ cockpit.mounts[view.camera.name] == pytest.approx(view.world_from_cam, abs=1e-6)
 
 
-def test_refusals_of_a_cockpit(run: tuple[Path, Path]) -> None:
-    scene, fit = run
-    with pytest.raises(InputError, match="needs the log"):
-        Cockpit(Session(toy_fitted()))
-    session = Session(fit, scene=scene)
-    with pytest.raises(UsageError, match="no such camera"):
-        Cockpit(session, "rear")
-    with pytest.raises(UsageError, match="outside the log"):
-        Cockpit(session).drive(time_s=1e4)
+def test_refusals_of_a_cockpit(session: Session) -> None:
+    refused("needs the log", Cockpit, Session(toy_fitted()))
+    refused("no such camera", Cockpit, session, "rear", raises=UsageError)
+    refused("outside the log", Cockpit(session).drive, time_s=1e4, raises=UsageError)
 
 
-def test_the_environment_keeps_gymnasiums_contract(run: tuple[Path, Path]) -> None:
+def test_the_environment_keeps_gymnasiums_contract(session: Session) -> None:
     pytest.importorskip("gymnasium", reason="gymnasium is not installed (extra sim)")
     from gymnasium.utils.env_checker import check_env
 
     from mudg.sim.env import LIMITS, Env
 
-    scene, fit = run
-    env = Env(fit, scene=scene, width_px=48, layers=tuple(LIMITS), step_s=0.2)
+    env = Env(session, width_px=48, layers=tuple(LIMITS), step_s=0.2)
     with pytest.warns(UserWarning, match="Box|spec"):  # without a registered name it cannot try other ways to render
         check_env(env)
-    with pytest.raises(UsageError, match="two finite numbers"):
-        env.step([math.nan, 0.0])
-    with pytest.raises(UsageError, match="no such option"):
-        env.reset(options={"speed": 3})
-    with pytest.raises(UsageError, match="no such layer"):
-        Env(fit, scene=scene, layers=("motion",))
-    with pytest.raises(UsageError, match="positive time"):
-        Env(fit, scene=scene, step_s=0.0)
-    with pytest.raises(UsageError, match="no drive has begun"):
-        Env(fit, scene=scene).step([0.0, 0.0])
+    refused("two finite numbers", env.step, [math.nan, 0.0], raises=UsageError)
+    refused("no such option", env.reset, options={"speed": 3}, raises=UsageError)
+    refused("no such layer", Env, session, layers=("motion",), raises=UsageError)
+    refused("positive time", Env, session, step_s=0.0, raises=UsageError)
+    refused("no drive has begun", Env(session).step, [0.0, 0.0], raises=UsageError)
 
 
-def test_equal_drives_are_equal_and_rewards_add_up_to_the_way(run: tuple[Path, Path]) -> None:
+def test_equal_drives_are_equal_and_rewards_add_up_to_the_way(session: Session) -> None:
     pytest.importorskip("gymnasium", reason="gymnasium is not installed (extra sim)")
     from mudg.sim.env import Env
 
-    scene, fit = run
     drives = []
     for _ in range(2):
-        env = Env(fit, scene=scene, width_px=48, layers=("rgb",), step_s=0.1)
+        env = Env(session, width_px=48, layers=("rgb",), step_s=0.1)
         _, info = env.reset(options={"shift_m": 0.5})
         begin, total, pictures, over = info["progress_m"], 0.0, [], False
         assert info["shift_m"] == pytest.approx(0.5, abs=1e-6)

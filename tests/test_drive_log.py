@@ -145,6 +145,8 @@ def test_tracks_are_sorted_split_at_gaps_and_clipped_one_key_beyond_each_end() -
 def test_what_stands_needs_no_keys_in_between_and_what_left_its_place_does(tmp_path: Path) -> None:
     """Boxes that stand in the whole log have two keys, from the first image to the last; that is no gap."""
 
+    scene = write_log(made(tmp_path / "log"), tmp_path / "out", ImportOptions())
+
     def scene_of(*standing: bool, x_m: float) -> tuple[list[Track], list[str]]:
         boxes = BoxTracks("table", {}, 9.0)
         times = np.arange(len(standing)) * 3.0
@@ -152,8 +154,6 @@ def test_what_stands_needs_no_keys_in_between_and_what_left_its_place_does(tmp_p
             x = x_m * index / (len(standing) - 1)
             boxes.add("7", "car", times[index], (4.0, 2.0, 1.5), yaw_matrix(0.0, (x, 0.0, 0.0)), standing=stands)
         tracks, _ = boxes.tracks(images_s={time_s: (time_s - 0.09, time_s - 0.02) for time_s in times.tolist()})
-        found = made(tmp_path / f"{x_m}{standing}")
-        scene = write_log(found, tmp_path / f"out {x_m}{standing}", ImportOptions())
         gaps = [f.message for f in check_records(replace(scene, tracks=tuple(tracks))) if "not seen" in f.message]
         return tracks, gaps
 

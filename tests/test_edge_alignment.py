@@ -63,18 +63,14 @@ def test_a_real_drive_turned_by_a_degree_is_doubtful(tmp_path: Path, shared_data
 def test_depth_jumps_are_on_the_near_side() -> None:
     azimuth = np.deg2rad(np.arange(-20, 20, 0.5))
     distance = np.where(np.abs(azimuth) < np.deg2rad(5.1), 8.0, 20.0)
-    rows = [
-        np.stack([distance * np.cos(azimuth), distance * np.sin(azimuth), np.full_like(azimuth, z) * distance], 1)
-        for z in (-0.02, 0.0, 0.02)
-    ]
-    xyz = np.concatenate(rows)
+    x, y = distance * np.cos(azimuth), distance * np.sin(azimuth)
+    xyz = np.concatenate([np.stack([x, y, z * distance], 1) for z in (-0.02, 0.0, 0.02)])
     found = edges.depth_jumps(xyz)
     assert (np.linalg.norm(xyz[found, :2], axis=1) < 9).all()
     at = np.rad2deg(np.abs(np.arctan2(xyz[found, 1], xyz[found, 0])))
     assert len(found) >= 6
     assert at.min() >= 4.0  # the two ends of the near panel, in each row
-    assert len(edges.depth_jumps(xyz[:3])) == 0
-    assert len(edges.depth_jumps(np.zeros((50, 3)))) == 0
+    assert len(edges.depth_jumps(xyz[:3])) == 0 and len(edges.depth_jumps(np.zeros((50, 3)))) == 0
 
 
 def test_a_verdict_needs_a_peak_that_is_no_accident() -> None:
@@ -104,8 +100,7 @@ def test_a_verdict_needs_a_peak_that_is_no_accident() -> None:
 def test_too_little_to_tell_is_said(tmp_path: Path) -> None:
     scene = ToyStreet().write(tmp_path / "scene", labels=False, width=60, height=30)
     found = camera_alignment(scene)["front"]
-    assert found.verdict == "unknown"
-    assert "too few" in describe("front", found)
+    assert found.verdict == "unknown" and "too few" in describe("front", found)
     assert camera_alignment(replace(scene, sweeps=())) == {}
 
 
@@ -116,7 +111,6 @@ def test_doctor_tells_of_each_camera(tmp_path: Path, monkeypatch: pytest.MonkeyP
     for found, level, said in ((doubtful, "warning", "+1.0 degrees"), (right, None, "agree")):
         monkeypatch.setattr(check, "camera_alignment", lambda _scene, found=found: {"front": found})
         report: dict[str, Any] = diagnosis.report_scene(tmp_path / "scene")
-        assert said in report["text"]
-        assert report["alignment"]["front"]["depth_edges"] == 900
+        assert said in report["text"] and report["alignment"]["front"]["depth_edges"] == 900
         assert any(f["level"] == level and "degrees" in f["words"] for f in report["findings"]) == (level is not None)
         assert report["exit_code"] == 0

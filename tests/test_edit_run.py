@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from toy_world import CAR_SIZE, car_pose, ego_pose
 
 import mudg
 from mudg import app
 from mudg.base import geometry, store
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Scene
 from mudg.diffusion.settings import SynthesizeConfig
@@ -140,15 +141,11 @@ def test_bad_scripts_leave_nothing(run: Path, tmp_path: Path) -> None:
     too_sharp = "- lane_change: {id: car, left_m: 9, start_s: 0, duration_s: 0.2}"
     for text in ("- mve: {id: car}", "- move: {id: nobody}", too_sharp):
         edits = script(tmp_path, text)
-        with pytest.raises(InputError, match="line 1"):
-            edited(model, edits, out)
-        with pytest.raises(InputError, match="line 1"):
-            rendered(run / "scene", model, out, edits)
+        refused("line 1", edited, model, edits, out)
+        refused("line 1", rendered, run / "scene", model, out, edits)
         assert not out.exists()
-    with pytest.raises(UsageError, match="input"):
-        edited(run, script(tmp_path, "- remove: {ids: [car]}"), run / "edited")
-    with pytest.raises(InputError, match="no fitted scene"):
-        edited(run / "scene", tmp_path / "edits.yaml", out)
+    refused("input", edited, run, script(tmp_path, "- remove: {ids: [car]}"), run / "edited", raises=UsageError)
+    refused("no fitted scene", edited, run / "scene", tmp_path / "edits.yaml", out)
     assert not out.exists()
 
 
@@ -180,8 +177,7 @@ def test_objects_go_from_one_run_to_another(run: Path, tmp_path: Path, capsys: p
     assert app.main(["asset", "export", str(run), "car", "--out", str(file)]) == 0
     assert mudg.export_asset(run, "car", out=file) == file  # the same again: verified
     assert mudg.export_asset(run / "fit" / "street_gaussians", "car", out=file) == file  # a fit knows its scene
-    with pytest.raises(UsageError, match="no dynamic object"):
-        mudg.export_asset(run, "nobody", out=tmp_path / "x.safetensors")
+    refused("no dynamic object", mudg.export_asset, run, "nobody", out=tmp_path / "x.safetensors", raises=UsageError)
     text = """
 - insert:
     asset: {file: shelf/red.safetensors}

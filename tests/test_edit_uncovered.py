@@ -14,7 +14,6 @@ from mudg.base import geometry
 from mudg.base.palette import ID
 from mudg.base.types import Camera, View
 from mudg.core.edit import Motion
-from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
 from mudg.editing.apply import complete_asset, hidden_by
 from mudg.editing.model import SHOWN, Hidden, continued, noted, shaded_cells, with_closed_sides, without_traces
@@ -27,7 +26,6 @@ from mudg.gaussians.start import SH_C0
 SIZE = (4.0, 2.0, 1.5)
 CAMERA = Camera("front", 120, 80, 90.0, 90.0, 60.0, 40.0)
 FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-RASTER = RasterConfig(near_m=0.2)
 LIT, SHADED, CAR = 0.55, 0.3, 0.1
 CLASSES = (ID["road"], ID["building"], ID["car"])
 
@@ -50,6 +48,7 @@ def level(xy: np.ndarray) -> np.ndarray:
 
 
 ROAD = level(grid((2, 30, 0.3), (-7, 7, 0.3)))
+NONE = np.zeros((0, 3))
 BEHIND = grid((14, 14.5, 0.3), (-0.6, 0.7, 0.3), (0.2, 1.0, 0.3))
 
 
@@ -71,25 +70,24 @@ def fitted(
     return SceneModel(Table(columns, labels), (StaticNode(), node), None, CLASSES, 0)
 
 
-def street(
-    actor: Actor, road: np.ndarray, grey: np.ndarray, buildings: np.ndarray, spots: np.ndarray | None = None
-) -> SceneModel:
+def street(actor: Actor, grey: np.ndarray | float = LIT, buildings=NONE, spots=NONE, road=ROAD) -> SceneModel:
     """Level road of given greys, white Gaussians of buildings, black ones of road users in the background, and the car:
     its rear, black."""
-    spots = np.zeros((0, 3)) if spots is None else spots
-    rear = np.column_stack([np.full(20 * 15, -2.0), grid((-0.95, 1, 0.1), (-0.7, 0.8, 0.1))])
+    rear = grid((-2.0, -1.95, 0.1), (-0.95, 1, 0.1), (-0.7, 0.8, 0.1))
     means = np.concatenate([road, buildings, spots, rear])
     owner = np.repeat([0, 0, 0, 1], [len(road), len(buildings), len(spots), len(rear)])
     kind = np.repeat([0, 1, 2, 2], [len(road), len(buildings), len(spots), len(rear)])
-    greys = np.concatenate([grey, np.ones(len(buildings)), np.zeros(len(spots)), np.full(len(rear), CAR)])
+    greys = np.concatenate(
+        [np.broadcast_to(grey, len(road)), np.ones(len(buildings)), np.zeros(len(spots)), np.full(len(rear), CAR)]
+    )
     car = RigidNode("car", "car", list(SIZE), actor.motion.times_s, actor.motion.poses)
     return fitted(means, greys[:, None].repeat(3, 1), kind, owner, car, np.full(3, np.exp(-2.0)))
 
 
 def cleared(model: SceneModel, actor: Actor, views: list[View]) -> SceneModel:
     """The street after the car was removed."""
-    known = noted(model, views, RASTER)
-    return without_traces(known.without_nodes(["car"]), {"car": hidden_by(actor, views)}, views, RASTER)
+    known = noted(model, views)
+    return without_traces(known.without_nodes(["car"]), {"car": hidden_by(actor, views)}, views)
 
 
 def grey_of(model: SceneModel) -> np.ndarray:
@@ -115,7 +113,7 @@ def test_what_no_view_saw_goes_and_hidden_ground_is_closed() -> None:
     dark = np.where(unseen & (ROAD[:, 0] > 9), 0.0, LIT)  # what a fit left behind the car
     beside = np.array([[20.0, 6.0, 2.0], [12.0, 4.0, 1.0]])
     in_path, around = np.array([[9.0, 0.2, 0.9]]), np.array([[10.0, 1.25, 0.6], [10.0, -3.0, 0.6]])
-    model = street(actor, ROAD, dark, np.concatenate([BEHIND, beside, in_path]), around)
+    model = street(actor, dark, np.concatenate([BEHIND, beside, in_path]), around)
     before = grey_of(model)
     made = cleared(model, actor, views)
     assert same_places(means_of(made, "building"), beside)
@@ -130,7 +128,7 @@ def test_what_no_view_saw_goes_and_hidden_ground_is_closed() -> None:
 
 def test_what_a_view_saw_stays() -> None:
     actor, views = lead()
-    model = street(actor, ROAD, np.full(len(ROAD), LIT), BEHIND)
+    model = street(actor, LIT, BEHIND)
     aside = View(CAMERA, geometry.from_rotation_translation(FORWARD, (6.0, -4.0, 3.0)), 0.0)
     made = cleared(model, actor, [*views, aside])
     only = cleared(model, actor, views)
@@ -143,7 +141,7 @@ def test_the_shadow_of_what_hardly_moves_becomes_as_bright_as_what_lies_around(s
     actor, views = lead(step_m)
     shadow = (np.abs(ROAD[:, 1]) < 1.1) & (ROAD[:, 0] > 4.4) & (ROAD[:, 0] < 10 + step_m)
     other = (ROAD[:, 1] > 4) & (ROAD[:, 0] < 12)  # of something else
-    model = street(actor, ROAD, np.where(shadow | other, SHADED, LIT), np.zeros((0, 3)))
+    model = street(actor, np.where(shadow | other, SHADED, LIT))
     made = cleared(model, actor, views)
     means, kept = made.table["means"].detach().numpy(), ~made_up(made)
     near = kept & (np.abs(means[:, 1]) < 0.9) & (means[:, 0] > 4.6) & (means[:, 0] < 5.8) & (means[:, 2] < 0.1)
@@ -156,7 +154,7 @@ def test_the_shadow_of_what_hardly_moves_becomes_as_bright_as_what_lies_around(s
 def test_a_shadow_may_reach_ground_that_no_view_shows() -> None:
     actor, views = lead()
     shadow = (np.abs(ROAD[:, 1]) < 1.1) & (ROAD[:, 0] < 12)  # the camera sees the road from 3.2 m on
-    made = cleared(street(actor, ROAD, np.where(shadow, SHADED, LIT), np.zeros((0, 3))), actor, views)
+    made = cleared(street(actor, np.where(shadow, SHADED, LIT)), actor, views)
     means, grey = made.table["means"].detach().numpy(), grey_of(made)
     assert np.isfinite(grey).all()
     near = ~made_up(made) & (np.abs(means[:, 1]) < 0.9) & (means[:, 0] < 6)
@@ -214,10 +212,9 @@ def test_a_script_says_whose_traces_go(usual: bool) -> None:
 
 def test_sky_that_the_car_always_hid_continues_the_sky_that_was_seen() -> None:
     actor, views = lead()
-    low = lambda v: geometry.from_rotation_translation(FORWARD, (v.center_world[0], 0, 0.5))
-    views = [View(CAMERA, low(v), v.time_s) for v in views]
-    plain = street(actor, ROAD, np.full(len(ROAD), LIT), np.zeros((0, 3)))
-    model = replace(plain, sky=SkyNode.uniform(64, (0.5, 0.6, 0.9)))
+    low = (geometry.from_rotation_translation(FORWARD, (v.center_world[0], 0, 0.5)) for v in views)
+    views = [View(CAMERA, pose, v.time_s) for pose, v in zip(low, views, strict=True)]
+    model = replace(street(actor), sky=SkyNode.uniform(64, (0.5, 0.6, 0.9)))
     with torch.no_grad():
         model.sky.table["panorama"][:, :, 30:32, 62:66] = 0.0  # ahead, up to 6 degrees above the horizon
         model.sky.table["panorama"][:, :, :20] = 0.2
@@ -232,8 +229,8 @@ def test_a_scene_without_ground_or_views_stays() -> None:
     actor, views = lead()
     for road, seen in ((np.zeros((4, 3)), views), (ROAD, [])):
         hidden = {"car": hidden_by(actor, seen)}
-        model = noted(street(actor, road, np.full(len(road), LIT), np.zeros((0, 3))), seen, RASTER)
-        made = without_traces(model, hidden, seen, RASTER)
+        model = noted(street(actor, road=road), seen)
+        made = without_traces(model, hidden, seen)
         assert len(made.table) == len(model.table) and torch.equal(made.table["sh_dc"], model.table["sh_dc"])
     assert isinstance(hidden_by(actor, []), Hidden)
 
@@ -249,13 +246,9 @@ VIEWS = [View(CAMERA, geometry.from_rotation_translation(FORWARD, (t, 0, 1.2)), 
 
 def behind(label: str = "car", flank: float | None = None) -> SceneModel:
     """The rear of a vehicle, red below and blue above; with its left flank (y = ``flank``) where that is given."""
-    axis = lambda a, b: np.arange(a, b, 0.08)
-    y, z = (part.ravel() for part in np.meshgrid(axis(-0.88, 0.9), axis(-0.7, 0.75)))
-    places = [np.column_stack([np.full(len(y), -1.95), y, z])]
+    means = grid((-1.95, -1.94, 0.08), (-0.88, 0.9, 0.08), (-0.7, 0.75, 0.08))
     if flank is not None:
-        x, z = (part.ravel() for part in np.meshgrid(axis(-1.95, 2), axis(-0.7, 0.75)))
-        places.append(np.column_stack([x, np.full(len(x), flank), z]))
-    means = np.concatenate(places)
+        means = np.concatenate([means, grid((-1.95, 2, 0.08), (flank, flank + 0.01, 0.08), (-0.7, 0.75, 0.08))])
     colors = np.where(means[:, 2:] < 0, [0.8, 0.1, 0.1], [0.1, 0.1, 0.8])
     every = np.ones(len(means), int)
     node = RigidNode("car", label, list(NARROW), ACTOR.motion.times_s, ACTOR.motion.poses)
@@ -273,7 +266,7 @@ def made_sides(before: SceneModel, after: SceneModel) -> tuple[np.ndarray, np.nd
 
 def test_flanks_continue_the_colours_of_the_rear() -> None:
     model = behind()
-    places, colors = made_sides(model, with_closed_sides(model, ["car"], VIEWS, RASTER))
+    places, colors = made_sides(model, with_closed_sides(model, ["car"], VIEWS))
     assert set(np.sign(places[:, 1])) == {-1.0, 1.0} and np.abs(places[:, 1]).max() <= NARROW[1] / 2
     assert places[:, 0].min() < -1.6 and places[:, 0].max() > 1.8
     low, high = places[:, 2] < -0.2, places[:, 2] > 0.2
@@ -285,10 +278,10 @@ def test_flanks_continue_the_colours_of_the_rear() -> None:
 
 def test_only_gaps_of_vehicles_are_closed() -> None:
     model = behind(flank=0.84)
-    places, _ = made_sides(model, with_closed_sides(model, ["car"], VIEWS, RASTER))
+    places, _ = made_sides(model, with_closed_sides(model, ["car"], VIEWS))
     assert len(places) and (places[:, 1] < 0).all()  # the left flank is there
     person = behind("pedestrian")
-    assert with_closed_sides(person, ["car"], VIEWS, RASTER) is person
+    assert with_closed_sides(person, ["car"], VIEWS) is person
 
 
 def test_what_views_show_is_not_made_up() -> None:
@@ -297,7 +290,7 @@ def test_what_views_show_is_not_made_up() -> None:
     beside = [View(CAMERA, pose, float(t)) for pose, t in zip(poses, TIMES, strict=True)]
 
     def right(views: Sequence[View]) -> int:
-        return int((made_sides(model, with_closed_sides(model, ["car"], views, RASTER))[0][:, 1] < 0).sum())
+        return int((made_sides(model, with_closed_sides(model, ["car"], views))[0][:, 1] < 0).sum())
 
     assert right([*VIEWS, *beside]) < 0.2 * right(VIEWS)  # the right flank was seen to be empty; measured: 0
 

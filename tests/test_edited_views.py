@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -11,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from refusals import refused
 from test_clips import RULES, image_of_wall, stripes, view_at, wall
 from tiny_networks import small_mdm
+from view_server import colors_in, question
 
 from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
@@ -45,7 +45,7 @@ from mudg.steps.edit import Edit
 from mudg.steps.render import RenderViews
 from mudg.steps.synthesize import Synthesize
 from mudg.viewer.settings import ViewConfig
-from mudg.viewer.view import FrameRequest, FrameSource, server_of
+from mudg.viewer.view import FrameSource, server_of
 
 CAR = (0.6, 1.0, 1.0)
 
@@ -291,18 +291,13 @@ def test_sessions_and_exact_frames_are_repaired_like_renders(run: Path) -> None:
         replace(asked, start=replace(start, objects={})),
         replace(asked, end=Instant(view.time_s + 0.1, pose)),
     ):
-        with pytest.raises(UsageError, match="cannot be repaired"):
-            session.render([other])
-    with pytest.raises(UsageError, match="repaired here"):
-        Session(run / FITTED, scene=run / "scene", repair=True)
+        refused("cannot be repaired", session.render, [other], raises=UsageError)
+    refused("repaired here", Session, run / FITTED, scene=run / "scene", repair=True, raises=UsageError)
     source = FrameSource(lambda _: [model], scene, 1600, torch.device("cpu"), [mixer])
-    lens = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
-    at = {"eye": pose[:3, 3].tolist(), "axes": pose[:3, :3].T.tolist(), "time_s": view.time_s}
-    question = FrameRequest(scene=0, layer="color", hidden=[], camera="front", **lens, **at)
-    shown = lambda request: np.asarray(Image.open(io.BytesIO(source.png(request)[0]))).astype(int)
-    assert np.abs(shown(question) - wanted).max() <= 1
+    shown = lambda **more: np.rint(255 * colors_in(source.png(question(view, **more))[0]))
+    assert np.abs(shown() - wanted).max() <= 1
     plain = render_view(model.without_nodes(["car"]), view, raster)
-    assert np.abs(shown(question.model_copy(update={"hidden": ["car"]})) - to_bytes(plain.rgb)).max() <= 1
+    assert np.abs(shown(hidden=["car"]) - to_bytes(plain.rgb)).max() <= 1
 
 
 def test_what_cannot_be_repaired_is_refused(run: Path, tmp_path: Path) -> None:
@@ -315,12 +310,10 @@ def test_what_cannot_be_repaired_is_refused(run: Path, tmp_path: Path) -> None:
         ({"fused": run / "fuse", "edits": edits}, "--edits or --layers"),
         (changed, "as it was recorded"),
     ):
-        with pytest.raises(UsageError, match=message):
-            RenderViews(**parts | more, settings=settings).run()
+        refused(message, RenderViews(**parts | more, settings=settings).run, raises=UsageError)
     assert not (tmp_path / "out").exists()
     whole = Edit(source=run, script=edits, out=tmp_path / "whole", settings=EditConfig()).run()
-    with pytest.raises(UsageError, match="as it was recorded"):
-        Session(whole, device="cpu", repair=True)
+    refused("as it was recorded", Session, whole, device="cpu", repair=True, raises=UsageError)
     with pytest.raises(UsageError, match="as it was recorded"):
         server_of(ViewConfig(repair=True, images=0, port=0, device="cpu"), whole, None, None)
 

@@ -206,24 +206,3 @@ def test_what_cannot_be_done_is_refused_before_anything_is_written(lines: Lines,
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "empty"]
     several = replace(lines, more=(tmp_path / "b", tmp_path / "a"))
     assert paths_of(several) == {"first": tmp_path / "a", "more": tmp_path / "b", "more 1": tmp_path / "a"}
-
-
-class OneFile(Lines):
-    is_file = True
-
-    def written(self, texts: list[str], work: Any) -> dict[str, Any]:
-        (self.stop or str)(0)
-        store.write_text(work.path, "".join(texts))
-        return {"files": len(texts)}
-
-
-def test_a_result_may_be_one_file_with_a_description(lines: Lines, tmp_path: Path) -> None:
-    one = OneFile(first=lines.first, more=lines.more, out=tmp_path / "one.txt")
-    assert one.run().read_text() == "ab"
-    about = store.read_json(tmp_path / "one.txt.json")
-    assert (about["verb"], about["files"], about["sha256"]) == ("onefile", 2, store.digest(tmp_path / "one.txt"))
-    assert about["inputs"] == {"first": store.digest(tmp_path / "a"), "more": store.digest(tmp_path / "b")}
-    replace(one, stop=pytest.fail).run()
-    with pytest.raises(UsageError):
-        replace(one, end="!").run()
-    assert replace(one, end="!", overwrite=True).run().read_text() == "ab"

@@ -17,6 +17,7 @@ import torch
 import toy_splats
 import yaml
 from mcap.reader import make_reader
+from refusals import refused
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from test_edit import SIZE, toy
@@ -204,11 +205,10 @@ def test_nodes_edits_and_motion(fit: Path, tmp_path: Path) -> None:
 def test_what_cannot_be_exported_is_refused(
     fit: Path, tmp_path: Path, settings: dict, name: str, out: str, said: str
 ) -> None:
-    with pytest.raises(MudgError, match=said):
-        Export(format=name, source=fit, out=tmp_path / out, settings=ExportConfig(**settings)).run()
+    step = Export(format=name, source=fit, out=tmp_path / out, settings=ExportConfig(**settings))
+    refused(said, step.run, raises=MudgError)
     assert not (tmp_path / out).exists()
-    with pytest.raises(UsageError, match="lies in"):
-        Export(format="ply", source=fit, out=fit / "a.ply", settings=ExportConfig()).run()
+    refused("lies in", replace(step, format="ply", out=fit / "a.ply", settings=ExportConfig()).run, raises=UsageError)
 
 
 # -- imports ---------------------------------------------------------------------------------------
@@ -216,13 +216,9 @@ def test_what_cannot_be_exported_is_refused(
 
 @pytest.mark.parametrize("name", ["ply", "spz", "splat", "sog", "glb", "compressed-ply"])
 def test_a_file_becomes_an_object_that_scripts_insert(name: str, fit: Path, tmp_path: Path) -> None:
-    car = toy_splats.cloud(60, 0, 3, spread=1.0)
-    node = toy_splats.SplatNode("car", car.moved(geometry.yaw_matrix(0.0, (30, 0, 5))))
-    scene = toy_splats.SplatScene("car", (node,))
-    suffix = formats.FORMATS[name].suffixes[0]
-    file = tmp_path / f"van{suffix}"
-    turned = replace(scene, file_from_world=formats.file_from_world(name, "viewer"))
-    file.write_bytes(formats.FORMATS[name].write(formats.WriteRequest(turned, 0.0)))
+    car, axes = toy_splats.cloud(60, 0, 3, spread=1.0), formats.file_from_world(name, "viewer")
+    file = tmp_path / f"van{formats.FORMATS[name].suffixes[0]}"
+    file.write_bytes(toy_splats.written(name, car.moved(geometry.yaw_matrix(0.0, (30, 0, 5))), axes))
     flags = ["--label", "van", "--length-m", "5", "--yaw-deg", "90", "--out", str(tmp_path / "a.safetensors")]
     assert app.main(["asset", "import", str(file), *flags]) == 0
     asset = read_asset(tmp_path / "a.safetensors")
@@ -250,8 +246,8 @@ def test_a_file_becomes_a_scene(tmp_path: Path) -> None:
     assert len(model.table) == 40 and model.sh_degree == 2 and model.nodes[0].kind == "static"
     again = export.splat_scene(model, 0.0).nodes[0].cloud
     assert np.array_equal(again.sh, cloud.sh) and np.array_equal(again.class_ids, cloud.class_ids)
-    with pytest.raises(UsageError, match="settings of objects"):
-        imported(tmp_path / "a.ply", tmp_path / "fit2", kind="scene", label="car")
+    more = {"kind": "scene", "label": "car", "raises": UsageError}
+    refused("settings of objects", imported, tmp_path / "a.ply", tmp_path / "fit2", **more)
 
 
 def test_what_cannot_be_imported_is_refused(tmp_path: Path) -> None:
@@ -264,8 +260,7 @@ def test_what_cannot_be_imported_is_refused(tmp_path: Path) -> None:
         ("b.ply", "a.safetensors", InputError, "no solid Gaussians"),
         ("b.ply", "a.ply", UsageError, "ends in .safetensors"),
     ):
-        with pytest.raises(error, match=said):
-            imported(tmp_path / file, tmp_path / out)
+        refused(said, imported, tmp_path / file, tmp_path / out, raises=error)
     for words in (["import", str(tmp_path / "b.ply"), "car-1"], ["export", str(tmp_path)]):
         assert app.main(["asset", *words, "--out", str(tmp_path / "a.safetensors")]) == 2
     assert not (tmp_path / "a.safetensors").exists()
@@ -466,8 +461,7 @@ def test_names_are_those_that_ros_accepts(exported: tuple[Scene, Path]) -> None:
     names = ros2.ros_names(["front", "CAM__front-left", "cam front left", "02", "", "ä"])
     assert list(names.values()) == ["front", "CAM_front_left", "cam_front_left", "n02", "sensor", "sensor_2"]
     scene = replace(exported[0], tracks=(replace(exported[0].tracks[0], label="a\0b"),))
-    with pytest.raises(InputError, match="zero byte"):
-        ros2.Ros2Messages(LogRecords(scene))
+    refused("zero byte", ros2.Ros2Messages, LogRecords(scene))
 
 
 def test_the_same_log_gives_the_same_bag_in_bounded_memory(exported: tuple[Scene, Path], tmp_path: Path) -> None:
@@ -491,8 +485,8 @@ def test_a_missing_package_is_named_with_its_extra(
     for module in [key for key in sys.modules if key.startswith(f"{package}.")]:
         monkeypatch.delitem(sys.modules, module)
     street(tmp_path / "scene")
-    with pytest.raises(ResourceError, match=r"mudg\[ros\]"):
-        Export(format=name, source=tmp_path / "scene", out=tmp_path / out, settings=ExportConfig()).run()
+    step = Export(format=name, source=tmp_path / "scene", out=tmp_path / out, settings=ExportConfig())
+    refused(r"mudg\[ros\]", step.run, raises=ResourceError)
     assert not (tmp_path / out).exists()
     assert app.main(["export", name, str(tmp_path / "scene"), "--out", str(tmp_path / "a.txt")]) != 0
 
@@ -500,11 +494,11 @@ def test_a_missing_package_is_named_with_its_extra(
 def test_what_has_no_log_or_is_damaged_is_refused(tmp_path: Path) -> None:
     save_model(toy(), tmp_path / "fit")
     for name, out in (("ros2", "bag"), ("mcap", "a.mcap")):
-        with pytest.raises(MudgError, match="none is known here"):
-            Export(format=name, source=tmp_path / "fit", out=tmp_path / out, settings=ExportConfig()).run()
+        step = Export(format=name, source=tmp_path / "fit", out=tmp_path / out, settings=ExportConfig())
+        refused("none is known here", step.run)
         assert not (tmp_path / out).exists()
     scene = street(tmp_path / "scene")
     (tmp_path / "scene" / scene.frames[1].image.path).unlink()
-    with pytest.raises(MudgError):
-        Export(format="ros2", source=tmp_path / "scene", out=tmp_path / "bag", settings=ExportConfig()).run()
+    step = Export(format="ros2", source=tmp_path / "scene", out=tmp_path / "bag", settings=ExportConfig())
+    refused("missing", step.run, raises=MudgError)
     assert not (tmp_path / "bag" / "metadata.yaml").exists() and not (tmp_path / "bag" / "log_0.mcap").exists()

@@ -3,9 +3,11 @@ the bit."""
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import random
+import shutil
 import tempfile
 import threading
 from collections.abc import Callable
@@ -19,6 +21,7 @@ from toy_clips import tiny, write_clips
 
 from mudg import app
 from mudg.base import store
+from mudg.base.errors import UsageError
 from mudg.base.run_folder import Replacement, RunDir, VerbOutput
 from mudg.steps.synthesize import Learn
 
@@ -78,19 +81,28 @@ def test_a_small_run_stopped_at_every_point_is_repeated_to_the_same_bytes(
 @EVERY
 def test_a_replacement_killed_at_every_point_is_never_lost(tmp_path: Path, step: int) -> None:
     """Old or new, whole, is there at any moment; somebody else's file always is; the repeated command ends in the new
-    one."""
+    one, and that for the old one finds it, or is refused."""
     new = contents(small_run(tmp_path / "whole", 2)) | {"mine.md": b"mine"}
 
     def old(place: Path) -> None:
         small_run(place / "out", 1)
         (place / "out" / "mine.md").write_text("mine")
 
+    def chosen(operations: list[str]) -> list[int]:
+        exchange = (n for n, name in enumerate(operations, 1) if name.startswith(("rename", "rmdir")))
+        return sorted({*range(1, len(operations) + 1, step), *exchange})
+
     replace = lambda place: small_run(place / "out", 2, overwrite=True)
-    for place, _, name in sweep(replace, tmp_path, killed, every(step), old):
+    for place, _, name in sweep(replace, tmp_path, killed, chosen, old):
         places = (place / "out", Replacement(place / "out").retired)
         standing = [folder for folder in places if (folder / "manifest.json").is_file()]
         assert standing, f"nothing whole after a kill at {name}"
         store.verify_manifest(standing[0])
+        again = shutil.copytree(place, tmp_path / "again")
+        with contextlib.suppress(UsageError):
+            assert contents(small_run(again / "out", 1))["out.txt"] == b"1", name
+        assert [path.read_text() for path in again.rglob("mine.md*")] == ["mine"], name
+        shutil.rmtree(again)
         replace(place)
         assert contents(place / "out") == new, name
 

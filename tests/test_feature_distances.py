@@ -45,8 +45,7 @@ ALL = {"frechet": distances.frechet_distance, "kernel": distances.kernel_distanc
 def test_symmetric_and_independent_of_the_order_of_rows(name: str) -> None:
     a, b = rows(40, 6, "a"), rows(40, 6, "b")
     value = ALL[name](a, b)
-    assert value > 1e-3
-    assert ALL[name](b, a) == pytest.approx(value, rel=1e-9)
+    assert value > 1e-3 and ALL[name](b, a) == pytest.approx(value, rel=1e-9)
     assert ALL[name](a[::-1], b) == pytest.approx(value, rel=1e-9)
     assert ALL[name](a.astype(np.float32), b.astype(np.float32)) == pytest.approx(value, rel=1e-4)
 
@@ -75,13 +74,6 @@ def test_frechet_agrees_with_the_matrix_root(n: int, m: int) -> None:
     # The root of a singular product is known to half of the digits only; ours needs no root.
     digits = 1e-9 if min(n, m) > 12 else 1e-5
     assert distances.frechet_distance(a, b) == pytest.approx(frechet_by_sqrtm(a, b), rel=digits)
-
-
-def test_frechet_of_few_rows_is_mostly_bias() -> None:
-    rng = seeds.numpy_rng(0, 0, "bias")
-    a, b = rng.standard_normal((300, 40)), rng.standard_normal((300, 40))
-    biased = distances.frechet_distance(a, b)
-    assert distances.frechet_distance(a[:60], b[:60]) > 3 * biased > 3.0
 
 
 def kernel_by_loops(a: np.ndarray, b: np.ndarray) -> float:

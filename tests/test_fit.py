@@ -16,6 +16,7 @@ import pytest
 import torch
 from fit_settings import fit_to, fitted_bytes, interrupted, log_lines, mean_psnr, written_street
 from fit_settings import small_fit as settings
+from refusals import refused
 from toy_world import camera, car_pose, fused_cloud, truth, view_at, write_scene
 
 from mudg import native
@@ -191,8 +192,7 @@ def test_a_non_finite_gradient_is_named_and_never_reaches_the_parameters(world):
     check = FiniteCheck(9)
     for view in ("front/000001", "front/000002"):
         check.gradients(view, model, Appearance({}))
-    with pytest.raises(NumericsError, match=r"gaussians.log_scales, view front/000001, step 9"):
-        check.refuse()
+    refused(r"gaussians.log_scales, view front/000001, step 9", check.refuse, raises=NumericsError)
     assert model.table["log_scales"].grad is None
 
 
@@ -203,10 +203,8 @@ def test_a_fit_without_views_or_a_camera_that_is_there_is_refused(world, tmp_pat
         (settings("mudg_s"), (tmp_path / "empty",), InputError, "no finished virtual views"),
         (settings("street_gaussians", cameras=("rear",)), (), UsageError, "no camera named 'rear'"),
     ):
-        with pytest.raises(error, match=said):
-            fit_to(world, tmp_path / "fit", config, observations=views).run()
-    with pytest.raises(InputError, match="no fitted scene"):
-        fit.load_model(tmp_path)
+        refused(said, fit_to(world, tmp_path / "fit", config, observations=views).run, raises=error)
+    refused("no fitted scene", fit.load_model, tmp_path)
 
 
 def test_views_of_several_folders_are_those_of_one_folder_with_all(world, tmp_path):
@@ -316,6 +314,12 @@ def test_lidar_pixels_agree_with_exact_depth_and_leave_out_what_lies_behind(worl
     assert len(fit_views.lidar_pixels(view, points[:0], 0.6).pixel) == 0
 
 
+def wall_seen_from(view: View, depth_m: float) -> fit_views.StoredView:
+    shape = (view.camera.height, view.camera.width)
+    depth = np.full(shape, depth_m, np.float32)
+    return fit_views.StoredView("v", view, "virtual", np.zeros((*shape, 3), np.uint8), depth=depth)
+
+
 def test_what_only_virtual_views_see():
     """A wall 6 m ahead with a box before it: from the side, what the box hid is unseen, the rest of the wall is
     seen."""
@@ -326,10 +330,7 @@ def test_what_only_virtual_views_see():
     column = np.arange(cam.width) + 0.5
     witness = np.where(np.abs((column - cam.cx) / cam.fx * 3) < 0.45, 3.0, 6.0).astype(np.float32)
     recorded = (ahead, np.repeat(witness[None], cam.height, 0))
-    shape = (cam.height, cam.width)
-    black, depth = np.zeros((*shape, 3), np.uint8), np.full(shape, 6.0, np.float32)
-    shown = fit_views.StoredView("side", side, "virtual", black, depth=depth)
-    unseen = fit_trust._unseen(shown, [recorded], [])[cam.height // 2]
+    unseen = fit_trust._unseen(wall_seen_from(side, 6.0), [recorded], [])[cam.height // 2]
     wall_y = 1.5 - (column - cam.cx) / cam.fx * 6
     in_image = np.abs(wall_y) < 0.95 * cam.cx / cam.fx * 6
     assert unseen[np.abs(wall_y) < hidden_y - 0.25].all()
@@ -344,10 +345,8 @@ def test_what_a_moving_object_shows_is_asked_where_the_object_was():
     node = RigidNode("car", "car", (2.0, 2.0, 2.0), [0.0, 1.0], poses)
     late = View(cam, geometry.yaw_matrix(0.0, (0.0, 40.0, 0.0)) @ geometry.invert(geometry.CAM_FROM_EGO_AXES), 1.0)
     now = View(cam, geometry.invert(geometry.CAM_FROM_EGO_AXES), 0.0)
-    shape = (cam.height, cam.width)
-    black, depth = np.zeros((*shape, 3), np.uint8), np.full(shape, 5.2, np.float32)
-    shown = fit_views.StoredView("v", now, "virtual", black, depth=depth)
-    witness = (late, np.full(shape, 5.2, np.float32))
+    shown = wall_seen_from(now, 5.2)
+    witness = (late, shown.depth)
     middle = (cam.height // 2, cam.width // 2)
     assert not fit_trust._unseen(shown, [witness], [(node.size_m, node.pose_matrix)])[middle]
     assert fit_trust._unseen(shown, [witness], [])[middle]  # without the box the point stays 40 m to the side

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from fit_settings import fit_to, fitted_bytes, interrupted, mean_psnr, small_fit, written_street
+from refusals import refused
 from toy_world import fused_cloud, write_scene
 
 from mudg.base import store
@@ -123,28 +124,22 @@ def test_learnt_corrections_of_cameras_are_kept(world, tmp_path):
 
 def test_another_scene_cloud_or_method_is_refused(world, tmp_path):
     other = write_scene(tmp_path / "scene", frames=FRAMES - 1, width=SIZE[0], height=SIZE[1]).root
-    with pytest.raises(InputError, match=r"belongs to another scene[\s\S]*inputs.scene"):
-        go_on({**world, "scene": Path(other)}, tmp_path / "a")
+    refused(r"belongs to another scene[\s\S]*inputs.scene", go_on, {**world, "scene": Path(other)}, tmp_path / "a")
     write_fused(tmp_path / "fuse", fused_cloud(FRAMES - 1), {})
     with pytest.raises(InputError, match=r"another fused cloud[\s\S]*fit street_gaussians to this fused cloud"):
         go_on({**world, "fuse": tmp_path / "fuse"}, tmp_path / "b")
     guided = go_on(world, tmp_path / "guided", settings(iterations=1))
-    with pytest.raises(InputError, match=r"on recorded views[\s\S]*street_gaussians[\s\S]*mudg_s"):
-        go_on(world, tmp_path / "c", start_from=guided)
+    refused(r"on recorded views[\s\S]*street_gaussians[\s\S]*mudg_s", go_on, world, tmp_path / "c", start_from=guided)
     assert not any((tmp_path / name).exists() for name in "abc")
 
 
 def test_what_is_no_finished_fit_is_refused(world, tmp_path):
     for folder in (world["fuse"], world["scene"], tmp_path / "nothing"):
-        with pytest.raises(InputError, match="no fitted scene"):
-            go_on(world, tmp_path / "fit", start_from=folder)
-    unfinished = tmp_path / "unfinished"
-    shutil.copytree(world["plain"], unfinished)
+        refused("no fitted scene", go_on, world, tmp_path / "fit", start_from=folder)
+    unfinished = shutil.copytree(world["plain"], tmp_path / "unfinished")
     state = store.read_json(unfinished / "run.json")
     store.write_json(unfinished / "run.json", {**state, "state": "interrupted"})
-    with pytest.raises(InputError, match="interrupted"):
-        go_on(world, tmp_path / "fit", start_from=unfinished)
+    refused("interrupted", go_on, world, tmp_path / "fit", start_from=unfinished)
     with pytest.raises(UsageError, match=r"spherical harmonics[\s\S]*--sh-degree 0"):
         go_on(world, tmp_path / "fit", settings(sh_degree=1))
-    with pytest.raises(UsageError, match="the output is also an input"):
-        go_on(world, world["plain"])
+    refused("the output is also an input", go_on, world, world["plain"], raises=UsageError)

@@ -14,8 +14,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from fit_settings import fit_config, fit_to, interrupted, small_fit
+from fit_settings import fit_config, fit_to, interrupted, log_lines, small_fit
 from pretend_device import Transfer, pretend_device, transfers
+from refusals import refused
 from test_scene_options import EVERYTHING, written_world
 from toy_world import camera, view_at
 
@@ -33,7 +34,7 @@ from mudg.gaussians.corrections import Appearance
 from mudg.gaussians.densify import DensifySettings, DensifyStats, densify
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import StaticNode
-from mudg.gaussians.rendering import render_planes
+from mudg.gaussians.rendering import NEAR_M, render_planes
 from mudg.gaussians.schedule import FiniteCheck
 from mudg.gaussians.settings import FitConfig
 from mudg.steps.settings import RunConfig, with_device
@@ -41,7 +42,6 @@ from mudg.steps.settings import RunConfig, with_device
 SIZE, FRAMES = (36, 24), 4
 PRETEND = torch.device("pretend", 0)
 CPU = torch.device("cpu")
-FILES = ("gaussians.safetensors", "nodes.safetensors")
 NUMBERS = 64
 """Copies of at most so many values are small: poses, sizes, numbers for the log."""
 
@@ -75,17 +75,9 @@ def twins():
         yield
 
 
-def tensors_of(folder: Path) -> dict[str, torch.Tensor]:
-    paths = [folder / name for name in (*FILES, "appearance.safetensors") if (folder / name).is_file()]
-    return {f"{path.stem}/{key}": value for path in paths for key, value in store.read_tensors(path).items()}
-
-
 def assert_same_fit(mine: Path, theirs: Path) -> None:
-    one, other = tensors_of(mine), tensors_of(theirs)
-    assert one.keys() == other.keys()
-    for name, value in one.items():
-        told = lambda text, name=name: f"{name}: {text}"
-        torch.testing.assert_close(value, other[name], atol=1e-5, rtol=1e-5, msg=told)
+    one, other = ({path.name: store.read_tensors(path) for path in f.glob("*.safetensors")} for f in (mine, theirs))
+    torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
 
 
 def fitted(world: dict[str, Path], out: Path, config: FitConfig, **more: Path) -> Path:
@@ -107,7 +99,7 @@ def test_a_fit_has_the_numbers_of_the_cpu(world, tmp_path, case):
     with pretend_device():
         there = fitted(world, tmp_path / "there", settings(method, "pretend", **changes))
     assert_same_fit(there, here)
-    lines = [[json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()] for folder in (here, there)]
+    lines = [log_lines(folder) for folder in (here, there)]
     did = set().union(*lines[0])
     assert did >= {"cloned", "split", "pruned"}
     assert ("boxes_moved_m" in did) == bool(changes.get("poses__learn"))
@@ -144,41 +136,33 @@ def plain_fit(world, tmp_path_factory) -> Path:
     return fit_to(world, tmp_path_factory.mktemp("fit") / "out", config).run()
 
 
-class Steps:
+def copies_of_steps(seen: list[Transfer], monkeypatch) -> dict[int, list[Transfer]]:
     """The copies of every step, apart from those of the rasterizer's twin, which asks for numbers all the time."""
+    steps: dict[int, list[Transfer]] = {}
+    choose, due = fit.ViewSet.choose, fit.densify_if_due
 
-    def __init__(self) -> None:
-        self.of: dict[int, list[Transfer]] = {}
+    def ended(*given):
+        report = due(*given)
+        steps[given[3]] = [copy for copy in seen if not copy.where.startswith("core/raster/")]
+        return report
 
-    def watch(self, seen: list[Transfer], monkeypatch) -> None:
-        """Cut the list of copies into steps."""
-        choose, due = fit.ViewSet.choose, fit.densify_if_due
-
-        def began(views, run_seed, step, *rest):
-            seen.clear()
-            return choose(views, run_seed, step, *rest)
-
-        def ended(*given):
-            report = due(*given)
-            self.of[given[3]] = [copy for copy in seen if not copy.where.startswith("core/raster/")]
-            return report
-
-        monkeypatch.setattr(fit.ViewSet, "choose", began)
-        monkeypatch.setattr(fit, "densify_if_due", ended)
+    monkeypatch.setattr(fit.ViewSet, "choose", lambda *given: (seen.clear(), choose(*given))[1])
+    monkeypatch.setattr(fit, "densify_if_due", ended)
+    return steps
 
 
 @pytest.mark.parametrize("method", [pytest.param("street_gaussians", marks=pytest.mark.slow), "mudg_s"])
 def test_a_step_copies_a_view_there_and_one_row_of_numbers_back(world, tmp_path, monkeypatch, method):
-    steps, pixels = Steps(), {SIZE[0] * SIZE[1], 30 * 20}
+    pixels = {SIZE[0] * SIZE[1], 30 * 20}
     few = {"iterations": 5, "start__gaussians": 60, "virtual__gaussians": 0}
     config = settings(method, "pretend", densify__kind="none", **few, poses__learn=True, poses__rounds=0)
     monkeypatch.setattr(fit, "densify_schedule", lambda *_given: None)
     monkeypatch.setattr(fit, "add_certainty", lambda state, config: None)
     with pretend_device(), transfers() as seen:
-        steps.watch(seen, monkeypatch)
+        steps = copies_of_steps(seen, monkeypatch)
         fitted(world, tmp_path / "fit", config)
-    assert set(steps.of) == {1, 2, 3, 4, 5}
-    for step, copied in steps.of.items():
+    assert set(steps) == {1, 2, 3, 4, 5}
+    for step, copied in steps.items():
         there = [copy for copy in copied if copy.way == "there"]
         large = [copy for copy in there if copy.values > NUMBERS]
         assert {copy.where.partition(":")[0] for copy in large} == {"gaussians/views.py"}, step
@@ -189,7 +173,7 @@ def test_a_step_copies_a_view_there_and_one_row_of_numbers_back(world, tmp_path,
         if step > 1:  # at first the tracks' offsets come back and the rows of every node are counted
             assert [copy.where for copy in back] == ["gaussians/schedule.py:refuse"], step
             assert back[0].values < 100
-    late = [copy for copy in steps.of[5] if copy.way == "there" and copy.values <= NUMBERS]
+    late = [copy for copy in steps[5] if copy.way == "there" and copy.values <= NUMBERS]
     assert all(copy.where == "gaussians/nodes.py:_placement" for copy in late), late
 
 
@@ -206,9 +190,8 @@ def test_densification_brings_no_rows_back(plain_fit):
         with transfers() as seen:
             found = densify(far, stats, 4, gradient, 0)
         assert found == densify(model, seen_rows, 4, gradient, 0)
-        noted = [copy for copy in seen if copy.values > NUMBERS]
-        assert all(copy.way == "there" for copy in noted), noted
-        assert {copy.where for copy in noted} == {"gaussians/densify.py:_halves"}
+        noted = {(copy.way, copy.where) for copy in seen if copy.values > NUMBERS}
+        assert noted == {("there", "gaussians/densify.py:_halves")}
         means = far.table["means"].detach().cpu()
         torch.testing.assert_close(means, model.table["means"].detach(), atol=1e-6, rtol=1e-6)
         assert sum(found.values()) > found["rows"], found
@@ -227,12 +210,10 @@ def test_what_is_not_finite_is_found_in_one_look(world):
             check.terms("front/1", {"color": torch.ones((), device=there), "sky": torch.ones((), device=there)})
             check.gradients("front/1", model, Appearance({}))
             assert not [copy for copy in seen if copy.way == "back"]
-            with pytest.raises(NumericsError, match=r"gaussians.logits, view front/1, step 7[\s\S]*3 values"):
-                check.refuse()
+            refused(r"gaussians.logits, view front/1, step 7[\s\S]*3 values", check.refuse, raises=NumericsError)
         assert table["logits"].grad is None
         check.terms("front/2", {"color": torch.ones((), device=there), "sky": torch.full((), torch.nan, device=there)})
-        with pytest.raises(NumericsError, match=r"'sky' is not finite[\s\S]*front/2, step 7"):
-            check.refuse()
+        refused(r"'sky' is not finite[\s\S]*front/2, step 7", check.refuse, raises=NumericsError)
 
 
 # ---- parts ---------------------------------------------------------------------------------------
@@ -242,7 +223,7 @@ def test_a_fitted_scene_moves_and_renders_the_same(plain_fit):
     model = fit.load_model(plain_fit)
     assert model.to(CPU) is model
     view = view_at(0.45, camera(width=SIZE[0], height=SIZE[1]), left_m=1.0)
-    raster = RasterConfig(backend="torch", near_m=fit.NEAR_M)
+    raster = RasterConfig(backend="torch", near_m=NEAR_M)
     with twins():
         here = fit.render_view(model, view, raster)
     with pretend_device() as there:
@@ -271,37 +252,29 @@ def test_auto_draws_with_cuda_only_if_gsplat_can(monkeypatch):
     monkeypatch.setattr(place, "choose_device", cuda)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(place, "available", lambda backend: "the package gsplat is not installed")
-    assert place.drawing_device("auto", "fit") == CPU
+    given = [("auto",), ("cuda:0",), ("auto", "torch"), ("auto", "cpu"), ("auto", "gsplat")]
+    drawn = lambda: [place.drawing_device(wanted, "fit", *raster).type for wanted, *raster in given]
+    assert drawn()[:4] == ["cpu", "cuda", "cuda", "cpu"]
     assert "gsplat" in said[0]
-    assert place.drawing_device("cuda:0", "fit").type == "cuda"
-    assert place.drawing_device("auto", "fit", "torch").type == "cuda"
-    assert place.drawing_device("auto", "fit", "cpu") == CPU
     monkeypatch.setattr(place, "available", lambda backend: "")
-    assert place.drawing_device("auto", "fit").type == "cuda"
-    assert place.drawing_device("auto", "fit", "gsplat").type == "cuda"
+    assert drawn() == ["cuda", "cuda", "cuda", "cpu", "cuda"]
 
 
 def test_a_backend_that_does_not_draw_on_the_device_is_refused(world, tmp_path):
-    with pytest.raises(ResourceError, match="--device"):
-        fitted(world, tmp_path / "fit", settings("street_gaussians", "cuda"))
-    with pytest.raises(UsageError, match="--raster"):
-        fitted(world, tmp_path / "fit", replace(settings("street_gaussians", "cpu"), raster="gsplat"))
+    for error, device, raster in ((ResourceError, "cuda", "torch"), (UsageError, "cpu", "gsplat")):
+        with pytest.raises(error, match="--device" if device == "cuda" else "--raster"):
+            fitted(world, tmp_path / "fit", settings("street_gaussians", device, raster=raster))
     assert not (tmp_path / "fit").exists()  # refused before anything is written
 
 
 def test_steps_and_benchmarks_follow_the_device_of_a_run_unless_they_have_their_own(monkeypatch):
-    made = with_device(RunConfig(device="cuda:1", fit=FitConfig(device="cpu")))
+    made, usual = with_device(RunConfig(device="cuda:1", fit=FitConfig(device="cpu"))), RunConfig()
     assert (made.fit.device, made.render.device, made.score.device) == ("cpu", "cuda:1", "cuda:1")
-    assert made.fuse == RunConfig().fuse
-    assert with_device(RunConfig()) == RunConfig()
-    assert result_settings(made) == result_settings(RunConfig())
-    assert "device" not in json.dumps(result_settings(made))
+    assert (made.fuse, with_device(usual)) == (usual.fuse, usual)
+    assert result_settings(made) == result_settings(usual) and "device" not in json.dumps(result_settings(made))
     config = BenchConfig(device="cuda:1", methods=("street_gaussians", "mudg_s"))
-    fits = [row.fit for row in rows.method_rows(config)]
-    assert len(fits) == 2
-    every = (*fits, rows.usual_fit(config))
-    assert {one.device for one in every} == {"cuda:1"}
+    fits = [*(row.fit for row in rows.method_rows(config)), rows.usual_fit(config)]
+    assert [one.device for one in fits] == ["cuda:1"] * 3
     monkeypatch.setattr(chain, "drawing_device", lambda wanted, purpose: PRETEND if wanted == "cuda:1" else CPU)
-    assert chain.at_once(config) == 1
-    assert chain.at_once(replace(config, processes=3)) == 3
-    assert chain.at_once(replace(config, device="cpu")) == os.cpu_count()
+    many = (config, replace(config, processes=3), replace(config, device="cpu"))
+    assert [chain.at_once(one) for one in many] == [1, 3, os.cpu_count()]

@@ -18,18 +18,10 @@ RNG = np.random.default_rng(0)
 
 def stored(width: int = WIDTH, height: int = HEIGHT, kind: str = "virtual") -> StoredView:
     view = View(Camera("front", width, height, 200.0, 210.0, 0.51 * width, 0.48 * height), np.eye(4), 0.0)
-    return StoredView(
-        "front_shift+2.0/000001",
-        view,
-        kind,
-        RNG.integers(0, 255, (height, width, 3), np.uint8),
-        RNG.integers(0, 9, (height, width), np.uint8),
-        RNG.random((height, width)) < 0.5,
-        RNG.random((height, width)) < 0.9,
-        None,
-        RNG.random((height, width), np.float32),
-        RNG.integers(0, 255, (height, width), np.uint8),
-    )
+    rgb, confidence = (RNG.integers(0, 255, (height, width, *more), np.uint8) for more in ((3,), ()))
+    channels, depth = RNG.integers(0, 9, (height, width), np.uint8), RNG.random((height, width), np.float32)
+    sky, mask = (RNG.random((height, width)) < share for share in (0.5, 0.9))
+    return StoredView("front_shift+2.0/000001", view, kind, rgb, channels, sky, mask, None, depth, confidence)
 
 
 def test_colours_are_means_and_labels_those_of_a_pixel() -> None:

@@ -6,13 +6,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from refusals import refused
 from test_score_metrics import lpips_state
 
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.core.losses import lpips_distance, unit_features
 from mudg.core.metrics import Pair
-from mudg.gaussians.fit import perception_of
+from mudg.gaussians.fit import Perception, perception_of
 from mudg.gaussians.settings import VirtualConfig
 from mudg.networks.featnets import LpipsFeatures, PerceptualDistance
 
@@ -28,27 +29,23 @@ def test_gradient_of_the_loss():
     assert torch.autograd.gradcheck(lambda p: lpips_distance([p], units, weight, channels), (x,))
 
 
+def perceiving(name: str, folder: Path) -> Perception:
+    path = folder / "lpips.safetensors"
+    store.write_safetensors(path, {key: value.numpy() for key, value in lpips_state().items()})
+    return perception_of(VirtualConfig(perception=name, lpips_weights=str(path)))
+
+
 def test_the_loss_is_the_scorers_distance_where_all_is_certain(tmp_path):
-    path = str(tmp_path / "lpips.safetensors")
-    store.write_safetensors(Path(path), {key: value.numpy() for key, value in lpips_state().items()})
     network = LpipsFeatures(lpips_state())
     render, truth = random(5, 3, 48, 64).float(), random(6, 3, 48, 64).float()
-    loss = perception_of(VirtualConfig(perception="lpips", lpips_weights=path))(render, truth, torch.ones(1, 48, 64))
-    pair = Pair(
-        rgb=render,
-        truth_rgb=truth,
-        **dict.fromkeys(("depth", "semantics", "truth_depth", "truth_depth_valid", "truth_semantics")),
-    )
+    loss = perceiving("lpips", tmp_path)(render, truth, torch.ones(1, 48, 64))
+    pair = Pair(render, None, None, truth, None, None, None)
     assert loss.item() == pytest.approx(PerceptualDistance(network, network.channel_weights)(pair), rel=1e-6)
 
 
 @pytest.mark.parametrize("name", ["filters", "lpips"])
 def test_every_eye_sees_equality_differences_and_confidence(name, tmp_path):
-    path = tmp_path / "lpips.safetensors"
-    store.write_safetensors(path, {key: value.numpy() for key, value in lpips_state().items()})
-    perception = perception_of(VirtualConfig(perception=name, lpips_weights=str(path)))
-    truth = random(1, 3, 48, 64).float()
-    everywhere = torch.ones(1, 48, 64)
+    perception, truth, everywhere = perceiving(name, tmp_path), random(1, 3, 48, 64).float(), torch.ones(1, 48, 64)
     assert perception(truth, truth, everywhere).item() == pytest.approx(0, abs=1e-6)
     render = (truth * 0.6 + 0.1).requires_grad_()
     distance = perception(render, truth, everywhere)
@@ -60,8 +57,7 @@ def test_every_eye_sees_equality_differences_and_confidence(name, tmp_path):
 
 
 def test_lpips_without_or_with_other_weights_is_refused(tmp_path):
-    with pytest.raises(UsageError, match="weight file"):
-        perception_of(VirtualConfig(perception="lpips"))
+    refused("weight file", perception_of, VirtualConfig(perception="lpips"), raises=UsageError)
     store.write_safetensors(tmp_path / "other.safetensors", {"x": torch.zeros(3).numpy()})
     with pytest.raises(InputError, match="not the network it should be"):
         perception_of(VirtualConfig(perception="lpips", lpips_weights=str(tmp_path / "other.safetensors")))

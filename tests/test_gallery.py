@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import Browser
+from refusals import refused
 
 import mudg
 from mudg import app
 from mudg.base import store
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import UsageError
 from mudg.viewer import gallery
 
 METRICS = [
@@ -66,7 +67,7 @@ def test_a_page_has_a_card_and_the_scores_of_every_run(tmp_path: Path) -> None:
     assert "viewer.html" not in page  # there is none, but a folder
     assert 'href="../runs/c/viewer_page/index.html"' in page
     assert page.count("data:image/jpeg;base64,") == 2
-    assert "1 min 5 s" in page and "12 frames of 1 cameras" in page
+    assert "1 min 05 s" in page and "12 frames of 1 cameras" in page
     rows = re.findall(r'<tr><th scope="row">(.*?)</th><td>(.*?)</td><td>(.*?)</td><td>(.*?)</td>', page)
     assert rows == [
         (run, scene, "Gaussians with diffusion", place)
@@ -90,8 +91,7 @@ def test_what_cannot_be_read_is_listed_and_the_rest_goes_on(tmp_path: Path) -> N
     listed = page[page.index("Not shown") :]
     assert all(f"<dt>{folder}</dt>" in listed for folder in (unfinished, damaged, other, tmp_path / "missing"))
     assert "the run is not finished: running" in listed and "no such folder" in listed
-    with pytest.raises(InputError, match="no finished run"):
-        gallery.run([unfinished], tmp_path / "none.html")
+    refused("no finished run", gallery.run, [unfinished], tmp_path / "none.html")
     assert not (tmp_path / "none.html").exists()
 
 
@@ -108,10 +108,8 @@ def test_a_page_is_replaced_on_demand_only(tmp_path: Path, capsys: pytest.Captur
     out = tmp_path / "all.html"
     assert mudg.report([run], out=out) == out
     assert mudg.report([run], out=out) == out  # the same again: verified
-    with pytest.raises(UsageError, match="exists"):
-        mudg.report([run, run_of(tmp_path / "another")], out=out)
-    with pytest.raises(UsageError, match="HTML"):
-        mudg.report([run], out=tmp_path / "all.pdf")
+    refused("exists", mudg.report, [run, run_of(tmp_path / "another")], out=out, raises=UsageError)
+    refused("HTML", mudg.report, [run], out=tmp_path / "all.pdf", raises=UsageError)
     assert app.main(["report", str(run), "--out", str(out), "--overwrite"]) == 0
     assert "page: " in capsys.readouterr().out
 

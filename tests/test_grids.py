@@ -7,10 +7,11 @@ import itertools
 
 import pytest
 import torch
+from refusals import refused
 
 from mudg import native
 from mudg.base import seeds
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import UsageError
 from mudg.core.grids import NATIVE_FEATURES, HashGrid, PlaneSizes, encode, look_up, torch_encode, torch_look_up
 
 Drawn = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
@@ -32,12 +33,9 @@ def drawn(grid: HashGrid, count: int, dtype: torch.dtype = torch.float32) -> Dra
 
 def test_levels_hold_all_corners_until_they_are_too_many():
     grid = HashGrid(3, 4, 2, 2, 16, 8)
-    assert grid.resolutions == (2, 4, 8, 16)
-    assert grid.hashed == (False, False, True, True)
-    assert grid.entries == (27, 125, 256, 256)
-    assert grid.table_shape == (664, 2)
-    with pytest.raises(UsageError):
-        HashGrid(2, 4, 2, 2, 16, 8)
+    assert grid.resolutions == (2, 4, 8, 16) and grid.hashed == (False, False, True, True)
+    assert grid.entries == (27, 125, 256, 256) and grid.table_shape == (664, 2)
+    refused(".", HashGrid, 2, 4, 2, 2, 16, 8, raises=UsageError)
 
 
 def test_a_linear_function_on_the_corners_is_met_exactly_between_them():
@@ -93,8 +91,7 @@ def test_points_that_are_data_get_no_gradient_and_wrong_shapes_are_refused():
     (encode(points.detach(), table, GRIDS[0]) * upstream).sum().backward()
     assert table.grad is not None and points.grad is None
     points, table, _ = drawn(GRIDS[0], 10)
-    with pytest.raises(InputError, match="wrong shape"):
-        encode(points, table[:-1], GRIDS[0])
+    refused("wrong shape", encode, points, table[:-1], GRIDS[0])
     assert encode(points[:0], table, GRIDS[0]).shape == (0, 6)
 
 
@@ -156,5 +153,4 @@ def test_what_the_native_op_does_not_know_goes_to_the_twin():
         places, numbers, _ = drawn_planes(sizes, 5)
         assert torch.equal(look_up(places, numbers, sizes), torch_look_up(places, numbers, sizes))
     assert look_up(places[:0], numbers, sizes).shape == (0, 2)
-    with pytest.raises(InputError, match="wrong shape"):
-        look_up(places, numbers[:-1], sizes)
+    refused("wrong shape", look_up, places, numbers[:-1], sizes)

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 import torch
 from raster_scenes import IMAGES, Parameters, axis_view, cloud, gaussians_of, leaves_of, outside_band, view_of, weighted
+from refusals import refused
 from torch import Tensor
 
 from mudg import native
-from mudg.base.errors import InputError, NumericsError, ResourceError
+from mudg.base.errors import NumericsError, ResourceError
 from mudg.base.types import View
 from mudg.core.raster import gsplat_cuda
 from mudg.core.raster import rasterize as raster
@@ -110,11 +111,9 @@ def test_it_is_as_exact_far_from_the_origin(gsplat: ModuleType) -> None:
     pose = view.world_from_cam.copy()
     pose[:3, 3] += shift
     moved = p | {"means": p["means"] + torch.tensor(shift, dtype=torch.float32)}
-    config = GSPLAT
-    here = rasterize(gaussians_of(p), view, config)
-    there = rasterize(gaussians_of(moved), View(view.camera, pose, 0.0), config)
-    assert (here.rgb - there.rgb).abs().max() < 2e-5
-    assert (here.depth - there.depth).abs().max() < 1e-3
+    here = rasterize(gaussians_of(p), view, GSPLAT)
+    there = rasterize(gaussians_of(moved), View(view.camera, pose, 0.0), GSPLAT)
+    assert (here.rgb - there.rgb).abs().max() < 2e-5 and (here.depth - there.depth).abs().max() < 1e-3
 
 
 def test_gradients_of_two_backward_passes_add_up_and_none_is_recorded_where_none_is_wanted(gsplat: ModuleType) -> None:
@@ -126,12 +125,10 @@ def test_gradients_of_two_backward_passes_add_up_and_none_is_recorded_where_none
     loss.backward()
     for first, both in zip(once, (p["means"].grad, out.trace.means2d.grad, out.trace.abs_grad2d)):
         torch.testing.assert_close(both, 2 * first)
-    config = GSPLAT
-    out = rasterize(gaussians_of(cloud(20)), view_of(), config, absgrad=True)
-    assert not out.rgb.requires_grad
-    assert out.trace.abs_grad2d is None
+    out = rasterize(gaussians_of(cloud(20)), view_of(), GSPLAT, absgrad=True)
+    assert not out.rgb.requires_grad and out.trace.abs_grad2d is None
     with torch.no_grad():
-        assert not rasterize(gaussians_of(leaves_of(cloud(20))), view_of(), config).trace.means2d.requires_grad
+        assert not rasterize(gaussians_of(leaves_of(cloud(20))), view_of(), GSPLAT).trace.means2d.requires_grad
 
 
 class _Canary(torch.autograd.Function):
@@ -158,9 +155,8 @@ def test_a_dropped_picture_frees_its_graph_at_once(gsplat: ModuleType) -> None:
     gc.collect()
     gc.disable()
     try:
-        config = GSPLAT
         watched = gaussians_of(p | {"means": _Canary.apply(p["means"], alive)})
-        out = rasterize(watched, view_of(), config, absgrad=True)
+        out = rasterize(watched, view_of(), GSPLAT, absgrad=True)
         del alive, watched
         assert graph() is not None
         del out
@@ -194,40 +190,34 @@ def test_absurd_values_never_spread(gsplat: ModuleType, name: str, value: float)
 
 
 def test_values_that_are_not_finite(gsplat: ModuleType) -> None:
-    config, view = GSPLAT, view_of()
-    with pytest.raises(InputError, match="float32"):
-        rasterize(gaussians_of({n: v.double() for n, v in cloud(3).items()}), view, config)
+    view = view_of()
+    refused("float32", rasterize, gaussians_of({n: v.double() for n, v in cloud(3).items()}), view, GSPLAT)
     for name in ("means", "quats", "scales", "opacity"):
         p = cloud(10)
         p[name][2] = torch.nan
-        with pytest.raises(NumericsError, match=name):
-            rasterize(gaussians_of(p), view, config)
+        refused(name, rasterize, gaussians_of(p), view, GSPLAT, raises=NumericsError)
     p = cloud(60)
-    visible = rasterize(gaussians_of(p), view, config).trace.visible
+    visible = rasterize(gaussians_of(p), view, GSPLAT).trace.visible
     seen, unseen = int(torch.nonzero(visible)[0, 0]), int(torch.nonzero(~visible)[0, 0])
     for name in ("sh", "extra"):
-        bad = {n: v.clone() for n, v in p.items()}
-        bad[name][seen] = torch.inf
-        with pytest.raises(NumericsError, match="colour or a feature"):
-            rasterize(gaussians_of(bad), view, config)
-        harmless = {n: v.clone() for n, v in p.items()}
-        harmless[name][unseen] = torch.nan
+        bad, harmless = ({n: v.clone() for n, v in p.items()} for _ in range(2))
+        bad[name][seen], harmless[name][unseen] = torch.inf, torch.nan
+        refused("colour or a feature", rasterize, gaussians_of(bad), view, GSPLAT, raises=NumericsError)
         leaves = leaves_of(harmless)
-        rasterize(gaussians_of(leaves), view, config).rgb.sum().backward()
+        rasterize(gaussians_of(leaves), view, GSPLAT).rgb.sum().backward()
         assert torch.isfinite(leaves["means"].grad).all()
 
 
 def test_nothing_to_draw(gsplat: ModuleType) -> None:
-    config, view = GSPLAT, view_of()
+    view = view_of()
     centre = leaves_of(cloud(10) | {"means": torch.zeros(10, 3)})  # at the very centre of the camera
-    rasterize(gaussians_of(centre), View(view.camera, np.eye(4), 0.0), config).rgb.sum().backward()
+    rasterize(gaussians_of(centre), View(view.camera, np.eye(4), 0.0), GSPLAT).rgb.sum().backward()
     assert centre["means"].grad is None or torch.isfinite(centre["means"].grad).all()
     none = {n: v[:0] for n, v in cloud(3).items()}
     behind = cloud(3) | {"means": torch.tensor([[0.0, 0, -5]]).repeat(3, 1)}
     for p in (none, behind):
-        out = rasterize(gaussians_of(p), view, config)
-        assert out.alpha.abs().max() == out.rgb.abs().max() == 0
-        assert not out.trace.visible.any()
+        out = rasterize(gaussians_of(p), view, GSPLAT)
+        assert out.alpha.abs().max() == out.rgb.abs().max() == 0 and not out.trace.visible.any()
 
 
 # ---- whether it can be used ----------------------------------------------------------------------
@@ -247,8 +237,7 @@ def _pretend_installed(monkeypatch: pytest.MonkeyPatch, folder: Any, version: st
 def test_the_reason_why_it_cannot_be_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda *_: None)
     assert "not installed" in gsplat_cuda.problem()
-    with pytest.raises(ResourceError, match=r"mudg\[gsplat\]"):
-        gsplat_cuda.load()
+    refused(r"mudg\[gsplat\]", gsplat_cuda.load, raises=ResourceError)
     monkeypatch.undo()
     _pretend_installed(monkeypatch, tmp_path, version="1.4.0")
     assert "older than 1.5.3" in gsplat_cuda.problem()
@@ -256,11 +245,9 @@ def test_the_reason_why_it_cannot_be_used(monkeypatch: pytest.MonkeyPatch, tmp_p
     assert "no CUDA device" in gsplat_cuda.problem()
     _pretend_installed(monkeypatch, tmp_path)
     monkeypatch.setattr(gsplat_cuda, "nvcc", lambda: None)
-    assert "nvcc" in gsplat_cuda.problem()
-    assert gsplat_cuda.status().startswith("cannot be used here")
+    assert "nvcc" in gsplat_cuda.problem() and gsplat_cuda.status().startswith("cannot be used here")
     (tmp_path / "csrc.so").touch()
-    assert gsplat_cuda.problem() == ""
-    assert "came with it" in gsplat_cuda.status()
+    assert gsplat_cuda.problem() == "" and "came with it" in gsplat_cuda.status()
 
 
 def test_a_missing_compiler_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:

@@ -149,7 +149,6 @@ def test_of_large_releases_the_tables_and_the_names_of_files_count(tmp_path: Pat
 
 
 def test_what_is_odd_about_a_scene_is_said_when_it_is_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "drive").mkdir()
     drive = made.write_derived(tmp_path / "drive")
     labels = drive / "derived" / "label_02.txt"
     rows = [line.split() for line in labels.read_text().splitlines()]

@@ -144,7 +144,6 @@ def test_odometry_sequence(tmp_path: Path) -> None:
 
 
 def test_derived_poses_and_tracking_labels_are_found_without_a_flag(tmp_path: Path) -> None:
-    (tmp_path / "drive").mkdir()
     scene = ingest(made.write_derived(tmp_path / "drive"), tmp_path / "out")
     first = invert(made.world_from_velo(0))
     assert worst(scene.ego.world_from_ego[5], first @ made.world_from_velo(0.5)) < 1e-9
@@ -177,7 +176,6 @@ def test_object_frame(tmp_path: Path) -> None:
 
 
 def test_explicit_files_win_over_those_found(tmp_path: Path) -> None:
-    (tmp_path / "drive").mkdir()
     root = made.write_derived(tmp_path / "drive")
     still = tmp_path / "still.txt"
     still.write_text("\n".join(f"{n} {made.numbers(np.eye(4)[:3])}" for n in range(6)) + "\n")
@@ -190,7 +188,6 @@ def test_explicit_files_win_over_those_found(tmp_path: Path) -> None:
 
 def test_track_with_a_gap_is_split_where_it_is_long(tmp_path: Path) -> None:
     drive = made.Drive(tuple(range(14)))
-    (tmp_path / "drive").mkdir()
     root = made.write_derived(tmp_path / "drive", drive)
     rows = [made.label_line(0.1 * n, f"{n} 7 ") for n in drive.frames if n not in (2, 3, 6, 7, 8, 9, 10, 11)]
     (root / "derived" / "label_02.txt").write_text("\n".join(rows) + "\n")

@@ -37,24 +37,22 @@ SOURCES = {
     "remedy": lambda text: UsageError("bad", remedy=f"remove {text}"),
     "located": lambda text: InputError("bad").located(text),
     "pickled": lambda text: pickle.loads(pickle.dumps(InputError("bad", got=text, remedy=text))),
-    "a record": lambda text: _raised(lambda: parse_record(Named, {"name": text}, f"{text}: ")),
-    "an unknown field": lambda text: _raised(lambda: parse_record(Named, {text: 1}, "file: ")),
-    "a key that is no text": lambda text: _raised(
-        lambda: parse_record(Named, {1: text, None: text, (text,): 1}, f"{text}: ")
-    ),
-    "a missing field": lambda text: _raised(
-        lambda: parse_record(Named, dict.fromkeys([f"{text}{n}" for n in range(9)]), "file: ")
-    ),
-    "an edit": lambda text: _raised(lambda: parse_edits(json.dumps([{text[:9999]: {}}]), "file")),
-    "a field of an edit": lambda text: _raised(
-        lambda: parse_edits(json.dumps([{"move": {text[:9999]: 1, "id": text[:9999]}}]), "file")
-    ),
-    "JSON": lambda text: _raised(lambda: store.parse_json(f'{{"{text}": 1, "{text}": 1}}'.replace("\n", " "), text)),
+    "a record": lambda text: record({"name": text}, f"{text}: "),
+    "an unknown field": lambda text: record({text: 1}),
+    "a key that is no text": lambda text: record({1: text, None: text, (text,): 1}, f"{text}: "),
+    "a missing field": lambda text: record(dict.fromkeys([f"{text}{n}" for n in range(9)])),
+    "an edit": lambda text: edit({text[:9999]: {}}),
+    "a field of an edit": lambda text: edit({"move": {text[:9999]: 1, "id": text[:9999]}}),
+    "JSON": lambda text: refused(".", store.parse_json, f'{{"{text}": 1, "{text}": 1}}'.replace("\n", " "), text),
 }
 
 
-def _raised(call: object) -> MudgError:
-    return refused(".", call, raises=MudgError)
+def record(value: object, where: str = "file: ") -> MudgError:
+    return refused(".", parse_record, Named, value, where, raises=MudgError)
+
+
+def edit(value: object) -> MudgError:
+    return refused(".", parse_edits, json.dumps([value]), "file", raises=MudgError)
 
 
 @pytest.mark.parametrize("source", SOURCES)
@@ -66,14 +64,10 @@ def test_values_in_errors_are_short_and_plain(source: str) -> None:
 
 
 def test_lines_of_a_remedy_and_short_values_stay_as_they_are() -> None:
-    error = UsageError(
-        "a b", where="/x y/ü.json: a[0]", expected="one of a, b", got="'c'", remedy="rename:\n    a -> b\n    c -> d"
-    )
-    assert (
-        str(error) == "a b\n  where: /x y/ü.json: a[0]\n  expected: one of a, b\n  got: 'c'\n"
-        "  what to do: rename:\n    a -> b\n  "
-        "  c -> d"
-    )
+    fields = {"where": "/x y/ü.json: a[0]", "expected": "one of a, b", "got": "'c'"}
+    said = str(UsageError("a b", **fields, remedy="rename:\n    a -> b\n    c -> d"))
+    lines = [f"  {name}: {value}" for name, value in fields.items()]
+    assert said.split("\n") == ["a b", *lines, "  what to do: rename:", "    a -> b", "    c -> d"]
 
 
 @pytest.mark.parametrize("terminal", [False, True])

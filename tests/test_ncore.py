@@ -47,8 +47,17 @@ except ResourceError as missing:
     REASON = str(missing)
 Sides = tuple[tuple[int, int], tuple[int, int], Any]
 """Size, principal point and shutter of a camera."""
-needs_package = pytest.mark.skipif(bool(REASON), reason="the package nvidia-ncore is not installed")
+WITHOUT = (
+    "sensors_are_apart goes_on_and_then_stands is_asked_for_in_words chunk_of_the_grid regular_files_alone".split()
+)
+"""What the names of tests that do without the package hold."""
 pytestmark = [needs_native, pytest.mark.filterwarnings("ignore::DeprecationWarning")]
+
+
+@pytest.fixture(autouse=True)
+def package_where_needed(request: pytest.FixtureRequest) -> None:
+    if REASON and not any(words in request.node.name for words in WITHOUT):
+        pytest.skip("the package nvidia-ncore is not installed")
 
 
 def records(scene: Scene, **changes: Any) -> LogRecords:
@@ -71,7 +80,6 @@ def loaded(recording: Path) -> Any:
 # --- what it means to the package -----------------------------------------------------------------
 
 
-@needs_package
 def test_points_fall_on_their_pixels_by_the_packages_own_projection(truth: Scene, loaded: Any) -> None:
     """Pixel centres, camera axes and the direction of every pose: the package projects as this program does."""
     import torch
@@ -93,7 +101,6 @@ def test_points_fall_on_their_pixels_by_the_packages_own_projection(truth: Scene
         assert np.asarray(model.pixels_to_image_points(np.zeros((1, 2), np.int32))).tolist() == [[0.5, 0.5]]
 
 
-@needs_package
 def test_sweeps_compensated_by_the_package_are_the_sweeps(truth: Scene, loaded: Any) -> None:
     lidar = loaded.get_lidar_sensor("lidar")
     for index, sweep in enumerate(truth.sweeps):
@@ -108,7 +115,6 @@ def test_sweeps_compensated_by_the_package_are_the_sweeps(truth: Scene, loaded: 
         assert np.abs(raw - given.xyz).max() > 0.01  # as measured, not as compensated
 
 
-@needs_package
 def test_boxes_stand_where_the_package_puts_them(truth: Scene, loaded: Any) -> None:
     bbox_pose = package().transformations.bbox_pose
     found = list(loaded.get_cuboid_track_observations())
@@ -126,7 +132,6 @@ def test_boxes_stand_where_the_package_puts_them(truth: Scene, loaded: Any) -> N
 # --- both ways ------------------------------------------------------------------------------------
 
 
-@needs_package
 def test_round_trip(truth: Scene, recording: Path, tmp_path: Path) -> None:
     """Images equal to the byte, poses to 1e-6, points to 0.1 mm, boxes to 1e-6, times to a nanosecond."""
     assert RECOGNISERS["ncore"](recording)
@@ -138,14 +143,12 @@ def test_round_trip(truth: Scene, recording: Path, tmp_path: Path) -> None:
     assert scene.id == truth.id
 
 
-@needs_package
 def test_the_same_log_gives_the_same_bytes(truth: Scene, recording: Path, tmp_path: Path) -> None:
     for path in write_ncore(tmp_path, records(truth)):
         assert path.read_bytes() == (recording / path.name).read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in recording.iterdir())
 
 
-@needs_package
 def test_shutters_masks_and_sensors_that_move(truth: Scene, tmp_path: Path) -> None:
     """What the city lacks: a rolling shutter, a camera that shakes on the vehicle, the bonnet."""
     rng = np.random.default_rng(2)
@@ -177,7 +180,6 @@ def test_shutters_masks_and_sensors_that_move(truth: Scene, tmp_path: Path) -> N
         assert (read_label(scene, b, "ego") == bonnet).all()
 
 
-@needs_package
 def test_other_peoples_recordings(truth: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """As NVIDIA's converters write: a store per sensor, float32 poses, boxes in a sensor's frame, two returns."""
     v4, data = package().v4, package().data
@@ -264,7 +266,6 @@ LENSES: dict[str, tuple[dict[str, Any], Any]] = {
 }
 
 
-@needs_package
 @pytest.mark.parametrize("kind", LENSES)
 def test_lenses_are_the_packages_own_and_fit_a_pinhole_camera(kind: str) -> None:
     """Projections against this program's own formulas; a lens of 120 degrees loses its rim, not its scale."""
@@ -314,7 +315,6 @@ def test_the_package_is_asked_for_in_words(tmp_path: Path, monkeypatch: pytest.M
     assert not (tmp_path / "out").exists()
 
 
-@needs_package
 def test_what_cannot_be_written_is_refused(truth: Scene, tmp_path: Path) -> None:
     nowhere = EgoPath(np.zeros(0), np.zeros((0, 4, 4)))
     refused("vehicle's path", write_ncore, tmp_path, records(truth, ego=nowhere))
@@ -327,7 +327,6 @@ def test_what_cannot_be_written_is_refused(truth: Scene, tmp_path: Path) -> None
     assert not list(tmp_path.iterdir())
 
 
-@needs_package
 def test_one_vehicle_pose_and_no_sweep_are_enough(truth: Scene, tmp_path: Path) -> None:
     still = EgoPath(truth.ego.times_s[:1], truth.ego.world_from_ego[:1])
     alone = replace(truth, ego=still, sweeps=(), tracks=())
@@ -337,7 +336,6 @@ def test_one_vehicle_pose_and_no_sweep_are_enough(truth: Scene, tmp_path: Path) 
     assert "no LiDAR sweeps in the recording" in scene.source.notes
 
 
-@needs_package
 def test_one_of_several_recordings(recording: Path, tmp_path: Path) -> None:
     (store,) = recording.glob("*.itar")
     for name in ("a", "b"):
@@ -351,7 +349,6 @@ def test_one_of_several_recordings(recording: Path, tmp_path: Path) -> None:
     refused("file name", ingest, tmp_path / "x.json", tmp_path / "two")
 
 
-@needs_package
 def test_the_commands(truth: Scene, tmp_path: Path) -> None:
     assert app.main(["export", "ncore", truth.root, "--out", str(tmp_path / "out")]) == 0
     assert app.main(["ingest", str(tmp_path / "out"), str(tmp_path / "back"), "--no-contact-sheet"]) == 0
@@ -364,7 +361,7 @@ def _itar(members: dict[str, bytes], metadata: dict[str, Any], index: dict[str, 
     """A store made by hand."""
     import cbor2
 
-    packed = lzma.compress(cbor2.dumps({"zarr_consolidated_format": 1, "metadata": metadata}))
+    packed = lzma.compress(cbor2.dumps({"zarr_consolidated_format": 1, "metadata": metadata}), preset=0)
     members = {**members, ".zmetadata.cbor.xz": packed}
     content, places = b"", []
     for name, body in members.items():
@@ -387,51 +384,51 @@ UNPACKS, PACKED, NOTHING = "unpacks to too much", "packed in a way", "cannot be 
 BLOSC = {"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 2, "blocksize": 0}
 FALSE_CHUNK = struct.pack("<4B3I", 2, 1, 0x21, 4, 1 << 31, 1 << 20, 64).ljust(64, b"\0")
 PICKLED = {"dtype": "|O", "filters": [{"id": "pickle", "protocol": 5}]}
-HOSTILE: dict[str, tuple[Any, bytes | None, str]] = {
-    # what is wrong: (attributes of an array, or what stands in their place; its chunk; what is said)
-    "huge array": ({"shape": [1 << 40], "chunks": [1 << 40]}, bytes(16), "larger than its file"),
-    "array without chunks": ({"shape": [1 << 33], "chunks": [1]}, None, "chunk of an array is missing"),
-    "pickled array": (PICKLED, bytes(16), PACKED),
-    "another codec": ({"compressor": {"id": "zlib", "level": 9}}, bytes(16), PACKED),
-    "false chunk": ({"compressor": BLOSC}, FALSE_CHUNK, "larger than its file|another size|damaged"),
-    "deep metadata": (functools.reduce(lambda inner, _: [inner], range(400), []), bytes(16), "are damaged"),
-    "nothing in it": ({}, bytes(16), NOTHING),
+DEEP = functools.reduce(lambda inner, _: [inner], range(400), [])
+
+
+def index_bomb() -> bytes:
+    bomb = lzma.compress(bytes(200 << 20), preset=0)
+    whole = (bytes(512) + bomb).ljust(-(-(512 + len(bomb)) // 512) * 512, b"\0")
+    return whole + struct.pack("<4sIQI", b"itar", 1, 512, len(bomb)).ljust(512, b"\0")
+
+
+def array(about: Any, chunk: bytes | None = bytes(16)) -> Callable[[], bytes]:
+    """A store of one array with other attributes, or with something in their place; and its chunk."""
+    about = {**ARRAY, **about} if isinstance(about, dict) else about
+    return lambda: _itar({} if chunk is None else {"x/0": chunk}, {**ROOT, "x/.zarray": about})
+
+
+def indexed(items: Any, offset: int, *sizes: int) -> Callable[[], bytes]:
+    return lambda: _itar({}, ROOT, {"items": items, "offset_datas": [offset], "sizes": list(sizes)})
+
+
+HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
+    # what is wrong: (the store; what is said)
+    "index bomb": (index_bomb, UNPACKS),
+    "metadata bomb": (lambda: _itar({"x/0": bytes(16)}, {**ROOT, "y/.zattrs": {"a": "0" * (150 << 20)}}), UNPACKS),
+    "a million lists": (lambda: _itar({}, {**ROOT, "x/.zattrs": [[] for _ in range(900_000)]}), NOTHING),
+    "member outside": (indexed(["a"], 1 << 50, 10), "outside of the file"),
+    "index of another kind": (indexed(7, 1), "index"),
+    "huge array": (array({"shape": [1 << 40], "chunks": [1 << 40]}), "larger than its file"),
+    "array without chunks": (array({"shape": [1 << 33], "chunks": [1]}, None), "chunk of an array is missing"),
+    "pickled array": (array(PICKLED), PACKED),
+    "another codec": (array({"compressor": {"id": "zlib", "level": 9}}), PACKED),
+    "false chunk": (array({"compressor": BLOSC}, FALSE_CHUNK), "larger than its file|another size|damaged"),
+    "deep metadata": (array(DEEP), "are damaged"),
+    "nothing in it": (array({}), NOTHING),
 }
 
 
-def _hostile(kind: str) -> tuple[bytes, str]:
-    """A store, and what is said about it."""
-    if kind == "index bomb":
-        bomb = lzma.compress(bytes(200 << 20))
-        whole = (bytes(512) + bomb).ljust(-(-(512 + len(bomb)) // 512) * 512, b"\0")
-        return whole + struct.pack("<4sIQI", b"itar", 1, 512, len(bomb)).ljust(512, b"\0"), UNPACKS
-    if kind == "metadata bomb":
-        return _itar({"x/0": bytes(16)}, {**ROOT, "y/.zattrs": {"a": "0" * (150 << 20)}}), UNPACKS
-    if kind == "a million lists":
-        return _itar({}, {**ROOT, "x/.zattrs": [[] for _ in range(900_000)]}), NOTHING
-    if kind == "member outside":
-        return _itar({}, ROOT, {"items": ["a"], "offset_datas": [1 << 50], "sizes": [10]}), "outside of the file"
-    if kind == "index of another kind":
-        return _itar({}, ROOT, {"items": 7, "offset_datas": [1], "sizes": []}), "index"
-    about, chunk, said = HOSTILE[kind]
-    about = {**ARRAY, **about} if isinstance(about, dict) else about
-    return _itar({} if chunk is None else {"x/0": chunk}, {**ROOT, "x/.zarray": about}), said
-
-
-KINDS = ("index bomb", "metadata bomb", "a million lists", "member outside", "index of another kind", *HOSTILE)
-
-
-@needs_package
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", HOSTILE)
 def test_hostile_stores_are_refused_before_they_cost_memory(kind: str, tmp_path: Path) -> None:
-    content, said = _hostile(kind)
-    (tmp_path / "a.ncore4.zarr.itar").write_bytes(content)
+    store, said = HOSTILE[kind]
+    (tmp_path / "a.ncore4.zarr.itar").write_bytes(store())
     with at_most(150):
         error = roundtrip.assert_refused(ingest, tmp_path, tmp_path / "out", said)
     assert "a.ncore4" in error.where or said == NOTHING
 
 
-@needs_package
 def test_metadata_that_would_fill_the_memory_are_refused_before_they_are_taken_apart(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -450,7 +447,6 @@ def as_folder(recording: Path, folder: Path) -> Path:
     return store
 
 
-@needs_package
 @pytest.mark.parametrize("lost", ["distance_m/0.0", "direction/0.0", "timestamp_us/0", "image/0"])
 def test_a_lost_chunk_is_named_and_never_filled(recording: Path, tmp_path: Path, lost: str) -> None:
     store = as_folder(recording, tmp_path)
@@ -500,7 +496,6 @@ FRONT = "intrinsics/default/cameras/front/.zattrs"
 RIG_POSES, BOXES = "poses/default/dynamic_poses/.zattrs", "cuboids/default/cuboids/.zattrs"
 
 
-@needs_package
 def test_components_and_fields_of_others_are_named_once(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -573,7 +568,6 @@ BAD = {
 }
 
 
-@needs_package
 @pytest.mark.parametrize("case", BAD)
 def test_recordings_that_contradict_themselves_are_refused(case: str, recording: Path, tmp_path: Path) -> None:
     change, said = BAD[case]
@@ -581,7 +575,6 @@ def test_recordings_that_contradict_themselves_are_refused(case: str, recording:
     roundtrip.assert_refused(ingest, altered(recording, tmp_path / "log", change), tmp_path / "out", said)
 
 
-@needs_package
 def test_rays_of_distance_0_are_no_points_and_are_counted(recording: Path, tmp_path: Path) -> None:
     import zarr
 
@@ -598,7 +591,6 @@ def test_rays_of_distance_0_are_no_points_and_are_counted(recording: Path, tmp_p
     assert any("100 " in note and "return" in note for note in scene.source.notes), scene.source.notes
 
 
-@needs_package
 def test_every_cut_and_flipped_bytes_end_in_words(recording: Path, tmp_path: Path) -> None:
     """An error in words; or a scene, where pixels and points, which have no checksum, were flipped."""
     (store,) = recording.glob("*.itar")

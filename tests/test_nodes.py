@@ -36,27 +36,19 @@ def track(name: str = "car", t0: float = 0.0) -> Track:
     return Track(name, "car", [4.0, 2.0, 1.5], t0 + np.array([0.0, 0.5, 1.0, 2.0]), np.stack(keys))
 
 
-def columns(count: int, seed: int, classes: int = 3, degree: int = 0) -> dict[str, torch.Tensor]:
+def columns(count: int, seed: int, degree: int = 0) -> dict[str, torch.Tensor]:
     g = torch.Generator().manual_seed(seed)
-    made = {
-        "means": torch.randn(count, 3, generator=g),
-        "quats": torch.randn(count, 4, generator=g),
-        "log_scales": torch.randn(count, 3, generator=g) - 2,
-        "logits": torch.randn(count, generator=g),
-        "sh_dc": torch.randn(count, 1, 3, generator=g),
-        "semantics": torch.randn(count, classes, generator=g),
-    }
+    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logits": (), "sh_dc": (1, 3), "semantics": (3,)}
     if degree:
-        made["sh_rest"] = torch.randn(count, (degree + 1) ** 2 - 1, 3, generator=g)
-    return made
+        shapes["sh_rest"] = ((degree + 1) ** 2 - 1, 3)
+    made = {name: torch.randn(count, *shape, generator=g) for name, shape in shapes.items()}
+    return made | {"log_scales": made["log_scales"] - 2}
 
 
 def model(learn_poses: bool = False, degree: int = 0) -> SceneModel:
     parts = [columns(5, 1, degree=degree), columns(4, 2, degree=degree), columns(3, 3, degree=degree)]
-    table = Table(
-        {name: torch.cat([p[name] for p in parts]) for name in parts[0]},
-        {"node": torch.tensor([0] * 5 + [1] * 4 + [2] * 3, dtype=torch.int32)},
-    )
+    labels = {"node": torch.tensor([0] * 5 + [1] * 4 + [2] * 3, dtype=torch.int32)}
+    table = Table({name: torch.cat([p[name] for p in parts]) for name in parts[0]}, labels)
     objects = (RigidNode.from_track(track("car"), learn_poses), RigidNode.from_track(track("van", 5.0), learn_poses))
     classes = (ID["road"], ID["sky"], ID["car"])
     return SceneModel(table, (StaticNode(), *objects), SkyNode.uniform(16), classes, degree, {"method": "test"})
@@ -65,26 +57,23 @@ def model(learn_poses: bool = False, degree: int = 0) -> SceneModel:
 # ---- poses ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("time_s", [0.0, 0.2, 0.5, 0.77, 1.0, 1.5, 2.0])
-def test_pose_agrees_with_the_track(time_s):
+def pose_error(node: RigidNode, time_s: float, expected: np.ndarray) -> float:
+    position, quat = (of.detach() for of in node.pose_at(time_s))
+    found = np.column_stack([harmonics.rotation_matrix(quat).numpy(), position.numpy()])
+    return np.abs(found - expected[:3]).max()
+
+
+def test_pose_agrees_with_the_track_and_offsets_act_in_the_frame_of_the_box():
     """Torch and float64 numpy interpolate alike: at keys, between keys, across the -pi/pi seam of the last pair."""
-    position, quat = RigidNode.from_track(track()).pose_at(time_s)
-    expected = track().pose_at(time_s)
-    assert np.abs(position.detach().numpy() - expected[:3, 3]).max() < 1e-5
-    assert np.abs(harmonics.rotation_matrix(quat).detach().numpy() - expected[:3, :3]).max() < 1e-5
-    for outside in (-0.01, 2.01, 50.0):
-        assert RigidNode.from_track(track()).pose_at(outside) is None
-
-
-def test_offsets_act_in_the_frame_of_the_box():
     node = RigidNode.from_track(track())
+    for time_s in (0.0, 0.2, 0.5, 0.77, 1.0, 1.5, 2.0):
+        assert pose_error(node, time_s, track().pose_at(time_s)) < 1e-5, time_s
+    assert [node.pose_at(outside) for outside in (-0.01, 2.01, 50.0)] == [None] * 3
     with torch.no_grad():
         node.offsets["shift"][1] = torch.tensor([1.0, 0.2, -0.1])
         node.offsets["yaw"][1] = 0.3
-    position, quat = node.pose_at(0.5)
     expected = track().world_from_object[1] @ geometry.yaw_matrix(0.3, (1.0, 0.2, -0.1))
-    assert np.abs(position.detach().numpy() - expected[:3, 3]).max() < 1e-5
-    assert np.abs(harmonics.rotation_matrix(quat).detach().numpy() - expected[:3, :3]).max() < 1e-5
+    assert pose_error(node, 0.5, expected) < 1e-5
 
 
 def test_offsets_are_not_learnt_by_gradient_steps_and_moving_them_shows_at_once():
@@ -114,8 +103,7 @@ def test_slerp_gradient_is_finite_for_equal_rotations():
 
 def test_compose_places_objects_and_hides_absent_ones():
     scene = model()
-    g = compose(scene, 0.3)
-    table = scene.table
+    g, table = compose(scene, 0.3), scene.table
     assert torch.equal(g.means[:5], table["means"][:5])
     world = geometry.transform_points(track().pose_at(0.3), table["means"][5:9].detach().numpy())
     assert np.abs(g.means[5:9].detach().numpy() - world).max() < 1e-5
@@ -125,8 +113,8 @@ def test_compose_places_objects_and_hides_absent_ones():
     assert (g.opacity[9:] == 0).all()  # the van's track begins at 5 s
     assert torch.equal(g.scales, torch.exp(table["log_scales"]))
     assert g.node.tolist() == [0] * 5 + [1] * 4 + [2] * 3
-    assert (compose(scene, 5.3).opacity[5:9] == 0).all()
-    assert (compose(scene, 5.3).opacity[9:] > 0).all()
+    later = compose(scene, 5.3).opacity
+    assert (later[5:9] == 0).all() and (later[9:] > 0).all()
 
 
 def test_gradients_reach_every_column_of_present_rows():
@@ -191,8 +179,7 @@ def test_sky_filled_from_measured_colours():
     red = directions[:, 1] > 0
     sky.fill([(directions, np.where(red[:, None], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]).astype(np.float32))])
     left, right = sky_picture(sky, looking(math.pi / 2)), sky_picture(sky, looking(-math.pi / 2))
-    assert left[0, 5, 20] > 0.95
-    assert right[2, 5, 20] > 0.95
+    assert left[0, 5, 20] > 0.95 and right[2, 5, 20] > 0.95
 
 
 def test_semantics_of_uncovered_pixels_are_sky():
@@ -212,16 +199,14 @@ def test_state_round_trip_keeps_everything():
     with torch.no_grad():
         scene.nodes[1].offsets["shift"].fill_(0.05)
         scene.table.moment1["means"].fill_(0.5)
-    values, groups = scene.state()
-    again = SceneModel.from_state(values, groups)
+    again = SceneModel.from_state(*scene.state())
     for time_s in (0.3, 5.7):
         before, after = compose(scene, time_s), compose(again, time_s)
         for name in ("means", "quats", "scales", "opacity", "sh", "extra", "node"):
             assert torch.equal(getattr(before, name), getattr(after, name)), name
     assert torch.equal(sky_picture(scene.sky, looking(0.2)), sky_picture(again.sky, looking(0.2)))
     assert torch.equal(again.table.moment1["means"], scene.table.moment1["means"])
-    assert again.nodes[1].learn_pose
-    assert again.facts == {"method": "test"}
+    assert again.nodes[1].learn_pose and again.facts == {"method": "test"}
 
 
 @pytest.mark.parametrize(
@@ -235,9 +220,8 @@ def test_state_round_trip_keeps_everything():
 )
 def test_damaged_and_older_states_are_refused(values, groups, words):
     whole, tensors = model(degree=2).state()
-    refused(
-        words, SceneModel.from_state, {**whole, **values}, {**tensors, "gaussians": {**tensors["gaussians"], **groups}}
-    )
+    tensors["gaussians"] |= groups
+    refused(words, SceneModel.from_state, {**whole, **values}, tensors)
 
 
 # ---- the table -----------------------------------------------------------------------------------
@@ -246,12 +230,9 @@ def test_damaged_and_older_states_are_refused(values, groups, words):
 def tagged_table(count: int = 6) -> Table:
     """Every column, moment and label of row i holds the number i."""
     number = torch.arange(count, dtype=torch.float32)
-    table = Table(
-        {"a": number.clone(), "b": number[:, None].repeat(1, 3)}, {"node": torch.arange(count, dtype=torch.int32)}
-    )
-    for moments, factor in ((table.moment1, 10), (table.moment2, 100)):
-        moments["a"] = factor * number
-        moments["b"] = factor * number[:, None].repeat(1, 3)
+    times = lambda factor: {"a": factor * number, "b": factor * number[:, None].repeat(1, 3)}
+    table = Table(times(1), {"node": torch.arange(count, dtype=torch.int32)})
+    table.moment1, table.moment2 = times(10), times(100)
     return table
 
 
@@ -276,13 +257,12 @@ def test_take_moves_everything_together(rows):
 
 def test_append_gives_zero_moments_and_wants_every_column():
     table = tagged_table(2)
-    table.append(
-        {"a": torch.tensor([7.0]), "b": torch.full((1, 3), 7.0)}, {"node": torch.tensor([7], dtype=torch.int32)}
-    )
+    labels = {"node": torch.tensor([7], dtype=torch.int32)}
+    table.append({"a": torch.tensor([7.0]), "b": torch.full((1, 3), 7.0)}, labels)
     assert table["a"].tolist() == [0, 1, 7]
     assert table.moment1["a"].tolist() == [0, 10, 0]
     assert table.labels["node"].tolist() == [0, 1, 7]
-    refused("fill every column", table.append, {"a": torch.tensor([7.0])}, {"node": torch.tensor([7])})
+    refused("fill every column", table.append, {"a": torch.tensor([7.0])}, labels)
 
 
 # ---- starting values -----------------------------------------------------------------------------
@@ -367,21 +347,17 @@ def test_settling_removes_noise_and_leaves_a_clean_track_alone():
 # ---- deformable ----------------------------------------------------------------------------------
 
 
-def walker(label: str = "pedestrian") -> nodes.DeformableNode:
+def walker() -> nodes.DeformableNode:
     keys = np.stack([pose(0.1 * n, 0, 0.9, 0.0) for n in range(5)])
-    node = nodes.object_node(Track("p", label, [0.8, 0.6, 1.8], 0.1 * np.arange(5), keys), deformable=True)
+    node = nodes.object_node(Track("p", "pedestrian", [0.8, 0.6, 1.8], 0.1 * np.arange(5), keys), deformable=True)
     assert isinstance(node, nodes.DeformableNode)
     return node
 
 
 def test_only_those_with_limbs_deform():
     keys = np.stack([pose(0, 0, 0, 0), pose(1, 0, 0, 0)])
-    for label, deformable, kind in (
-        ("car", True, "rigid"),
-        ("cyclist", True, "deformable"),
-        ("cyclist", False, "rigid"),
-    ):
-        assert nodes.object_node(Track("x", label, [1, 1, 1], [0.0, 1.0], keys), deformable=deformable).kind == kind
+    for label, may, kind in (("car", True, "rigid"), ("cyclist", True, "deformable"), ("cyclist", False, "rigid")):
+        assert nodes.object_node(Track("x", label, [1, 1, 1], [0.0, 1.0], keys), deformable=may).kind == kind
 
 
 def test_an_undeformed_node_is_a_rigid_one():
@@ -398,9 +374,8 @@ def test_displacement_interpolates_the_grid_in_space_and_time():
     """Control points displaced by a linear function of their place displace every row by that function."""
     node = walker()
     up, across, along = node.offsets["deform"].shape[2:]
-    z, y, x = torch.meshgrid(
-        *(torch.linspace(-0.5, 0.5, n) * s for n, s in zip((up, across, along), (1.8, 0.6, 0.8))), indexing="ij"
-    )
+    axes = [torch.linspace(-0.5, 0.5, n) * s for n, s in zip((up, across, along), (1.8, 0.6, 0.8))]
+    z, y, x = torch.meshgrid(*axes, indexing="ij")
     with torch.no_grad():
         for key in range(5):
             node.offsets["deform"][key] = key * torch.stack([0.1 * x + 0.2 * z, 0.3 * y, 0.05 + 0.0 * z])
@@ -431,10 +406,8 @@ def test_deformation_settles_between_its_neighbours_and_poses_stay():
         node.offsets["deform"][2].fill_(1.0)
     node.after_step(1.0)
     deform = node.offsets["deform"]
-    assert 0.2 < deform[2].mean().item() < 0.3
-    assert 0.3 < deform[1].mean().item() < 0.4
-    assert not node.offsets["shift"].any()
-    assert node.learnt is node.offsets
+    assert 0.2 < deform[2].mean().item() < 0.3 < deform[1].mean().item() < 0.4
+    assert node.learnt is node.offsets and not node.offsets["shift"].any()
 
 
 def test_columns_that_no_node_changes_are_passed_on_without_a_copy():

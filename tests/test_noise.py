@@ -56,8 +56,7 @@ def test_ddim_equals_the_reference(golden, case):
 
 def test_trailing_steps():
     assert noise.trailing_steps(1000, 50)[:3] == [999, 979, 959]
-    assert noise.trailing_steps(1000, 50)[-1] == 19
-    assert noise.trailing_steps(1000, 1) == [999]
+    assert noise.trailing_steps(1000, 50)[-1] == 19 and noise.trailing_steps(1000, 1) == [999]
     assert noise.trailing_steps(1000, 1000) == list(range(999, -1, -1))
     for bad in (0, 1001):
         refused(".", noise.trailing_steps, 1000, bad, raises=UsageError)
@@ -73,8 +72,7 @@ def test_predictions_invert_the_forward_process(prediction):
         output = {"x0": x0, "v": schedule.velocity(x0, eps, index)}[prediction]
         alpha, sigma = schedule.alpha_sigma(index, x.ndim)
         back_x0, back_eps = noise.x0_and_eps(x, output, alpha, sigma, prediction)
-        assert torch.allclose(back_x0, x0, atol=2e-3)
-        assert torch.allclose(back_eps, eps, atol=2e-3)
+        assert torch.allclose(back_x0, x0, atol=2e-3) and torch.allclose(back_eps, eps, atol=2e-3)
 
 
 def test_what_cannot_be_is_refused():
@@ -104,8 +102,7 @@ def test_stratified_steps_cover_the_schedule():
     drawn = noise.stratified_steps(10, 1000, torch.Generator().manual_seed(0))
     assert sorted((drawn // 100).tolist()) == list(range(10))
     again = noise.stratified_steps(10, 1000, torch.Generator().manual_seed(0))
-    assert torch.equal(drawn, again)
-    assert not torch.equal(drawn, drawn.sort().values)
+    assert torch.equal(drawn, again) and not torch.equal(drawn, drawn.sort().values)
 
 
 def test_shared_noise_has_the_stated_correlation():

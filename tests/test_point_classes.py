@@ -46,8 +46,7 @@ def write(street: ToyStreet, root: Path) -> Scene:
 def test_scenes_and_copies_keep_classes_and_scenes_without_have_none(tmp_path: Path) -> None:
     scene = write(PARKED, tmp_path / "scene")
     expected = classed(PARKED, 0.1)[1].classes
-    assert expected is not None
-    assert (read_points(scene, scene.sweeps[1]).classes == expected).all()
+    assert expected is not None and (read_points(scene, scene.sweeps[1]).classes == expected).all()
     Annotate(scene=tmp_path / "scene", out=tmp_path / "labelled", settings=AnnotateConfig()).run()
     labelled = read_scene(tmp_path / "labelled")
     assert "semantics" in labelled.frames[0].labels
@@ -109,10 +108,8 @@ def fused_classes(classes_for: str, labels: bool) -> tuple[np.ndarray | None, np
 def test_fused_clouds_carry_the_classes_of_points_before_those_of_images() -> None:
     for labels in (False, True):
         semantics, car = fused_classes("all", labels)
-        assert car.sum() > 100
-        assert (semantics[car] == palette.ID["car"]).all()
+        assert car.sum() > 100 and (semantics[car] == palette.ID["car"]).all()
         assert palette.ID["bicycle"] not in semantics
     semantics, _ = fused_classes("unlabelled", labels=True)
-    assert semantics is not None
-    assert (semantics == palette.ID["bicycle"]).all()
+    assert semantics is not None and (semantics == palette.ID["bicycle"]).all()
     assert fused_classes("none", labels=False)[0] is None

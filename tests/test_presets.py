@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
@@ -70,25 +71,22 @@ def test_the_run_yaml_of_a_preset_gives_it_back_under_any_preset(name: PresetNam
 def test_paper_needs_a_published_model_and_lpips_before_anything_is_written(tmp_path: Path) -> None:
     out, paper = tmp_path / "out", run_preset("paper")
     refused("published-type diffusion model", Run(source="city", out=out, settings=paper).run, raises=UsageError)
-    refused("published-type diffusion model", mudg.run, "city", out=out, preset="paper", raises=UsageError)
-    weights = replace(paper.fit, virtual=replace(paper.fit.virtual, lpips_weights=str(tmp_path / "lpips.safetensors")))
-    other = replace(paper, fit=weights, synthesize=replace(paper.synthesize, model="embedded"))
-    refused("published-type models only", Run(source="city", out=out, settings=other).run, raises=UsageError)
-    without = replace(paper, fit=weights, synthesize=replace(paper.synthesize, model=str(tmp_path / "none")))
-    refused("no diffusion model here", Run(source="city", out=out, settings=without).run)
-    with pytest.raises(UsageError, match="LPIPS needs a weight file"):
-        mudg.run("city", out=out, preset="paper", synthesize={"model": "embedded"})
+    run = partial(mudg.run, "city", out=out, preset="paper")
+    refused("published-type diffusion model", run, raises=UsageError)
+    refused("LPIPS needs a weight file", run, synthesize={"model": "embedded"}, raises=UsageError)
+    fit = {"virtual": {"lpips_weights": str(tmp_path / "lpips.safetensors")}}
+    refused("published-type models only", run, fit=fit, synthesize={"model": "embedded"}, raises=UsageError)
+    refused("no diffusion model here", run, fit=fit, synthesize={"model": str(tmp_path / "none")})
     assert not out.exists()
 
 
 def test_the_same_presets_from_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[RunConfig] = []
     monkeypatch.setattr(pipeline, "run_chain", lambda config, *_args, **_named: seen.append(config) or {})
-    mudg.run("city", out=tmp_path, preset="quality", fit={"iterations": 9})
-    mudg.run("city", out=tmp_path, fast=True)
-    mudg.run("city", out=tmp_path, seed=4)
-    assert seen[0] == replace(run_preset("quality"), fit=replace(run_preset("quality").fit, iterations=9))
-    assert seen[1] == run_preset("fast")
-    assert seen[2] == with_seed(run_preset(), 4)
-    with pytest.raises(UsageError, match="another name of --preset fast"):
-        mudg.run("city", out=tmp_path, preset="paper", fast=True)
+    for given in ({"preset": "quality", "fit": {"iterations": 9}}, {"fast": True}, {"seed": 4}):
+        mudg.run("city", out=tmp_path, **given)
+    quality = run_preset("quality")
+    changed = replace(quality, fit=replace(quality.fit, iterations=9))
+    assert seen == [changed, run_preset("fast"), with_seed(run_preset(), 4)]
+    named = {"preset": "paper", "fast": True}
+    refused("another name of --preset fast", mudg.run, "city", out=tmp_path, **named, raises=UsageError)

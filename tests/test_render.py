@@ -23,16 +23,15 @@ from mudg.steps.render import RenderViews
 FRAMES = 4
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def world(street_run: Path) -> dict[str, Path]:
     return {"scene": street_run / "scene", "model": street_run / "fit" / "street_gaussians"}
 
 
 @pytest.fixture(scope="module")
-def rendered(street_run: Path, tmp_path_factory) -> Path:
-    parts = {"scene": street_run / "scene", "model": street_run / "fit" / "street_gaussians"}
+def rendered(world: dict[str, Path], tmp_path_factory) -> Path:
     settings = RenderConfig(shifts_m=(0.0, 2.0, -3.0))
-    return RenderViews(**parts, out=tmp_path_factory.mktemp("r") / "out", settings=settings).run()
+    return RenderViews(**world, out=tmp_path_factory.mktemp("r") / "out", settings=settings).run()
 
 
 def test_one_folder_and_video_per_trajectory(rendered):
@@ -47,8 +46,7 @@ def test_one_folder_and_video_per_trajectory(rendered):
 
 def test_observations_hold_all_modalities_and_lie_where_the_trajectory_says(rendered):
     seen = read_observations(rendered / "front_shift+2.0")[1]
-    assert seen.kind == "virtual"
-    assert seen.source == "street_gaussians"
+    assert (seen.kind, seen.source) == ("virtual", "street_gaussians")
     sky = seen.semantics == ID["sky"]
     assert 0.05 < sky.float().mean() < 0.6
     assert torch.equal(sky, torch.isnan(seen.depth[0]))
@@ -59,8 +57,7 @@ def test_observations_hold_all_modalities_and_lie_where_the_trajectory_says(rend
     names = ("front_recorded", "front_shift+2.0")
     recorded, left = (read_observations(rendered / name).views for name in names)
     for a, b in zip(recorded, left):
-        assert np.linalg.norm(b.center_world - a.center_world) == pytest.approx(2.0, abs=1e-9)
-        assert b.time_s == a.time_s
+        assert np.linalg.norm(b.center_world - a.center_world) == pytest.approx(2.0, abs=1e-9) and b.time_s == a.time_s
 
 
 def test_continues_after_an_interruption_and_reuses_what_is_finished(world, tmp_path, monkeypatch):
@@ -98,7 +95,6 @@ def test_any_camera_any_width(tmp_path):
     scene = write_scene(tmp_path / "scene", frames=2, cameras=("front", "left"), width=60, height=40)
     paths = render.trajectories(scene, RenderConfig(cameras=("left",), shifts_m=(0.0, -1.5), width_px=30))
     assert [path.name for path in paths] == ["left_recorded", "left_shift-1.5"]
-    assert paths[0].views[0].camera.width == 30
-    assert paths[0].views[0].camera.height == 20
+    assert (paths[0].views[0].camera.width, paths[0].views[0].camera.height) == (30, 20)
     refused("no camera named 'rear'", render.trajectories, scene, RenderConfig(cameras=("rear",)), raises=UsageError)
     refused("no shifts", render.trajectories, scene, RenderConfig(shifts_m=()), raises=UsageError)

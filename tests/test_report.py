@@ -43,8 +43,10 @@ def grey(_index: int, seen: Observation) -> Observation:
     return dataclasses.replace(seen, rgb=torch.full_like(seen.rgb, 0.5), semantics=None)
 
 
-def finished_run(out: Path) -> Path:
-    """What the chain leaves behind, made from toy views."""
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the chain leaves behind, made from toy views; tests only read, or copy it."""
+    out = tmp_path_factory.mktemp("run") / "run"
     scene = toy_views.write_scene(out / "scene")
     plain = toy_views.write_views(scene, out / "render" / "street_gaussians", "street_gaussians", (0.0, 2.0), dark(0.8))
     guided = toy_views.write_views(scene, out / "render" / "mudg_s", "mudg_s", (0.0, 2.0), dark(0.9))
@@ -62,12 +64,6 @@ def finished_run(out: Path) -> Path:
 def written(out: Path) -> Path:
     """The report of a finished run."""
     return report.write_page(out, report.film(out))
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run that tests only read, or copy."""
-    return finished_run(tmp_path_factory.mktemp("run") / "run")
 
 
 @pytest.fixture(scope="module")
@@ -120,9 +116,11 @@ def test_the_page_is_well_formed_escapes_texts_and_loads_nothing(page: str) -> N
     assert "&lt;toy&gt; &amp; co" in page
 
 
-def test_the_report_holds_commands_that_can_be_copied_and_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_report_holds_commands_that_can_be_copied_and_work(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
-    out = finished_run(Path("my run"))
+    out = Path(shutil.copytree(run, "my run"))
     nodes = [{"kind": "static", "name": "background"}, {"kind": "rigid", "name": "car 1", "label": "car"}]
     store.write_json(out / "fit" / "mudg_s" / "model.json", {"nodes": nodes})
     text = written(out).read_text(encoding="utf-8")
@@ -202,14 +200,14 @@ def test_panels_show_what_they_say(run: Path) -> None:
     folders = report._folders(run, scores)
     assert list(folders) == ["truth", "street_gaussians", "mudg_r", "mudg_s"]
     h, w = toy_views.HEIGHT, toy_views.WIDTH
-    courses = {course["shift_m"]: report._columns(course, folders) for course in scores["trajectories"]}
+    courses = {course["shift_m"]: report.Columns.of(course, folders) for course in scores["trajectories"]}
     recorded, shifted = courses[0], courses[2]
-    panels, beside = ({c: report._rows(columns, c) for c in columns.sets} for columns in (recorded, shifted))
+    panels, beside = ({c: columns.rows(c) for c in columns.sets} for columns in (recorded, shifted))
     assert recorded.has_truth
     assert panels["truth"] == ("rgb", "depth", "semantics")
     assert panels["mudg_s"] == ("rgb", "depth", "semantics", "error")
     assert "mudg_r" not in panels
-    atlas = next(report._frames(recorded, list(folders), (w, h)))
+    atlas = next(recorded.pictures(list(folders), (w, h)))
     assert np.array_equal(atlas[:h, :w], toy_views.colors(0))
     assert abs(atlas[:h, w : 2 * w].astype(int) - np.round(toy_views.colors(0) * 0.8)).max() <= 1
     assert (atlas[h : 2 * h, :w][np.isnan(toy_views.depths())] == 0).all()
@@ -219,7 +217,7 @@ def test_panels_show_what_they_say(run: Path) -> None:
     assert shifted.sets["truth"].trajectory == "front_recorded"
     assert list(shifted.indices["truth"]) == [0, 1, 2, 3]
     assert all("error" not in rows for rows in beside.values())
-    atlas = next(report._frames(shifted, list(folders), (w, h)))
+    atlas = next(shifted.pictures(list(folders), (w, h)))
     assert np.array_equal(atlas[:h, :w], toy_views.colors(0))
 
 
@@ -257,16 +255,16 @@ def test_axis_ticks_enclose_the_values(low: float, high: float) -> None:
 
 
 def test_the_budget_makes_videos_smaller_and_without_an_encoder_pictures_stand_in(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Path, page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = shutil.copytree(run, tmp_path / "run")
-    large = written(out).stat().st_size
     monkeypatch.setattr(report, "BUDGET_BYTES", 1000)
-    assert written(out).stat().st_size < large
+    size = lambda text: len("".join(re.findall(r'src="data:video/mp4;base64,([^"]+)"', text)))
+    assert 0 < size(written(out).read_text(encoding="utf-8")) < size(page)
     monkeypatch.setattr(report, "video_encoders", list)
-    page = written(out).read_text(encoding="utf-8")
-    outline(page)
-    assert "<video" not in page and page.count("data:image/jpeg") == 2
+    text = written(out).read_text(encoding="utf-8")
+    outline(text)
+    assert "<video" not in text and text.count("data:image/jpeg") == 2
 
 
 def test_an_unscored_run_and_a_value_that_a_template_lacks_are_errors(tmp_path: Path) -> None:

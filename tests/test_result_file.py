@@ -23,7 +23,7 @@ from toy_fitted import write_toy_run
 from mudg import app
 from mudg.base import store
 from mudg.base.errors import ResourceError, UsageError
-from mudg.base.run_folder import RunDir, VerbOutput, take_lock
+from mudg.base.run_folder import take_lock
 from mudg.core.table import Table
 from mudg.gaussians.storage import save_model
 from mudg.viewer import view
@@ -125,6 +125,8 @@ def test_files_of_others_and_altered_ones_are_replaced_on_demand_only(
     about = out.with_name(f"{out.name}.json")
     assert command(name, toy)(tmp_path) == 0
     whole, stamp = folder_of(tmp_path), out.stat().st_mtime_ns
+    if name in ("ply", "asset"):
+        assert store.read_json(about)["inputs"] == {"fit": store.digest(toy / "fit")}
     assert command(name, toy)(tmp_path) == 0 and out.stat().st_mtime_ns == stamp
     if (other := COMMANDS[name][2]) != "--overwrite":
         assert command(name, toy, other)(tmp_path) == 2 and "the file exists" in capsys.readouterr().err
@@ -276,28 +278,3 @@ def test_of_many_that_start_together_one_takes_the_lock(tmp_path: Path) -> None:
         codes = [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in started]
         assert sorted(codes) == [0, *[7] * 7]
         (tmp_path / "end").unlink()
-
-
-def test_a_folder_that_another_process_filled_meanwhile_is_not_taken_over(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Between a look into the folder and its lock another command can have finished there."""
-    output = VerbOutput("small", 1, ("*.txt",))
-
-    def fill(value: int) -> None:
-        run = RunDir.open(tmp_path / "out", output, {"value": value}, {})
-        store.write_text(run.path / "out.txt", str(value))
-        run.finish()
-
-    begin = RunDir._begin
-
-    def later(run: RunDir, *given: Any) -> None:
-        monkeypatch.setattr(RunDir, "_begin", begin)
-        fill(1)
-        begin(run, *given)
-
-    monkeypatch.setattr(RunDir, "_begin", later)
-    with pytest.raises((ResourceError, UsageError)):
-        fill(2)
-    assert (tmp_path / "out" / "out.txt").read_text() == "1"
-    store.verify_manifest(tmp_path / "out")

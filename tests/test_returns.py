@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import io
 import pickle
 import sqlite3
 from collections.abc import Callable
@@ -22,7 +21,6 @@ from write_pandaset import write_frame
 
 from mudg.base.geometry import invert
 from mudg.base.types import EgoPath, Scene, Sweep, SweepPoints
-from mudg.formats.importers.clouds import read_cloud
 from mudg.formats.importers.pandaset import read_frame
 from mudg.scene.check import check_points, check_scene
 from mudg.scene.clouds import at_sensor
@@ -230,12 +228,3 @@ def test_zeros_of_merged_lidars_lie_at_their_mounts(tmp_path: Path, tmp_path_fac
     pcd(mount[:3, :3].T @ (side - mount[:3, 3]))(cloud)
     scene = bad_logs.ingest("nuplan", database, tmp_path / "scene", bad_logs.ImportOptions())
     assert f"merged: {MARKS} of " in "\n".join(scene.source.notes)
-
-
-def test_bytes_of_an_archive_are_numbers(tmp_path: Path) -> None:
-    """An archive of the neutral layout whose coordinates are whole numbers has no-return rows, too."""
-    buffer = io.BytesIO()
-    np.savez(buffer, xyz=np.array([[0, 0, 0], [1, 2, 3]], np.int32))
-    (tmp_path / "cloud.npz").write_bytes(buffer.getvalue())
-    cloud = read_cloud(tmp_path / "cloud.npz")
-    assert cloud.missing == 1 and cloud.xyz.tolist() == [[1.0, 2.0, 3.0]]

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 import torch
 import toy_views
+from refusals import refused
 
 from mudg.base import geometry, store
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import UsageError
 from mudg.base.types import FusedCloud, Observation, PointCloud, View
 from mudg.core.metrics import METRICS
 from mudg.editing.settings import ScoreConfig
@@ -26,11 +27,7 @@ PLAIN = ScoreConfig(perceptual_views=0)
 
 def brighter(step: int) -> object:
     """Every channel of every pixel ``step`` grey values brighter: a mean squared error of exactly (step / 255)^2."""
-
-    def change(_index: int, seen: Observation) -> Observation:
-        return dataclasses.replace(seen, rgb=seen.rgb + step / 255)
-
-    return change
+    return lambda _, seen: dataclasses.replace(seen, rgb=seen.rgb + step / 255)
 
 
 def scored(scene: Path, out: Path, settings: ScoreConfig = PLAIN, **views: Path) -> dict:
@@ -43,9 +40,8 @@ def of_one(scene: Path, folder: Path, *change: Any) -> dict:
 
 
 def value(document: dict, method: str, trajectory: str, metric: str) -> object:
-    found = [r for r in document["results"] if r["method"] == method and r["trajectory"] == trajectory]
-    assert len(found) == 1
-    return found[0]["values"][metric]
+    (found,) = (r for r in document["results"] if (r["method"], r["trajectory"]) == (method, trajectory))
+    return found["values"][metric]
 
 
 @pytest.fixture
@@ -64,12 +60,9 @@ def test_known_colour_error_gives_known_psnr(tmp_path: Path, scene: Path) -> Non
 
 
 def test_only_held_out_frames_count_on_the_recorded_path(tmp_path: Path, scene: Path) -> None:
-    def spoil_training_frames(index: int, seen: Observation) -> Observation:
-        return seen if index % 2 else dataclasses.replace(seen, rgb=torch.zeros_like(seen.rgb))
-
-    document = of_one(scene, tmp_path, spoil_training_frames)
-    assert document["results"][0]["views"] == 2
-    assert value(document, "a", "front_recorded", "psnr") == 100.0  # equal pictures
+    spoilt = lambda index, seen: seen if index % 2 else dataclasses.replace(seen, rgb=torch.zeros_like(seen.rgb))
+    (found,) = of_one(scene, tmp_path, spoilt)["results"]  # in training frames
+    assert (found["views"], found["values"]["psnr"]) == (2, 100.0)  # equal pictures
 
 
 def test_a_recorded_log_has_no_truth_off_its_path(tmp_path: Path, scene: Path) -> None:
@@ -84,27 +77,19 @@ def test_a_recorded_log_has_no_truth_off_its_path(tmp_path: Path, scene: Path) -
 
 
 def test_what_a_method_does_not_produce_is_not_a_zero(tmp_path: Path, scene: Path) -> None:
-    def color_only(_index: int, seen: Observation) -> Observation:
-        return dataclasses.replace(seen, depth=None, semantics=None)
-
-    document = of_one(scene, tmp_path, color_only)
-    assert value(document, "a", "front_recorded", "abs_rel") == "not produced"
-    assert value(document, "a", "front_recorded", "miou") == "not produced"
-    assert value(document, "a", "front_recorded", "psnr") == 100.0
+    color_only = lambda _, seen: dataclasses.replace(seen, depth=None, semantics=None)
+    values = of_one(scene, tmp_path, color_only)["results"][0]["values"]
+    assert [values[name] for name in ("abs_rel", "miou", "psnr")] == ["not produced", "not produced", 100.0]
 
 
 def test_labels_that_the_log_lacks_are_no_truth(tmp_path: Path) -> None:
-    scene = toy_views.write_scene(tmp_path / "scene", labels=False)
-    document = of_one(scene, tmp_path)
-    assert value(document, "a", "front_recorded", "miou") == score_tables.NO_TRUTH
-    assert value(document, "a", "front_recorded", "abs_rel") == score_tables.NO_TRUTH
+    values = of_one(toy_views.write_scene(tmp_path / "scene", labels=False), tmp_path)["results"][0]["values"]
+    assert values["miou"] == values["abs_rel"] == score_tables.NO_TRUTH
 
 
 def test_missing_depth_counts_as_the_limit(tmp_path: Path, scene: Path) -> None:
-    def no_depth_anywhere(_index: int, seen: Observation) -> Observation:
-        return dataclasses.replace(seen, depth=torch.full_like(seen.depth, torch.nan))
-
-    document = of_one(scene, tmp_path, no_depth_anywhere)
+    nowhere = lambda _, seen: dataclasses.replace(seen, depth=torch.full_like(seen.depth, torch.nan))
+    document = of_one(scene, tmp_path, nowhere)
     true = toy_views.depths()[np.isfinite(toy_views.depths())].astype(np.float64)
     expected = float(np.mean((80.0 - true) / true))
     assert value(document, "a", "front_recorded", "abs_rel") == pytest.approx(expected, rel=1e-4)
@@ -142,19 +127,16 @@ def test_what_cannot_be_compared_is_refused(tmp_path: Path, scene: Path) -> None
     here = toy_views.write_views(scene, tmp_path / "a", "a", (2.0,))
     there = toy_views.write_views(scene, tmp_path / "b", "b", (3.0,))
     (there / "front_shift+3.0").rename(there / "front_shift+2.0")
-    with pytest.raises(InputError, match="different positions"):
-        Score(scene=scene, views={"a": here, "b": there}, out=tmp_path / "score", settings=PLAIN).run()
-    with pytest.raises(UsageError):
-        Score(scene=scene, views={}, out=tmp_path / "score1", settings=PLAIN).run()
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="none of the folders"):
-        Score(scene=scene, views={"a": tmp_path / "empty"}, out=tmp_path / "score2", settings=PLAIN).run()
+    refused("different positions", scored, scene, tmp_path / "score", a=here, b=there)
+    refused("no views were given", scored, scene, tmp_path / "score", raises=UsageError)
+    refused("none of the folders", scored, scene, tmp_path / "score", a=tmp_path / "empty")
 
 
 def test_two_runs_give_the_same_bytes(tmp_path: Path, scene: Path) -> None:
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0, -3.0), brighter(9))
-    first = Score(scene=scene, views={"a": views}, out=tmp_path / "one", settings=ScoreConfig()).run()
-    second = Score(scene=scene, views={"a": views}, out=tmp_path / "two", settings=ScoreConfig()).run()
+    outs = (tmp_path / "one", tmp_path / "two")
+    first, second = (Score(scene=scene, views={"a": views}, out=out, settings=ScoreConfig()).run() for out in outs)
     for name in ("metrics.json", "metrics.md", "errors/front_recorded.png"):
         assert (first / name).read_bytes() == (second / name).read_bytes()
 
@@ -209,7 +191,6 @@ def test_baseline_fills_holes_with_the_nearest_point_and_sees_nothing_behind(sce
     for column, depth in ((0, 10.0), (-1, 20.0)):
         assert torch.allclose(seen.depth[0, :, column], torch.tensor(depth))
     assert set(seen.semantics.unique().tolist()) == {0, 13}
-    view = View(toy_views.CAMERA, toy_views.EGO_FROM_CAM, 0.0)
     xyz, rgb = np.array([[-5.0, 0, 1]], np.float32), np.zeros((1, 3), np.uint8)
     behind = PointCloud(xyz, rgb, "world", np.zeros(1, np.uint8))
     seen = score.nearest_fill(FusedCloud(behind, {}), {}, view)

@@ -140,9 +140,8 @@ def lpips_twin(made, truth, state, trunk, taps, scaled=True):
     trunk = trunk.double()
     trunk.load_state_dict({name.split(".", 2)[2]: v.double() for name, v in state.items() if name.startswith("net.")})
     x = torch.stack([made, truth]).double()
-    mean, deviation = (
-        torch.tensor(row).double().view(3, 1, 1) for row in ([-0.030, -0.088, -0.188], [0.458, 0.448, 0.450])
-    )
+    mean = torch.tensor([-0.030, -0.088, -0.188]).double().view(3, 1, 1)
+    deviation = torch.tensor([0.458, 0.448, 0.450]).double().view(3, 1, 1)
     x, total, stage = ((x * 2 - 1 if scaled else x) - mean) / deviation, 0.0, 0
     with torch.no_grad():
         for number, layer in enumerate(trunk):
@@ -197,8 +196,7 @@ def test_flicker_of_several_methods_shares_what_the_truth_does():
             shared[place].add(made)
             alone[place].add(made)
     assert [one.value() for one in shared] == [one.value() for one in alone]
-    assert shared[1].value() == pytest.approx(2.5, rel=1e-4)
-    assert motion.between(pair(), pair()) is None
+    assert shared[1].value() == pytest.approx(2.5, rel=1e-4) and motion.between(pair(), pair()) is None
 
 
 def test_psnr_of_dynamic_objects_counts_their_pixels_only_and_leaves_specks_out():

@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from refusals import refused
 from test_edit import toy
 
 from mudg.base import geometry
-from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.errors import ResourceError, UsageError
 from mudg.base.types import Camera, Scene
 from mudg.scene.motion import Road
 from mudg.sim import CameraRequest, Instant, Pinhole, Session, wire
@@ -74,20 +75,19 @@ def picture_request(types: Any, objects: dict[str, np.ndarray] | None = None, **
     lens.principal_point_x, lens.principal_point_y = 32.0, 24.0
     request.camera_intrinsics.resolution_w, request.camera_intrinsics.resolution_h = 64, 48
     request.camera_intrinsics.shutter_type = 5
-    for end in ("start_pose", "end_pose"):
-        write_pose(getattr(request.sensor_pose, end), POSE)
+    write_poses(request.sensor_pose, POSE)
     for name, pose in (objects or {}).items():
-        one = request.dynamic_objects.add(track_id=name)
-        for end in ("start_pose", "end_pose"):
-            write_pose(getattr(one.pose_pair, end), pose)
+        write_poses(request.dynamic_objects.add(track_id=name).pose_pair, pose)
     for name, value in fields.items():
         setattr(request, name, value)
     return request
 
 
-def write_pose(message: Any, matrix: np.ndarray) -> None:
-    message.vec.x, message.vec.y, message.vec.z = matrix[:3, 3]
-    message.quat.w, message.quat.x, message.quat.y, message.quat.z = geometry.quaternion_from_matrix(matrix)
+def write_poses(pair: Any, matrix: np.ndarray) -> None:
+    """A pose that is that of the start and of the end."""
+    for message in (pair.start_pose, pair.end_pose):
+        message.vec.x, message.vec.y, message.vec.z = matrix[:3, 3]
+        message.quat.w, message.quat.x, message.quat.y, message.quat.z = geometry.quaternion_from_matrix(matrix)
 
 
 def decoded(content: bytes) -> np.ndarray:
@@ -123,8 +123,7 @@ def test_a_batch_answers_every_camera_and_says_which_one_failed(address: str, cl
 def test_a_sweep_comes_with_its_points_in_both_forms(address: str, session: Session, client_messages: Any) -> None:
     request = client_messages.LidarRenderRequest(scene_id=NAME, frame_start_us=500_000, frame_end_us=600_000)
     request.lidar_config.lidar_type = 1
-    for end in ("start_pose", "end_pose"):
-        write_pose(getattr(request.sensor_pose, end), geometry.yaw_matrix(0.0, (0.0, 0.0, 1.8)))
+    write_poses(request.sensor_pose, geometry.yaw_matrix(0.0, (0.0, 0.0, 1.8)))
     reply = call(address, "render_lidar", request, client_messages.LidarRenderReturn)
     points = np.frombuffer(reply.point_xyzs_buffer, "<f4").reshape(-1, 3)
     assert reply.num_points == len(points) > 1000
@@ -229,15 +228,14 @@ def test_more_requests_than_may_wait_are_refused_at_once(session: Session, monke
     monkeypatch.setattr(Session, "render", lambda self, requests: (gate.wait(30), render(self, requests))[1])
     monkeypatch.setattr("mudg.sim.server.WAITING", 2)
     with serving(session, NAME, ServeConfig()) as (address, _), ThreadPoolExecutor(8) as pool:
-        jobs = [
-            pool.submit(call, address, "render_rgb", picture_request(types), types.RGBRenderReturn) for _ in range(6)
-        ]
+        ask = (call, address, "render_rgb", picture_request(types), types.RGBRenderReturn)
+        jobs = [pool.submit(*ask) for _ in range(6)]
         until = time.monotonic() + 30
         while sum(job.done() for job in jobs) < 4 and time.monotonic() < until:
             time.sleep(0.02)
-        refused = [job.exception() for job in jobs if job.done()]
+        ended = [job.exception() for job in jobs if job.done()]
         gate.set()
-        assert [error.code().name for error in refused] == ["RESOURCE_EXHAUSTED"] * 4  # two of six may wait
+        assert [error.code().name for error in ended] == ["RESOURCE_EXHAUSTED"] * 4  # two of six may wait
 
 
 def test_a_token_is_asked_for_and_needed_beyond_loopback(session: Session) -> None:
@@ -287,8 +285,7 @@ def test_a_public_policy_drives_fifty_steps_on_pictures_of_our_server(address: s
         pilot = PlanPilot(policy)
         for _ in range(50):
             request = picture_request(client_messages)
-            for end in ("start_pose", "end_pose"):
-                write_pose(getattr(request.sensor_pose, end), drive.pose @ mount)
+            write_poses(request.sensor_pose, drive.pose @ mount)
             reply = call(address, "render_rgb", request, client_messages.RGBRenderReturn)
             rgb = np.asarray(Image.open(io.BytesIO(reply.image_bytes)))
             pictures.append(rgb)
@@ -303,5 +300,4 @@ def test_a_public_policy_drives_fifty_steps_on_pictures_of_our_server(address: s
 
 def test_a_policy_that_is_not_there_is_named() -> None:
     camera = Camera("front", 64, 48, 50.0, 50.0, 32.0, 24.0)
-    with pytest.raises(InputError, match="did not answer"):
-        Policy("127.0.0.1:9", "front", camera, np.eye(4))
+    refused("did not answer", Policy, "127.0.0.1:9", "front", camera, np.eye(4))

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from test_edit import SIZE, gaussians, toy
 
 from mudg.base import geometry
@@ -21,12 +22,13 @@ from mudg.core.table import Table
 from mudg.gaussians.model import CERTAINTY, SceneModel
 from mudg.gaussians.nodes import StaticNode
 from mudg.gaussians.rendering import render_view
-from mudg.sim.lidar import BeamTable, LidarReply, LidarRequest, read_table
+from mudg.sim.lidar import BeamTable, LidarRequest, read_table
 from mudg.sim.optics import Fisheye, FTheta, Pinhole, faces_of
-from mudg.sim.session import LAYERS, CameraRequest, Instant, Session
+from mudg.sim.session import LAYERS, CameraReply, CameraRequest, Instant, Session
 
 LOOK = geometry.invert(geometry.CAM_FROM_EGO_AXES)
 PLAIN = Pinhole(64, 48, 50.0, 50.0, 32.0, 24.0)
+HERE = Instant(0.0, np.eye(4))
 
 
 def placed(x: float = 0.0, y: float = 0.0, z: float = 1.5, yaw: float = 0.0) -> np.ndarray:
@@ -46,8 +48,10 @@ def wall() -> SceneModel:
     return SceneModel(Table(rows, labels), (StaticNode(),), None, (ID["road"], ID["sky"], ID["car"]), 0, {})
 
 
-def sweep(session: Session, request: LidarRequest) -> LidarReply:
-    return session.render([request])[0]
+def ask(session: Session, start: Instant, *layers: str, **more: Any) -> CameraReply:
+    """What a plain camera sees, unless another lens is given."""
+    chosen = {"optics": PLAIN, "layers": layers or ("rgb",), **more}
+    return session.render([CameraRequest(start=start, **chosen)])[0]
 
 
 # -- lenses ----------------------------------------------------------------------------------------
@@ -118,11 +122,8 @@ def test_faces_show_every_ray_where_a_pinhole_camera_would() -> None:
 
 def test_a_plain_camera_sees_what_render_view_draws() -> None:
     model, pose = toy(), placed()
-    reply = Session(model).render(
-        [CameraRequest(optics=PLAIN, start=Instant(0.5, pose), layers=("rgb", "depth", "classes"))]
-    )
+    layers = ask(Session(model), Instant(0.5, pose), "rgb", "depth", "classes").layers
     seen = render_view(model, View(Camera("sim", 64, 48, 50.0, 50.0, 32.0, 24.0), pose, 0.5), RasterConfig(near_m=0.2))
-    layers = reply[0].layers
     assert np.array_equal(layers["rgb"], (seen.rgb * 255).round().byte().permute(1, 2, 0).numpy())
     np.testing.assert_allclose(layers["depth"], seen.depth[0].numpy(), rtol=1e-6)
     assert np.array_equal(layers["classes"], seen.semantics.numpy())
@@ -132,11 +133,7 @@ def test_a_wide_lens_sees_the_wall_where_it_is() -> None:
     """Distance along every ray to the plane x = 10, and the colours that grow along it."""
     optics = Fisheye(80, 80, 40.0, 40.0, 40.0, 40.0, (0.01,), 1.2)
     pose = placed(z=0.5, yaw=0.2)
-    layers = (
-        Session(wall())
-        .render([CameraRequest(optics=optics, start=Instant(0.0, pose), layers=("rgb", "distance", "normals"))])[0]
-        .layers
-    )
+    layers = ask(Session(wall()), Instant(0.0, pose), "rgb", "distance", "normals", optics=optics).layers
     rays = optics.rays() @ pose[:3, :3].T
     with np.errstate(invalid="ignore"):
         exact = 10 / rays[..., 0]
@@ -157,31 +154,21 @@ def test_an_object_stands_where_the_caller_puts_it_and_goes_when_it_is_not_liste
     recorded = session.objects(0.5)["car-1"]
     aside = recorded @ geometry.yaw_matrix(0.3, (1.0, 2.0, 0.0))
 
-    def draw(objects: dict[str, np.ndarray] | None, time_s: float = 0.5) -> dict[str, np.ndarray]:
-        start = Instant(time_s, placed(), objects)
-        return dict(session.render([CameraRequest(optics=PLAIN, start=start, layers=("rgb", "instances"))])[0].layers)
+    def draw(objects: dict[str, np.ndarray] | None, shown: Session = session) -> np.ndarray:
+        return ask(shown, Instant(0.5, placed(), objects)).layers["rgb"].astype(int)
 
-    moved = model.with_object_moved("car-1", geometry.yaw_matrix(0.3, (1.0, 2.0, 0.0)))
-    other = Session(moved).render(
-        [CameraRequest(optics=PLAIN, start=Instant(0.5, placed()), layers=("rgb", "instances"))]
-    )
-    np.testing.assert_allclose(draw({"car-1": aside})["rgb"].astype(int), other[0].layers["rgb"].astype(int), atol=1)
-    gone, without = draw({})["rgb"], Session(model.without_nodes(["car-1"]))
-    assert np.array_equal(
-        gone, without.render([CameraRequest(optics=PLAIN, start=Instant(0.5, placed()))])[0].layers["rgb"]
-    )
-    assert np.array_equal(draw(None)["rgb"], draw({"car-1": recorded})["rgb"])
-    late = draw({"car-1": recorded}, 99.0)  # long after its track ended: it is where the caller says
-    assert (late["instances"] == 1).sum() > 20
-    with pytest.raises(UsageError, match=r"no such object(.|\n)*car-1(.|\n)*bus-7"):
-        draw({"bus-7": recorded})
+    moved = Session(model.with_object_moved("car-1", geometry.yaw_matrix(0.3, (1.0, 2.0, 0.0))))
+    np.testing.assert_allclose(draw({"car-1": aside}), draw(None, moved), atol=1)
+    assert np.array_equal(draw({}), draw(None, Session(model.without_nodes(["car-1"]))))
+    assert np.array_equal(draw(None), draw({"car-1": recorded}))
+    late = ask(session, Instant(99.0, placed(), {"car-1": recorded}), "instances")  # long after its track ended
+    assert (late.layers["instances"] == 1).sum() > 20
+    refused(r"no such object(.|\n)*car-1(.|\n)*bus-7", draw, {"bus-7": recorded}, raises=UsageError)
 
 
 def test_instances_are_the_pixels_that_change_when_an_object_goes() -> None:
     session = Session(toy())
-    request = CameraRequest(optics=PLAIN, start=Instant(0.5, placed()), layers=("rgb", "instances"))
-    full = session.render([request])[0]
-    empty = session.render([replace(request, start=Instant(0.5, placed(), {}))])[0]
+    full, empty = (ask(session, Instant(0.5, placed(), there), "rgb", "instances") for there in (None, {}))
     changed = np.abs(full.layers["rgb"].astype(int) - empty.layers["rgb"].astype(int)).max(-1) > 20
     own = full.layers["instances"] == 1 + full.objects.index("car-1")
     assert own.any() and (own & changed).sum() > 0.9 * own.sum() and (changed & ~own).sum() < own.sum()
@@ -189,10 +176,8 @@ def test_instances_are_the_pixels_that_change_when_an_object_goes() -> None:
 
 def test_motion_is_where_the_surface_goes() -> None:
     """The camera drives 1 m towards the wall: a point at pixel offset p from the axis moves by p (10 / 9 - 1)."""
-    request = CameraRequest(
-        optics=PLAIN, start=Instant(0.0, placed(z=0)), layers=("motion",), motion_to=Instant(0.1, placed(x=1.0, z=0))
-    )
-    flow = Session(wall()).render([request])[0].layers["motion"]
+    later = Instant(0.1, placed(x=1.0, z=0))
+    flow = ask(Session(wall()), Instant(0.0, placed(z=0)), "motion", motion_to=later).layers["motion"]
     u, v = np.meshgrid(np.arange(64) + 0.5 - 32, np.arange(48) + 0.5 - 24)
     np.testing.assert_allclose(flow[..., 0], u / 9, atol=0.05)
     np.testing.assert_allclose(flow[..., 1], v / 9, atol=0.05)
@@ -202,13 +187,8 @@ def test_motion_of_an_object_is_that_of_its_box() -> None:
     session, pose = Session(toy()), placed()
     here = session.objects(0.5)["car-1"]
     there = here @ geometry.yaw_matrix(0.0, (0.0, 1.0, 0.0))
-    request = CameraRequest(
-        optics=PLAIN,
-        start=Instant(0.5, pose, {"car-1": here}),
-        layers=("motion", "instances", "depth"),
-        motion_to=Instant(0.6, pose, {"car-1": there}),
-    )
-    layers = session.render([request])[0].layers
+    start, later = Instant(0.5, pose, {"car-1": here}), Instant(0.6, pose, {"car-1": there})
+    layers = ask(session, start, "motion", "instances", "depth", motion_to=later).layers
     own = layers["instances"] == 1
     np.testing.assert_allclose(layers["motion"][own][:, 0], -50.0 / layers["depth"][own], rtol=1e-3)  # 1 m to the left
     still = ~own & np.isfinite(layers["depth"])
@@ -218,13 +198,13 @@ def test_motion_of_an_object_is_that_of_its_box() -> None:
 @pytest.mark.parametrize("shutter", ["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"])
 def test_a_rolling_shutter_reads_every_strip_at_its_own_pose(shutter: str) -> None:
     session, start, end = Session(wall()), Instant(0.0, placed(z=0)), Instant(0.1, placed(y=2.0, z=0))
-    rolled = session.render([CameraRequest(optics=PLAIN, start=start, end=end, shutter=shutter)])[0].layers["rgb"]
+    rolled = ask(session, start, end=end, shutter=shutter).layers["rgb"]
     length = 64 if shutter.endswith(("right", "left")) else 48
     for strip in range(8):
         first, last = strip * length // 8, (strip + 1) * length // 8
         share = (first + last) / 2 / length
         share = 1 - share if shutter in ("bottom_to_top", "right_to_left") else share
-        still = session.render([CameraRequest(optics=PLAIN, start=Instant(0.1 * share, placed(y=2.0 * share, z=0)))])[0]
+        still = ask(session, Instant(0.1 * share, placed(y=2.0 * share, z=0)))
         part = np.s_[:, first:last] if length == 64 else np.s_[first:last]
         assert np.abs(rolled[part].astype(int) - still.layers["rgb"][part].astype(int)).max() <= 1
 
@@ -240,9 +220,8 @@ def test_equal_requests_get_equal_bytes() -> None:
 def test_trust_counts_what_shows_no_surface_below_the_horizon() -> None:
     """Every pixel towards the wall is determined; away from it the lower half shows nothing, the upper half is sky."""
     session = Session(wall())
-    towards = CameraRequest(optics=PLAIN, start=Instant(0.0, placed(z=0)))
-    assert session.render([towards])[0].trust.determined == 1.0
-    back = session.render([CameraRequest(optics=PLAIN, start=Instant(0.0, placed(z=0, yaw=math.pi)))])[0].trust
+    assert ask(session, Instant(0.0, placed(z=0))).trust.determined == 1.0
+    back = ask(session, Instant(0.0, placed(z=0, yaw=math.pi))).trust
     assert back.determined == 0.0 and math.isnan(back.distance_m)
 
 
@@ -253,17 +232,9 @@ def test_trust_counts_what_shows_no_surface_below_the_horizon() -> None:
         (lambda: Instant(0.0, np.full((4, 4), math.nan)), InputError, "not rigid"),
         (lambda: Instant(0.0, geometry.yaw_matrix(0, (1e9, 0, 0))), InputError, "farther than"),
         (lambda: Instant(0.0, np.eye(4), {"a": np.eye(3)}), InputError, "not rigid"),
-        (
-            lambda: CameraRequest(optics=PLAIN, start=Instant(0, np.eye(4)), layers=("heat",)),
-            UsageError,
-            "no such layer",
-        ),
-        (
-            lambda: CameraRequest(optics=PLAIN, start=Instant(0, np.eye(4)), layers=("motion",)),
-            UsageError,
-            "later moment",
-        ),
-        (lambda: CameraRequest(optics=PLAIN, start=Instant(0, np.eye(4)), shutter="up"), UsageError, "no such shutter"),
+        (lambda: CameraRequest(optics=PLAIN, start=HERE, layers=("heat",)), UsageError, "no such layer"),
+        (lambda: CameraRequest(optics=PLAIN, start=HERE, layers=("motion",)), UsageError, "later moment"),
+        (lambda: CameraRequest(optics=PLAIN, start=HERE, shutter="up"), UsageError, "no such shutter"),
         (lambda: Pinhole(10**6, 10**6, 1, 1, 1, 1), UsageError, "image size"),
         (lambda: Pinhole(8, 8, 0.0, 1, 1, 1), UsageError, "positive"),
         (lambda: Pinhole(8, 8, 1.0, 1, 1, 1, (math.inf,)), UsageError, "not finite"),
@@ -273,9 +244,8 @@ def test_trust_counts_what_shows_no_surface_below_the_horizon() -> None:
         (lambda: BeamTable.spinning([0.0], 1.0, (5.0, 5.0)), UsageError, "nearest range"),
     ],
 )
-def test_what_is_no_request_is_refused_in_words(make: object, kind: type[MudgError], words: str) -> None:
-    with pytest.raises(kind, match=words):
-        make()  # type: ignore[operator]
+def test_what_is_no_request_is_refused_in_words(make: Any, kind: type[MudgError], words: str) -> None:
+    refused(words, make, raises=kind)
 
 
 # -- LiDAR -----------------------------------------------------------------------------------------
@@ -286,9 +256,8 @@ def test_beams_measure_the_wall_while_the_vehicle_drives() -> None:
     the end of the sweep, lie on the wall."""
     beams = BeamTable.spinning(np.linspace(-20, 20, 16), 1.0, (0.5, 30.0))
     pose = lambda x: geometry.yaw_matrix(0.0, (x, 0.0, 0.0))
-    reply = sweep(
-        Session(wall()), LidarRequest(beams=beams, start=Instant(0.0, pose(0.0)), end=Instant(0.1, pose(1.0)))
-    )
+    request = LidarRequest(beams=beams, start=Instant(0.0, pose(0.0)), end=Instant(0.1, pose(1.0)))
+    (reply,) = Session(wall()).render([request])
     away = beams.directions[reply.beam]
     exact = (10 - beams.share[reply.beam]) / away[:, 0]
     central = (np.abs(exact[:, None] * away[:, 1:]) < 13).all(1)
@@ -306,7 +275,7 @@ def test_a_car_that_the_caller_places_is_met_by_beams() -> None:
     beams = BeamTable.spinning(np.linspace(-15, 5, 24), 0.5, (0.5, 60.0))
     at = geometry.yaw_matrix(0.0, (0.0, 0.0, 1.5))
     car = geometry.yaw_matrix(0.0, (12.0, 3.0, 0.75))
-    reply = sweep(Session(toy()), LidarRequest(beams=beams, start=Instant(0.5, at, {"car-1": car})))
+    (reply,) = Session(toy()).render([LidarRequest(beams=beams, start=Instant(0.5, at, {"car-1": car}))])
     own = reply.instances == 1 + reply.objects.index("car-1")
     inside = geometry.transform_points(geometry.invert(car) @ at, reply.xyz[own].astype(float))
     assert own.sum() > 10 and (np.median(np.abs(inside), 0) <= np.array(SIZE) / 2).all()
@@ -325,5 +294,4 @@ def test_beam_tables_that_no_sensor_has_are_refused_before_they_are_made(
 ) -> None:
     table = {"elevations_deg": [-10, 0], "azimuth_step_deg": 1, "range_m": [1, 50], "field_deg": 90, **changed}
     (tmp_path / "beams.json").write_text(json.dumps(table))
-    with pytest.raises(MudgError, match=words):
-        read_table(tmp_path / "beams.json")
+    refused(words, read_table, tmp_path / "beams.json", raises=MudgError)

@@ -17,7 +17,7 @@ from toy_scene import ToyStreet
 
 from mudg.base import geometry
 from mudg.formats.splats import gltf, usd
-from mudg.formats.splats.cloud import SplatCloud, SplatScene
+from mudg.formats.splats.cloud import SplatScene
 from mudg.formats.splats.formats import file_from_world
 
 PREFIX = "KHR_gaussian_splatting:"
@@ -108,23 +108,16 @@ def test_a_glb_keeps_the_rules(degree: int, time_s: float | None) -> None:
 @pytest.mark.parametrize("time_s", [-0.5, -0.1, 0.25, 0.4, 0.9, 1.0])
 def test_a_glb_moves_as_the_scene_does(time_s: float) -> None:
     scene = replace(toy_splats.scene(), file_from_world=file_from_world("glb", "viewer"))
-    stiff = replace(
-        scene,
-        nodes=(*scene.nodes[:2], replace(scene.nodes[2], cloud=gltf.middle_shape(scene.nodes[2]), displacement=None)),
-    )
+    *others, person = scene.nodes
+    person = replace(person, cloud=gltf.middle_shape(person), displacement=None)
+    stiff = replace(scene, nodes=(*others, person))
     document, data = slow.open_glb(gltf.to_bytes(scene))
-    played = {
-        (c["target"]["node"], c["target"]["path"]): document["animations"][0]["samplers"][c["sampler"]]
-        for c in document["animations"][0]["channels"]
-    }
+    (animation,) = document["animations"]
+    played = {tuple(c["target"].values()): animation["samplers"][c["sampler"]] for c in animation["channels"]}
     shown = []
     for index, node in enumerate(document["nodes"]):
         cloud = slow.read_glb_mesh(document, data, node["mesh"])
-        now: dict[str, np.ndarray] = {
-            "translation": np.zeros(3),
-            "rotation": np.array([0, 0, 0, 1.0]),
-            "scale": np.ones(3),
-        }
+        now = {"translation": np.zeros(3), "rotation": np.array([0, 0, 0, 1.0]), "scale": np.ones(3)}
         for path in now:
             if (index, path) in played:
                 sampler = played[index, path]
@@ -190,9 +183,8 @@ def test_usd_moves_and_bends_as_the_scene_does(time_s: float) -> None:
 def test_a_package_begins_with_its_stage_and_shows_the_sky_where_it_is() -> None:
     scene = toy_splats.scene()
     archive = zipfile.ZipFile(io.BytesIO(usd.to_package(scene)))
-    assert archive.namelist() == ["scene.usda", "sky.png"] and all(
-        i.compress_type == zipfile.ZIP_STORED for i in archive.infolist()
-    )
+    assert archive.namelist() == ["scene.usda", "sky.png"]
+    assert {info.compress_type for info in archive.infolist()} == {zipfile.ZIP_STORED}
     dome = slow.parse_usda(archive.read("scene.usda").decode())["World"]["Sky"]
     picture = np.asarray(Image.open(io.BytesIO(archive.read("sky.png"))))
     turn = geometry.matrix_from_quaternion(dome["xformOp:orient"])
@@ -202,11 +194,8 @@ def test_a_package_begins_with_its_stage_and_shows_the_sky_where_it_is() -> None
             latitude, longitude = np.pi / 2 - (row + 0.5) / rows * np.pi, np.pi - (column + 0.5) / columns * 2 * np.pi
             d = np.array([np.sin(longitude) * np.cos(latitude), np.sin(latitude), np.cos(longitude) * np.cos(latitude)])
             x, y, z = turn @ d
-            ours = (
-                int((np.arctan2(y, x) / (2 * np.pi) + 0.5) * columns) % columns,
-                int((0.5 - np.arcsin(z) / np.pi) * rows),
-            )
-            assert (picture[row, column] == scene.sky[ours[1], ours[0]]).all()
+            across = int((np.arctan2(y, x) / (2 * np.pi) + 0.5) * columns) % columns
+            assert (picture[row, column] == scene.sky[int((0.5 - np.arcsin(z) / np.pi) * rows), across]).all()
 
 
 def test_cameras_of_a_stage_see_what_ours_see(tmp_path: Path) -> None:
@@ -225,26 +214,22 @@ def test_cameras_of_a_stage_see_what_ours_see(tmp_path: Path) -> None:
         wide, high = prim["horizontalAperture"], prim["verticalAperture"]
         across = (x / -z * prim["focalLength"] - prim["horizontalApertureOffset"]) / wide + 0.5
         upwards = (y / -z * prim["focalLength"] - prim["verticalApertureOffset"]) / high + 0.5
-        assert np.allclose(
-            [across * 24, (1 - upwards) * 12], geometry.project(frame.view, point[None])[0][0], atol=1e-4
-        )
+        found = [across * 24, (1 - upwards) * 12]
+        assert np.allclose(found, geometry.project(frame.view, point[None])[0][0], atol=1e-4)
 
 
 def test_names_and_texts_cannot_break_out_of_a_stage() -> None:
     scene = toy_splats.scene()
     evil = replace(scene.nodes[1], name='x"\n}\ndef "y', label='a\\"b')
-    stage = slow.parse_usda(
-        usd.to_text(replace(scene, nodes=(scene.nodes[0], evil), facts={"method": '"\n)'})).decode()
-    )
+    written = usd.to_text(replace(scene, nodes=(scene.nodes[0], evil), facts={"method": '"\n)'}))
+    stage = slow.parse_usda(written.decode())
     assert list(stage["World"]) == ["type", "background", "x____def__y"]
     assert stage["World"]["x____def__y"]["mudg:label"] == 'a\\"b'
 
 
 def test_empty_nodes_do_no_harm() -> None:
     scene = toy_splats.scene()
-    nothing = SplatCloud(
-        *(getattr(scene.nodes[0].cloud, name)[:0] for name in ("means", "quats", "log_scales", "logits", "sh"))
-    )
+    nothing = scene.nodes[0].cloud.take(np.zeros(0, int))
     bare = replace(scene, nodes=(replace(scene.nodes[0], cloud=nothing), *scene.nodes[1:]))
     check_gltf(gltf.to_bytes(bare))
     assert slow.parse_usda(usd.to_text(bare).decode())["World"]["background"]["splats"]["positions"] == []

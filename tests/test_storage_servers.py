@@ -23,6 +23,7 @@ from pathlib import Path
 
 import pytest
 from refusals import refused
+from test_location import content, save_read_list_and_remove
 
 from mudg import app
 from mudg.base import location, store
@@ -65,20 +66,8 @@ def folder_of(tmp_path: Path, *sizes: int) -> Path:
     return folder
 
 
-def content(folder: Path) -> dict[str, str]:
-    files = [path for path in folder.rglob("*") if path.is_file()]
-    return {path.relative_to(folder).as_posix(): store.sha256_file(path) for path in files}
-
-
 def test_single_objects(root: Location) -> None:
-    assert root.names() == [] and not root.exists()
-    for name, content in (("b/one", b"1"), ("b/one", b"12"), ("a", b"")):
-        (root / name).save(content)
-    assert (root / "b/one").load() == b"12" and (root / "a").load() == b""
-    assert root.names() == ["a", "b"] and root.tree() == {"a": 0, "b/one": 2}
-    (root / "a").remove()
-    (root / "a").remove()
-    refused("nothing is at", (root / "a").load)
+    save_read_list_and_remove(root)
 
 
 def test_folders_with_large_objects_and_odd_names(root: Location, tmp_path: Path) -> None:

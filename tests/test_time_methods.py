@@ -52,11 +52,7 @@ OWN = {
 }
 BOX_FREE = [name for name in RECIPES if not METHODS[name].boxes]
 MOVING = [name for name in RECIPES if name != "gs3d"]
-FITTED_ALONE = [
-    name
-    for name, row in METHODS.items()
-    if row.made_by == "render" and not {"virtual", "repaired"} & {*row.supervision}
-]
+FITTED_ALONE = [name for name, row in METHODS.items() if row.made_by == "render" and not row.learns_virtual]
 """Methods that are fitted to recorded views and nothing else."""
 FITTED = {"gaussians", "nodes", "model", "field"}
 
@@ -78,6 +74,12 @@ def black_points(xyz: np.ndarray) -> dict[str, torch.Tensor]:
     return StartPoints(xyz, black, black[:, 0], np.full(len(xyz), 0.1, np.float32)).columns((), 0)
 
 
+def scene_of(columns: dict[str, torch.Tensor], *nodes: StaticNode | RigidNode, owner: int = 0) -> SceneModel:
+    """A scene whose Gaussians all belong to one node."""
+    labels = {"node": torch.full((len(columns["means"]),), owner, dtype=torch.int32)}
+    return SceneModel(Table(columns, labels), nodes, None, (), 0)
+
+
 # ---- vibration -----------------------------------------------------------------------------------
 
 
@@ -92,14 +94,13 @@ def vibrating(count: int = 5) -> NodeRows:
 
 
 def test_vibration_agrees_with_a_plain_loop_and_its_slopes_with_differences():
-    rows, node = vibrating(), VibrationNode("background", 1.0, 0.1, 0.013)
+    rows, node = vibrating(), VibrationNode("background", 1.0, 0.1).with_values(early=0.013)
     seen = node.at_time(rows, 1.2)
     for i in range(len(rows.means)):
         beta, since = math.exp(rows.own["log_beta"][i]), 0.04 - 0.013 - float(rows.own["tau"][i])
         factor = math.exp(-(since**2) / (2 * beta**2))
-        assert float(seen.opacity[i]) == pytest.approx(
-            float(rows.opacity[i]) * (factor if factor > 0.05 else 0.0), rel=1e-12
-        )
+        shown = float(rows.opacity[i]) * (factor if factor > 0.05 else 0.0)
+        assert float(seen.opacity[i]) == pytest.approx(shown, rel=1e-12)
         for axis in range(3):
             v = float(rows.own["velocity"][i, axis])
             moved = v * math.sin(2 * math.pi * since / 0.2) * 0.2 / (2 * math.pi) + v * math.exp(-beta / 0.4) * 0.013
@@ -120,9 +121,7 @@ def test_what_changes_in_time_is_split_in_time(step, late, rows):
     the run three."""
     columns = black_points(np.zeros((4, 3), np.float32))
     columns |= starting_columns(4, torch.zeros(4), 0.2) | {"log_beta": torch.tensor([0.1, 0.1, 0.1, 0.005]).log()}
-    model = SceneModel(
-        Table(columns, {"node": torch.zeros(4, dtype=torch.int32)}), (VibrationNode("b", 0.0, 0.1),), None, (), 0
-    )
+    model = scene_of(columns, VibrationNode("b", 0.0, 0.1))
     stats = densify.DensifyStats(torch.zeros(4), torch.ones(4), torch.tensor([0.0, 1.0, 0.0, 0.0]))
     report = densify.densify(model, stats, step, densify.DensifySettings(1, 99, 10, growth=9.0, late=late), 0)
     assert (report["split"], report["cloned"], report["rows"]) == (1, 0, rows)
@@ -137,17 +136,14 @@ def test_the_losses_of_pvg_by_hand():
     inverse = losses.inverse_depth(depth, alpha, 1000.0)
     assert inverse.flatten().tolist() == pytest.approx([0.05 + 0.0005, 0.05])
     assert losses.sparse_inverse_depth(inverse, torch.tensor([1]), torch.tensor([10.0])).item() == pytest.approx(0.05)
-    rgb = torch.tensor([[[0.0, 1.0]]] * 3)
-    assert losses.edge_aware(torch.tensor([[[1.0, 3.0], [1.0, 3.0]]]), rgb.expand(3, 2, 2)).item() == pytest.approx(
-        2 * math.exp(-1)
-    )
+    rgb, values = torch.tensor([[[0.0, 1.0]]] * 3).expand(3, 2, 2), torch.tensor([[[1.0, 3.0], [1.0, 3.0]]])
+    assert losses.edge_aware(values, rgb).item() == pytest.approx(2 * math.exp(-1))
     assert losses.opacity_entropy(alpha).item() == pytest.approx(-0.25 * math.log(0.5))
     assert losses.empty_sky(alpha, torch.tensor([[[True, False]]])).item() == pytest.approx(-0.5 * math.log(0.5))
 
 
 def test_half_of_the_steps_draw_the_state_of_another_time():
-    table = Table({"means": torch.zeros(1, 3)}, {"node": torch.zeros(1, dtype=torch.int32)})
-    model = SceneModel(table, (VibrationNode("b", 0, 0.1),), None, (), 0)
+    model = scene_of({"means": torch.zeros(1, 3)}, VibrationNode("b", 0, 0.1))
     drawn = (pvg.VibrationRecipe().drawn_model(model, None, step, small_fit("pvg")) for step in range(400))
     moved = [one.nodes[0].early for one in drawn if one.nodes[0].early]
     assert 160 < len(moved) < 240
@@ -160,9 +156,8 @@ def test_half_of_the_steps_draw_the_state_of_another_time():
 
 
 def person() -> tuple[DeformationField, DeformedNode]:
-    track = Track(
-        "walker", "pedestrian", [0.8, 0.6, 1.8], [0.0, 1.0], np.stack([geometry.yaw_matrix(0.3, (0, 0, 0))] * 2)
-    )
+    poses = np.stack([geometry.yaw_matrix(0.3, (0, 0, 0))] * 2)
+    track = Track("walker", "pedestrian", [0.8, 0.6, 1.8], [0.0, 1.0], poses)
     return DeformationField.fresh((0.0, 2.0), 2, 8, 3, 5), DeformedNode.of_rigid(RigidNode.from_track(track), 2)
 
 
@@ -183,9 +178,7 @@ def test_a_deformed_object_stays_one_through_everything_a_scene_does():
     """At first it is rigid; then it moves as the field says, otherwise for other times and objects, saved and alone."""
     field, node = person()
     columns = black_points(np.random.default_rng(1).random((4, 3), np.float32) - 0.5)
-    scene = SceneModel(
-        Table(columns, {"node": torch.ones(4, dtype=torch.int32)}), (StaticNode(), node, field), None, (), 0
-    )
+    scene = scene_of(columns, StaticNode(), node, field, owner=1)
     rigid = RigidNode.from_track(Track("w", "car", node.size_m, node.times_s, node.world_from_object))
     rows = NodeRows(columns["means"], columns["quats"], columns["logits"], columns["sh_dc"])
     assert torch.equal(compose(scene, 0.5).means, rigid.at_time(rows, 0.5).means)
@@ -199,8 +192,7 @@ def test_a_deformed_object_stays_one_through_everything_a_scene_does():
     assert not torch.equal(moved, compose(scene, 0.7).means)
     assert torch.equal(compose(SceneModel.from_state(*scene.state()), 0.5).means, moved)
     assert torch.equal(compose(scene.with_object_moved("walker", np.eye(4)), 0.5).means, moved)
-    assert scene.node_names() == ("walker",)
-    assert scene.without_nodes(["walker"]).node_names() == ()
+    assert [one.node_names() for one in (scene, scene.without_nodes(["walker"]))] == [("walker",), ()]
     resting = scene.with_nodes((scene.nodes[0], scene.nodes[1].with_values(rests=True), field))
     assert torch.equal(compose(resting, 0.5).means, rigid.at_time(rows, 0.5).means)
 
@@ -212,9 +204,8 @@ def field_in_float64() -> HexPlaneNode:
     """A small field with numbers everywhere."""
     node = HexPlaneNode.fresh([-2, -3, 0, 1], [2, 3, 1, 2], PlaneSizes(2, 2, 3, 4, 5), 1)
     g = torch.Generator().manual_seed(4)
-    node.learnt = Table(
-        {name: torch.rand(value.shape, generator=g).double() - 0.4 for name, value in node.learnt.columns.items()}
-    )
+    drawn = {name: torch.rand(value.shape, generator=g).double() for name, value in node.learnt.columns.items()}
+    node.learnt = Table({name: value - 0.4 for name, value in drawn.items()})
     return node
 
 
@@ -241,11 +232,10 @@ def test_the_field_moves_and_recolors_what_lies_in_its_box():
     means = torch.cat([torch.rand(4, 3, generator=g).double(), torch.tensor([[9.0, 0, 0]]).double()])
     rows = NodeRows(means, torch.ones(5, 4).double(), torch.ones(5).double(), torch.zeros(5, 1, 3).double())
     now, later = node.at_time(rows, 1.2), node.at_time(rows, 1.9)
-    resting = node.with_values(rests=True).at_time(rows, 1.2)
     assert bool((now.means[:4] != means[:4]).all()) and torch.equal(now.means[4], means[4])
     assert bool((now.sh_dc[:4] != 0).all()) and bool((now.sh_dc[4] == 0).all())
     assert not torch.equal(now.means, later.means)
-    assert resting is rows
+    assert node.with_values(rests=True).at_time(rows, 1.2) is rows
     fresh = HexPlaneNode.fresh([-2, -3, 0, 1], [2, 3, 1, 2], PlaneSizes(2, 2, 3, 4, 5), 1)
     single = NodeRows(means.float(), torch.ones(5, 4), torch.ones(5), torch.zeros(5, 1, 3))
     assert torch.equal(fresh.at_time(single, 1.2).means, means.float())
@@ -312,13 +302,8 @@ def test_an_object_on_curves_starts_where_its_box_is_and_moves_with_its_columns(
     keys = np.stack([geometry.yaw_matrix(0.4 * t, (5 * t, t**2, 0.5)) for t in times])
     track = Track("car", "car", [4.0, 2.0, 1.5], times, keys)
     node, rigid, g = BezierNode.from_track(track), RigidNode.from_track(track), torch.Generator().manual_seed(2)
-    rows = NodeRows(
-        torch.randn(5, 3, generator=g),
-        torch.randn(5, 4, generator=g),
-        torch.ones(5),
-        torch.zeros(5, 1, 3),
-        {"curve": torch.zeros(5, 4, 3)},
-    )
+    means, quats = torch.randn(5, 3, generator=g), torch.randn(5, 4, generator=g)
+    rows = NodeRows(means, quats, torch.ones(5), torch.zeros(5, 1, 3), {"curve": torch.zeros(5, 4, 3)})
     for time_s in (0.0, 0.4, 1.0):
         ours, boxes = node.at_time(rows, time_s), rigid.at_time(rows, time_s)
         assert (ours.means - boxes.means).abs().max() < 2e-3
@@ -370,8 +355,7 @@ def test_a_fit_learns_reaches_every_column_and_is_read_back(world, tmp_path, mon
     seen = fit.render_view(model, view, RasterConfig())
     exact = truth(view)
     assert metrics.psnr(seen.rgb, exact.rgb, (exact.semantics != ID["sky"])[None]) > 17.0
-    values, groups = model.state()
-    again = SceneModel.from_state(values, groups)
+    again = SceneModel.from_state(*model.state())
     assert torch.equal(fit.render_view(again, view, RasterConfig()).rgb, seen.rgb)
     assert not torch.equal(compose(again, 0.0).means, compose(again, 0.45).means)
 
@@ -390,13 +374,11 @@ def tracked_or_not(tmp_path_factory) -> dict[str, Path]:
     """Scenes of two cameras, one darker, that differ in their tracks alone, and three other clouds made of them."""
     root = tmp_path_factory.mktemp("tracks")
     for name, changes in {"tracked": {}, "untracked": {"tracks": False}, "garbled": {"garbled": True}}.items():
-        write_scene(
-            root / name, frames=4, cameras=("front", "left"), width=SIZE[0], height=SIZE[1], dark=("left",), **changes
-        )
+        cameras = {"cameras": ("front", "left"), "dark": ("left",), "width": SIZE[0], "height": SIZE[1]}
+        write_scene(root / name, frames=4, **cameras, **changes)
         Fuse(scene=root / name, out=root / f"{name}-fuse", settings=FuseConfig(min_object_points=5, voxel_m=0.05)).run()
     clouds = [read_fused(root / f"{name}-fuse") for name in ("tracked", "untracked", "garbled")]
-    assert len({len(cloud.static) for cloud in clouds}) == 3
-    assert [len(cloud.objects) for cloud in clouds] == [1, 0, 1]
+    assert len({len(cloud.static) for cloud in clouds}) == 3 and [len(cloud.objects) for cloud in clouds] == [1, 0, 1]
     assert clouds[1].colors.to_common["left"].gain != clouds[2].colors.to_common["left"].gain
     return {path.name: path for path in root.iterdir()}
 
@@ -418,9 +400,8 @@ def test_boxes_change_a_method_if_and_only_if_it_knows_them(tracked_or_not, tmp_
     """Without boxes: no byte of the start and of the fit depends on the tracks of the scene, nor on the clouds that
     they cleaned."""
     folders = [fitted_to(tracked_or_not, name, tmp_path, method, 3) for name in ("tracked", "untracked", "garbled")]
-    tracked, untracked, garbled = (
-        {f.name: f.read_bytes() for f in folder.glob("*.*") if f.stem in FITTED} for folder in folders
-    )
+    of = lambda folder: {f.name: f.read_bytes() for f in folder.glob("*.*") if f.stem in FITTED}
+    tracked, untracked, garbled = map(of, folders)
     assert len(tracked) >= 2
     assert (tracked == untracked == garbled) is not METHODS[method].boxes
     assert (tracked != untracked != garbled) is METHODS[method].boxes
@@ -443,9 +424,8 @@ def test_a_cloud_without_boxes_has_the_settings_of_the_one_with_them(tracked_or_
     settings = FuseConfig(voxel_m=0.8, match_colors=False)
     Fuse(scene=tracked_or_not["tracked"], out=tmp_path / "coarse", settings=settings).run()
     scene = read_scene(tracked_or_not["tracked"])
-    fine, coarse = (
-        fuse.fused_without_boxes(scene, folder) for folder in (tracked_or_not["tracked-fuse"], tmp_path / "coarse")
-    )
+    folders = (tracked_or_not["tracked-fuse"], tmp_path / "coarse")
+    fine, coarse = (fuse.fused_without_boxes(scene, folder) for folder in folders)
     assert len(coarse.static) < len(fine.static) / 2
     assert (fine.colors.to_common.keys(), coarse.colors.to_common.keys()) == ({"left"}, set())
 

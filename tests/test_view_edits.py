@@ -19,7 +19,7 @@ from browser import Browser
 from PIL import Image
 from refusals import refused
 from toy_fitted import STREET, write_toy_run
-from view_server import seen_from, serving
+from view_server import colors_in, question, seen_from, serving, whole_page
 
 from mudg.base import seeds
 from mudg.base.errors import UsageError
@@ -35,9 +35,9 @@ from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import raster_of, render_view
 from mudg.scene.read import read_scene
 from mudg.viewer import view
-from mudg.viewer.page import UNKNOWN, PageFacts, with_ground
+from mudg.viewer.page import UNKNOWN, PageFacts
 from mudg.viewer.settings import PageConfig
-from mudg.viewer.view import MARK, EditDesk, EditRequest, FrameRequest, FrameSource, desk_for, place_for
+from mudg.viewer.view import MARK, EditDesk, EditRequest, FrameSource, desk_for, place_for
 
 Toy = tuple[Path, Path, SceneModel]
 SCRIPT = "- move: {id: car-1, along_m: 1.5, left_m: 1, yaw_deg: 20}\n"
@@ -91,15 +91,9 @@ def test_a_wrong_script_is_told_with_its_line(toy: Toy, tmp_path: Path, script: 
 def test_an_exact_frame_is_the_render_of_the_edited_fit(toy: Toy, tmp_path: Path) -> None:
     desk, model = desk_of(toy, tmp_path / "edits.yaml"), toy[2]
     wanted = STREET.view(0.4, 80, 48)
-    asked = FrameRequest(
-        scene=0, layer="color", time_s=0.4, hidden=[], edits=SCRIPT, camera="front", **seen_from(wanted)
-    )
     scene = read_scene(toy[0] / "scene")
     source = FrameSource(desk.edited, scene, 1600, torch.device("cpu"))
-
-    def drawn(script: str) -> np.ndarray:
-        return np.asarray(Image.open(io.BytesIO(source.png(asked.model_copy(update={"edits": script}))[0]))) / 255.0
-
+    drawn = lambda script: colors_in(source.png(question(wanted, edits=script))[0])
     seen, edited = drawn(SCRIPT), carry_out(parse_edits(SCRIPT, "edits.yaml"), model, scene).model(model)
     true = render_view(edited, wanted, raster_of(model)).rgb.permute(1, 2, 0).numpy()
     plain = render_view(model, wanted, raster_of(model)).rgb.permute(1, 2, 0).numpy()
@@ -107,10 +101,8 @@ def test_an_exact_frame_is_the_render_of_the_edited_fit(toy: Toy, tmp_path: Path
     assert np.abs(seen - plain).max() > 0.1
     script = SCRIPT + "- weather: {rain: {mm_h: 30}, wet: 0.8}\n- light: {time: dusk}\n"
     conditions = conditions_of(parse_edits(script, "edits.yaml").canonical())
-    assert conditions is not None
-    raster = raster_of(model)
-    how = weather_of(lambda one: render_view(edited, one, raster), conditions, scene)
-    wet = in_weather(lambda one: render_view(edited, one, raster), how)(wanted).rgb.permute(1, 2, 0).numpy()
+    dry = lambda one: render_view(edited, one, raster_of(model))
+    wet = in_weather(dry, weather_of(dry, conditions, scene))(wanted).rgb.permute(1, 2, 0).numpy()
     rainy = drawn(script)
     assert np.abs(rainy - wet).max() < 0.003 and np.abs(rainy - seen).max() > 0.1
     assert np.abs(drawn(SCRIPT) - seen).max() == 0
@@ -125,7 +117,8 @@ def test_a_street_is_closed_once_and_only_for_frames(toy: Toy, tmp_path: Path, m
 
     monkeypatch.setattr(view, "street_left", counted)
     scene = read_scene(toy[0] / "scene")
-    desk = desk_of(toy, tmp_path / "edits.yaml")
+    scene = replace(scene, frames=scene.frames[1:3])
+    desk = desk_for([toy[2]], scene, None, toy[1], out=tmp_path / "edits.yaml")
     scripts = [f"- move: {{id: car-1, left_m: {x}, close_street: true}}\n" for x in (1, 2)]
     notes = [said(desk, script)["notes"] for script in scripts]
     assert all(any("close the street" in note for note in of) for of in notes) and True not in calls
@@ -188,12 +181,12 @@ def test_a_page_begins_with_a_script(toy: Toy, tmp_path: Path) -> None:
 
 def test_heights_of_the_ground_are_kept_within_a_millimetre() -> None:
     heights = np.array([[0.0, 0.5], [np.nan, 12.0]])
-    page = with_ground(PageFacts({}, {}, b""), HeightMap(np.zeros(2), 0.5, heights))
+    page = PageFacts({}, {}, b"").with_ground(HeightMap(np.zeros(2), 0.5, heights))
     facts, levels = page.facts["ground"], page.sections["ground"]
     assert levels[1, 0] == UNKNOWN
     known = np.isfinite(heights)
     assert np.abs(facts["low"] + facts["step"] * levels[known] - heights[known]).max() < 1e-3
-    assert with_ground(PageFacts({}, {}, b""), None).facts["ground"] is None
+    assert page.with_ground(None).facts["ground"] is None
 
 
 # in a browser -------------------------------------------------------------------------------------
@@ -211,10 +204,7 @@ def hilly() -> HeightMap:
 def opened(toy: Toy, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     root = tmp_path_factory.mktemp("page")
     made = view.page_of(PageConfig(images=0), view.Shown(read_scene(toy[0] / "scene"), (("fit", toy[2]),)))
-    made = replace(made, log=with_ground(made.log, hilly()))
-    facts: dict = {}
-    files = list(made.files(facts))
-    (root / "page.html").write_bytes(made.one_file(files, facts))
+    (root / "page.html").write_bytes(whole_page(replace(made, log=made.log.with_ground(hilly()))))
     with Browser(tmp_path_factory.mktemp("profile"), size=(900, 600)) as one:
         one.open(f"file://{root / 'page.html'}#m=recorded&c=front&t=0.4")
         yield one

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import http.client
 import json
 import socket
 import struct
@@ -14,7 +15,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from view_server import ask
 
 from mudg.base.errors import ResourceError
 from mudg.viewer import server as served
@@ -68,7 +68,9 @@ def answered(server: SiteServer, request: bytes) -> bytes:
 
 
 def is_served(port: int) -> bool:
-    return ask(port, "GET", f"/small?token={TOKEN}") == (200, b"small")
+    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=10)) as connection:
+        connection.request("GET", f"/small?token={TOKEN}")
+        return connection.getresponse().read() == b"small"
 
 
 PORT = b"PORT"  # becomes the server's

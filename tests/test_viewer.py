@@ -6,7 +6,6 @@ import base64
 import gzip
 import hashlib
 import http.server
-import io
 import json
 import re
 import threading
@@ -21,15 +20,14 @@ import numpy as np
 import pytest
 import torch
 from browser import Browser, BrowserError
-from PIL import Image
 from refusals import refused
 from toy_fitted import STREET, toy_fitted, write_toy_run
-from view_server import allowed, ask, seen_from, serving
+from view_server import allowed, ask, colors_in, question, serving, whole_page
 
 from mudg import FittedScene
 from mudg.base.errors import UsageError
 from mudg.base.palette import ID
-from mudg.base.types import Camera
+from mudg.base.types import Camera, View
 from mudg.core.trajectory import at_shift
 from mudg.editing.script import read_edits
 from mudg.formats.paths import read_path
@@ -39,7 +37,7 @@ from mudg.gaussians.storage import save_model
 from mudg.scene.read import read_scene
 from mudg.viewer import page as viewer_page
 from mudg.viewer import view
-from mudg.viewer.page import BLOCK, blob_of, coverage, level_of, opacity_of, pack_scene, smallest_three
+from mudg.viewer.page import BLOCK, blob_of, coverage, level_of, opacity_of, pack_scene, packed_turns
 from mudg.viewer.server import token_for
 from mudg.viewer.settings import PageConfig
 from mudg.viewer.view import GROUND
@@ -51,7 +49,7 @@ Toy = tuple[Path, Path, SceneModel]
 
 
 def rotations(codes: np.ndarray) -> np.ndarray:
-    """Unit quaternions of ``smallest_three``, as the page unpacks them."""
+    """Unit quaternions of ``packed_turns``, as the page unpacks them."""
     small = np.stack([(codes >> shift & 1023).astype(float) - 512 for shift in (0, 10, 20)], 1) / (511 * np.sqrt(2))
     absent = codes >> 30
     whole = np.empty((len(codes), 4))
@@ -65,7 +63,7 @@ def test_rotations_sections_and_json_of_a_page() -> None:
     quats = np.random.default_rng(0).normal(size=(2000, 4))
     quats[0] = (0, 0, 0, -3)
     unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
-    apart = 2 * np.arccos(np.clip(np.abs((rotations(smallest_three(quats)) * unit).sum(1)), 0, 1))
+    apart = 2 * np.arccos(np.clip(np.abs((rotations(packed_turns(quats)) * unit).sum(1)), 0, 1))
     assert np.degrees(apart).max() < 0.25
     blob, directory = blob_of({"a": np.arange(3, dtype=np.uint8), "b": np.arange(2, dtype=np.float32)})
     assert directory == {"a": [0, "u1", 3], "b": [4, "f4", 2]}
@@ -223,13 +221,6 @@ def test_a_page_says_what_was_left_out(toy: Toy) -> None:
     page = view.page_of(PageConfig(images=0, budget=500), view.Shown(scene, (("fit", toy[2]),)))
     assert "500 Gaussians of 900 (" in page.about
     assert f"{page.scenes[0][1].layout.visible - 500} left out for the budget" in page.about
-
-
-def whole_page(page: viewer_page.ViewerPage) -> bytes:
-    """A page of one file."""
-    facts: dict[str, Any] = {}
-    files = list(page.files(facts))
-    return page.one_file(files, facts)
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
@@ -577,25 +568,19 @@ def test_the_server_answers_only_to_its_own_page(served: tuple[int, str]) -> Non
 def test_the_server_draws_exact_frames(served: tuple[int, str], toy: Toy) -> None:
     port, token = served
     wanted = STREET.view(0.4, 160, 96)
-    body = {"scene": 0, "layer": "color", "hidden": [], "time_s": 0.4, "camera": "front", **seen_from(wanted)}
-    status, content = ask(port, "POST", "/frame", body, **allowed(port, token, "localhost"))
+    status, content = ask(port, "POST", "/frame", question(wanted), **allowed(port, token, "localhost"))
     assert status == 200
     true = render_view(toy[2], wanted, raster_of(toy[2])).rgb.permute(1, 2, 0).numpy()
-    assert np.abs(np.asarray(Image.open(io.BytesIO(content))) / 255.0 - true).max() < 0.003
+    assert np.abs(colors_in(content) - true).max() < 0.003
 
 
 def test_a_free_exact_frame_shows_ground_below_the_horizon(served: tuple[int, str], toy: Toy) -> None:
     port, token = served
-    lens = {"width": 64, "height": 48, "fx": 40, "fy": 40, "cx": 32, "cy": 24}
-    at = {"eye": [-60, 0, 20], "axes": [[0, 1, 0], [0, 0, -1], [-1, 0, 0]], "time_s": 0.4}
-
-    def drawn(camera: str) -> np.ndarray:
-        body = {"scene": 0, "layer": "color", "hidden": [], "camera": camera, **lens, **at}
-        status, content = ask(port, "POST", "/frame", body, **allowed(port, token, "localhost"))
-        assert status == 200
-        return np.asarray(Image.open(io.BytesIO(content))) / 255.0
-
-    free, recorded = drawn(""), drawn("front")
+    seen = View(Camera("front", 64, 48, 40, 40, 32, 24), np.eye(4), 0.4)
+    at = {"eye": [-60, 0, 20], "axes": [[0, 1, 0], [0, 0, -1], [-1, 0, 0]]}
+    bodies = (question(seen, camera=name, **at) for name in ("", "front"))
+    answers = [ask(port, "POST", "/frame", body, **allowed(port, token, "localhost")) for body in bodies]
+    free, recorded = (colors_in(content) for _, content in answers)
     # rows of the small panorama blend within 11 degrees of the horizon
     assert np.abs(free[36:] - GROUND).max() < 0.01
     assert np.abs(recorded[36:] - GROUND).max() > 0.03
@@ -638,8 +623,7 @@ def shown(port: int, address: str, folder: Path) -> Iterator[Browser]:
 )
 def test_a_wrong_question_is_told(served: tuple[int, str], changes: dict[str, Any], told: str) -> None:
     port, token = served
-    body = {"scene": 0, "layer": "color", "hidden": [], "time_s": 0.4, "camera": "front"}
-    body |= {**seen_from(STREET.view(0.4, 160, 96)), **changes}
+    body = question(STREET.view(0.4, 160, 96), **changes)
     status, text = ask(port, "POST", "/frame", body, **allowed(port, token))
     assert status == 400
     assert told in text.decode()

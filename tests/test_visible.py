@@ -68,14 +68,9 @@ def slow_nearer(nearest: np.ndarray, rule: HidingRule, reach: tuple[int, int]) -
                 out[v, u] = padded[y - reach[1] : y + reach[1] + 1, x - reach[0] : x + reach[0] + 1].min()
                 continue
             aside, along = (max(1, int(share * cells)) if share else 0 for share, cells in zip(rule.widen, reach))
-            above, below = (
-                padded[rows, x - aside : x + aside + 1].min()
-                for rows in (slice(y - reach[1], y + 1), slice(y, y + reach[1] + 1))
-            )
-            left, right = (
-                padded[y - along : y + along + 1, columns].min()
-                for columns in (slice(x - reach[0], x + 1), slice(x, x + reach[0] + 1))
-            )
+            beside, level = slice(x - aside, x + aside + 1), slice(y - along, y + along + 1)
+            above, below = padded[y - reach[1] : y + 1, beside].min(), padded[y : y + reach[1] + 1, beside].min()
+            left, right = padded[level, x - reach[0] : x + 1].min(), padded[level, x : x + reach[0] + 1].min()
             out[v, u] = min(max(above, below), max(left, right))
     return out
 

@@ -386,7 +386,6 @@ BOTH: dict[str, tuple[Callable[[made.Log], object], str]] = {
     "box": (lambda log: log.frames[1]["boxes"][0].update(size=(4.0, -2.0, 1.5)), "size makes no sense"),
     "rows": (lambda log: change(log.lasers[0], inclinations=lambda beams: beams[:-1]), "row for every beam"),
     "numbers": (infinite, "not finite"),
-    "image": (lambda log: change(log.frames[1]["images"][0], image=lambda c: c[:300]), "cannot be decoded"),
     "camera": (lacks_an_image, "do not pair up"),
     "laser": (lambda log: log.frames[2]["lasers"].pop(0), "do not pair up"),
     "calibration": (lambda log: log.cameras.pop(1), "no calibration"),

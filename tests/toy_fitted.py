@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from toy_scene import CAR_SIZE_M, ToyStreet
 
+from mudg.base import geometry
 from mudg.base.palette import ID
 from mudg.base.types import Scene
 from mudg.core.table import Table
@@ -55,25 +56,18 @@ def toy_fitted(degree: int = 3, seed: int = 0) -> SceneModel:
     fade, tint = torch.linspace(0.9, 0.3, 8)[:, None], torch.tensor([0.6, 0.8, 1.0])[:, None, None]
     sky.table.columns["panorama"] = (tint * fade * torch.ones(8, 16))[None]
     facts = {"method": "street_gaussians", "scene": "toy-street", "classes": [], "drawing": {"antialias": True}}
-    return SceneModel(table, (StaticNode(), _car(), _person(rng)), sky, CLASSES, degree, facts)
-
-
-def _car() -> RigidNode:
-    return RigidNode.from_track(STREET.track())
+    nodes = (StaticNode(), RigidNode.from_track(STREET.track()), _person(rng))
+    return SceneModel(table, nodes, sky, CLASSES, degree, facts)
 
 
 def _person(rng: np.random.Generator) -> DeformableNode:
     """Walks across the street, turning, from the second time on; its limbs move by up to 20 cm."""
     times = np.array(STREET.times[1:])
-    poses = np.tile(np.eye(4), (len(times), 1, 1))
-    for pose, t in zip(poses, times):
-        pose[:2, :2] = [[np.cos(2 * t), -np.sin(2 * t)], [np.sin(2 * t), np.cos(2 * t)]]
-        pose[:3, 3] = (7.0, -2.0 + 2 * t, 0.9)
+    poses = np.stack([geometry.yaw_matrix(2 * t, (7.0, -2.0 + 2 * t, 0.9)) for t in times])
     node = DeformableNode("<script>alert(1)</script>", "pedestrian", PERSON_M, times, poses)
     along, across, up = (cells + 1 for cells in DEFORM_CELLS)
-    node.offsets.columns["deform"] = torch.from_numpy(
-        rng.uniform(-0.2, 0.2, (len(times), 3, up, across, along)).astype(np.float32)
-    )
+    deform = rng.uniform(-0.2, 0.2, (len(times), 3, up, across, along)).astype(np.float32)
+    node.offsets.columns["deform"] = torch.from_numpy(deform)
     return node
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mudg.base import geometry
+from mudg.formats.splats import formats
 from mudg.formats.splats.cloud import SplatCloud, SplatNode, SplatScene
 
 
@@ -15,15 +16,21 @@ def cloud(count: int = 3, degree: int = 0, seed: int = 0, classes: bool = False,
     quats[0] = (1, 0, 0, 0)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     sh = (rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.3).clip(-0.9, 0.9)  # SPZ holds -1 to 1
-    columns = (
-        rng.uniform(-spread, spread, (count, 3)),
-        quats,
-        rng.uniform(-5, 0, (count, 3)),
-        rng.uniform(-4, 4, count),
-        sh,
-    )
+    means, logs = rng.uniform(-spread, spread, (count, 3)), rng.uniform(-5, 0, (count, 3))
+    columns = (means, quats, logs, rng.uniform(-4, 4, count), sh)
     ids = rng.integers(0, 19, count).astype(np.uint8) if classes else None
     return SplatCloud(*(values.astype(np.float32) for values in columns), ids)
+
+
+def still(given: SplatCloud, axes: np.ndarray | None = None, **facts: object) -> SplatScene:
+    """A scene of one cloud; ``axes``: file-from-world."""
+    turned = {} if axes is None else {"file_from_world": axes}
+    return SplatScene("toy", (SplatNode("background", given),), facts=facts, **turned)
+
+
+def written(name: str, given: SplatCloud, axes: np.ndarray | None = None, **facts: object) -> bytes:
+    """A cloud as a file of a format; not turned, unless ``axes`` say so."""
+    return formats.FORMATS[name].write(formats.WriteRequest(still(given, axes, **facts), 0.0))
 
 
 def scene(degree: int = 0, count: int = 5) -> SplatScene:

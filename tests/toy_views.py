@@ -75,15 +75,9 @@ def write_views(
         path = trajectory.shifted(loaded, "front", shift_m) if shift_m else trajectory.recorded(loaded, "front")
         with ObservationWriter(out / path.name, path.name, source) as writer:
             for index, view in enumerate(path.views):
-                seen = Observation(
-                    view=view,
-                    rgb=torch.from_numpy(colors(index)).permute(2, 0, 1).float() / 255,
-                    depth=torch.from_numpy(depths())[None],
-                    semantics=torch.from_numpy(classes().astype(np.int64)),
-                    confidence=torch.ones(1, HEIGHT, WIDTH),
-                    mask=torch.ones(1, HEIGHT, WIDTH, dtype=torch.bool),
-                    kind="virtual",
-                    source=source,
-                )
+                rgb = torch.from_numpy(colors(index)).permute(2, 0, 1).float() / 255
+                depth, ids = torch.from_numpy(depths())[None], torch.from_numpy(classes().astype(np.int64))
+                mask = torch.ones(1, HEIGHT, WIDTH, dtype=torch.bool)
+                seen = Observation(view, rgb, depth, ids, mask.float(), mask, "virtual", source)
                 writer.add(seen if change is None else change(index, seen))
     return out

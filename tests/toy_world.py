@@ -97,9 +97,8 @@ def cast(origin: np.ndarray, rays: np.ndarray, time_s: float) -> tuple[np.ndarra
     mark = (np.abs(point[:, 1] - 0.003 * point[:, 0] ** 2) < 0.15) & (point[:, 0] % 4.0 < 2.0)
     tone = np.where(mark, 0.85, tone)
     pave = 0.55 + 0.06 * np.sign(np.sin(point[:, 0] * 3.0) * np.sin(point[:, 1] * 3.0))
-    color = np.where(
-        road[:, None], tone[:, None] * np.array([1.0, 1.0, 1.02]), pave[:, None] * np.array([1.0, 0.96, 0.9])
-    )
+    asphalt, stone = tone[:, None] * np.array([1.0, 1.0, 1.02]), pave[:, None] * np.array([1.0, 0.96, 0.9])
+    color = np.where(road[:, None], asphalt, stone)
     rgb[ground] = color[ground]
     train_id[ground] = np.where(road, ID["road"], ID["sidewalk"])[ground]
     for box in STATIC:
@@ -141,16 +140,9 @@ def truth(view: View) -> Observation:
     depth, rgb, train_id, _ = cast(view.center_world, rays @ view.world_from_cam[:3, :3].T, view.time_s)
     shape = (cam.height, cam.width)
     depth = np.where(np.isfinite(depth), depth, np.nan).reshape(shape).astype(np.float32)
-    return Observation(
-        view,
-        torch.from_numpy(rgb.reshape(*shape, 3).transpose(2, 0, 1).astype(np.float32).copy()),
-        torch.from_numpy(depth)[None],
-        torch.from_numpy(train_id.reshape(shape).astype(np.int64)),
-        torch.ones(1, *shape),
-        torch.ones(1, *shape, dtype=torch.bool),
-        "virtual",
-        "truth",
-    )
+    colors = torch.from_numpy(rgb.reshape(*shape, 3).transpose(2, 0, 1).astype(np.float32).copy())
+    classes, mask = torch.from_numpy(train_id.reshape(shape).astype(np.int64)), torch.ones(1, *shape, dtype=torch.bool)
+    return Observation(view, colors, torch.from_numpy(depth)[None], classes, mask.float(), mask, "virtual", "truth")
 
 
 def sweep_points(
@@ -158,15 +150,9 @@ def sweep_points(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """One turn of a LiDAR 1.8 m above the ego origin: world points, colours, train ids, on-the-moving-car."""
     azimuth = np.linspace(-math.pi, math.pi, columns, endpoint=False)
-    elevation = np.radians(np.linspace(-18, 6, beams))
-    rays = np.stack(
-        [
-            np.outer(np.cos(elevation), np.cos(azimuth)),
-            np.outer(np.cos(elevation), np.sin(azimuth)),
-            np.outer(np.sin(elevation), np.ones(columns)),
-        ],
-        -1,
-    ).reshape(-1, 3)
+    elevation = np.radians(np.linspace(-18, 6, beams))[:, None]
+    level, up = np.cos(elevation), np.sin(elevation) * np.ones(columns)
+    rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), up], -1).reshape(-1, 3)
     pose = ego_pose(time_s)
     origin = pose[:3, 3] + np.array([0, 0, 1.8])
     rays = rays @ pose[:3, :3].T
@@ -228,17 +214,12 @@ def fused_cloud(frames: int = 8, semantics: bool = True) -> FusedCloud:
         time_s = 0.3 * index
         xyz, rgb, train_id, moving = sweep_points(time_s)
         static.append((xyz[~moving], rgb[~moving], train_id[~moving]))
-        car.append(
-            (geometry.transform_points(geometry.invert(car_pose(time_s)), xyz[moving]), rgb[moving], train_id[moving])
-        )
+        own = geometry.transform_points(geometry.invert(car_pose(time_s)), xyz[moving])
+        car.append((own, rgb[moving], train_id[moving]))
 
     def cloud(parts, frame) -> PointCloud:
         xyz, rgb, train_id = (np.concatenate(column) for column in zip(*parts))
-        return PointCloud(
-            xyz.astype(np.float32),
-            (rgb * 255).round().astype(np.uint8),
-            frame,
-            train_id.astype(np.uint8) if semantics else None,
-        )
+        ids = train_id.astype(np.uint8) if semantics else None
+        return PointCloud(xyz.astype(np.float32), (rgb * 255).round().astype(np.uint8), frame, ids)
 
     return FusedCloud(cloud(static, "world"), {"car": cloud(car, "object")})

@@ -1,16 +1,21 @@
-"""The server of ``mudg view`` for tests: running in a thread, and asked over HTTP."""
+"""The server of ``mudg view`` for tests: running in a thread, and asked over HTTP; what it shows as numbers."""
 
 from __future__ import annotations
 
 import http.client
+import io
 import json
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+from PIL import Image
+
 from mudg.base.types import View
 from mudg.viewer import view
+from mudg.viewer.page import ViewerPage
 from mudg.viewer.settings import ViewConfig
 
 
@@ -19,6 +24,24 @@ def seen_from(view: View) -> dict[str, object]:
     camera, pose = view.camera, view.world_from_cam
     lens = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     return {**lens, "eye": pose[:3, 3].tolist(), "axes": pose[:3, :3].T.tolist()}
+
+
+def question(view: View, **changes: object) -> dict[str, object]:
+    """What the page asks where it wants a frame in colour from a view."""
+    asked = {"scene": 0, "layer": "color", "hidden": [], "time_s": view.time_s, "camera": view.camera.name}
+    return {**asked, **seen_from(view), **changes}
+
+
+def colors_in(content: bytes) -> np.ndarray:
+    """Colours of a picture file, 0 to 1, f64[H, W, 3]."""
+    return np.asarray(Image.open(io.BytesIO(content))) / 255.0
+
+
+def whole_page(page: ViewerPage) -> bytes:
+    """A page of one file."""
+    facts: dict[str, object] = {}
+    files = list(page.files(facts))
+    return page.one_file(files, facts)
 
 
 def allowed(port: int, token: str, host: str = "127.0.0.1") -> dict[str, str]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from roundtrip import mounts
 
 from mudg.base.geometry import invert, quaternion_from_matrix, transform_points, yaw_matrix
 from mudg.base.types import Scene
@@ -37,29 +38,25 @@ def nanos(time_s: float) -> int:
 
 def write_av2(truth: Scene, folder: Path) -> Path:
     """Write ``truth`` as one log; points are float32 (the data set's are float16)."""
-    ego_at = {time_s: truth.ego.pose_at(time_s) for time_s in _times(truth)}
-    mounts: dict[str, NDArray[np.float64]] = {}
+    times = {frame.view.time_s for frame in truth.frames} | {sweep.time_s for sweep in truth.sweeps}
+    ego_at = {time_s: truth.ego.pose_at(time_s) for time_s in sorted(times)}
+    placed = {NAMES.get(name, "up_lidar"): mount for name, mount in mounts(truth).items()}
     for frame in truth.frames:
         name = NAMES[frame.view.camera.name]
-        mounts.setdefault(name, invert(ego_at[frame.view.time_s]) @ frame.view.world_from_cam)
         path = folder / "sensors" / "cameras" / name / f"{nanos(frame.view.time_s)}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(open_files(truth.root).read(frame.image.path))
     for sweep in truth.sweeps:
-        ego_from_lidar = invert(ego_at[sweep.time_s]) @ sweep.world_from_lidar
-        mounts.setdefault("up_lidar", ego_from_lidar)
         points = read_points(truth, sweep)
-        xyz = transform_points(ego_from_lidar, points.xyz)
+        xyz = transform_points(invert(ego_at[sweep.time_s]) @ sweep.world_from_lidar, points.xyz)
         columns = {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2], "intensity": points.intensity * 255}
-        columns |= {
-            "laser_number": np.zeros(len(xyz), np.uint8),
-            "offset_ns": np.round(points.dt_s * 1e9).astype(np.int32),
-        }
+        columns["laser_number"] = np.zeros(len(xyz), np.uint8)
+        columns["offset_ns"] = np.round(points.dt_s * 1e9).astype(np.int32)
         write_table(folder / "sensors" / "lidar" / f"{nanos(sweep.time_s)}.feather", columns)
     ego = {"timestamp_ns": [nanos(t) for t in ego_at]} | pose_columns([CITY_FROM_WORLD @ p for p in ego_at.values()])
     write_table(folder / "city_SE3_egovehicle.feather", ego)
     calibration = folder / "calibration"
-    sensors = {"sensor_name": list(mounts)} | pose_columns(list(mounts.values()))
+    sensors = {"sensor_name": list(placed)} | pose_columns(list(placed.values()))
     write_table(calibration / "egovehicle_SE3_sensor.feather", sensors)
     cameras = [truth.cameras[name] for name in truth.cameras]
     intrinsics = {"sensor_name": [NAMES[c.name] for c in cameras]}
@@ -70,10 +67,6 @@ def write_av2(truth: Scene, folder: Path) -> Path:
     write_table(calibration / "intrinsics.feather", intrinsics)
     write_table(folder / "annotations.feather", _boxes(truth))
     return folder
-
-
-def _times(truth: Scene) -> list[float]:
-    return sorted({frame.view.time_s for frame in truth.frames} | {sweep.time_s for sweep in truth.sweeps})
 
 
 def _boxes(truth: Scene) -> dict[str, Any]:

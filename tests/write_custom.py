@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+from roundtrip import mounts
 
-from mudg.base.geometry import invert, quaternion_from_matrix, yaw_of
+from mudg.base.geometry import quaternion_from_matrix, yaw_of
 from mudg.base.types import Camera, Scene, SweepPoints
 from mudg.scene.read import read_image, read_points
 
@@ -19,24 +20,6 @@ EAST_M = np.array([512_345.5, 5_403_210.25, 310.0])
 """Where the recording's world lies: coordinates as of a survey grid."""
 
 Edit = Callable[[dict[str, Any]], None]
-
-
-def rig(scene: Scene) -> dict[str, np.ndarray]:
-    """Mounting poses: camera or LiDAR -> ego_from_sensor."""
-    poses = {}
-    for name in scene.cameras:
-        view = scene.frames_of(name)[0].view
-        poses[name] = invert(ego_at(scene, view.time_s)) @ view.world_from_cam
-    sweep = scene.sweeps[0]
-    poses[sweep.sensor] = invert(ego_at(scene, sweep.time_s)) @ sweep.world_from_lidar
-    return poses
-
-
-def ego_at(scene: Scene, time_s: float) -> np.ndarray:
-    """World-from-ego at a time of the log."""
-    pose = scene.ego.pose_at(time_s)
-    assert pose is not None
-    return pose
 
 
 def ns(time_s: float) -> int:
@@ -52,18 +35,12 @@ def pinhole(c: Camera, ego_from_camera: np.ndarray) -> dict[str, Any]:
 
 def write_log(scene: Scene, root: Path, suffix: str = ".npz", edit: Edit | None = None) -> Path:
     """The scene in the neutral layout, nanoseconds, far from the origin; ``edit`` changes log.json's content first."""
-    sensors = rig(scene)
+    sensors = mounts(scene)
     cameras = {name: pinhole(c, sensors[name]) for name, c in scene.cameras.items()}
     lidar = scene.sweeps[0].sensor
     ego = zip(scene.ego.times_s, scene.ego.world_from_ego, strict=True)
-    log: dict[str, Any] = {
-        "format": "mudg-log",
-        "version": 1,
-        "name": "round-trip",
-        "licence": "none",
-        "time_unit": "ns",
-    }
-    log |= {"cameras": cameras, "images": [], "sweeps": [], "tracks": []}
+    log: dict[str, Any] = {"format": "mudg-log", "version": 1, "name": "round-trip", "licence": "none"}
+    log |= {"time_unit": "ns", "cameras": cameras, "images": [], "sweeps": [], "tracks": []}
     log["lidars"] = {lidar: {"ego_from_lidar": sensors[lidar].tolist(), "motion_compensated": True}}
     log["ego"] = [{"time": ns(t), "world_from_ego": far(pose).tolist()} for t, pose in ego]
     for track in scene.tracks:
@@ -129,7 +106,7 @@ CLOUDS = {".npz": npz, ".bin": bin_, ".pcd": pcd, ".ply": ply}
 def write_recording(scene: Scene, root: Path) -> Path:
     """The scene as a raw recording of the form that the template converter reads."""
     root.mkdir(parents=True)
-    sensors = rig(scene)
+    sensors = mounts(scene)
     described: dict[str, Any] = {}
     for name, c in scene.cameras.items():
         k = [[c.fx, 0, c.cx - 0.5], [0, c.fy, c.cy - 0.5], [0, 0, 1]]

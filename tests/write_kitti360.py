@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from roundtrip import mounts
 from scipy.spatial.transform import Rotation
 
 from mudg.base.geometry import invert, yaw_matrix
@@ -38,19 +38,11 @@ def stamp(time_s: float) -> str:
     return f"2013-05-28 08:46:{total_ns // 10**9:02d}.{total_ns % 10**9:09d}"
 
 
-def write_kitti360(truth: Scene, root: Path, *, posed: Sequence[int] | None = None) -> Path:
-    """``root`` as the data set's folder with one drive. Returns ``root``.
-
-    Args:
-        posed: the log's frames (0, 1, ...) that get a pose; None = all.
-    """
-    ego_of = {sweep.time_s: truth.ego.pose_at(sweep.time_s) for sweep in truth.sweeps}
-    ego = next(iter(ego_of.values()))
-    assert ego is not None
-    imu_from_velo = EGO_FROM_IMU @ invert(ego) @ truth.sweeps[0].world_from_lidar
-    imu_from_rect = {
-        CAMERA_OF[name]: EGO_FROM_IMU @ invert(ego) @ truth.frames_of(name)[0].view.world_from_cam for name in CAMERA_OF
-    }
+def write_kitti360(truth: Scene, root: Path) -> Path:
+    """``root`` as the data set's folder with one drive. Returns ``root``."""
+    placed = mounts(truth)
+    imu_from_velo = EGO_FROM_IMU @ placed[truth.sweeps[0].sensor]
+    imu_from_rect = {theirs: EGO_FROM_IMU @ placed[name] for name, theirs in CAMERA_OF.items()}
     _calibration(truth, root / "calibration", imu_from_rect, imu_from_velo)
     for name, theirs in CAMERA_OF.items():
         here = root / "data_2d_raw" / DRIVE / theirs / "data_rect"
@@ -65,11 +57,8 @@ def write_kitti360(truth: Scene, root: Path, *, posed: Sequence[int] | None = No
     period = truth.sweeps[1].time_s - truth.sweeps[0].time_s
     lines = [stamp(period * (n - FIRST)) for n in range(FIRST + len(truth.sweeps) + 2)]
     (raw / "timestamps.txt").write_text("\n".join(lines) + "\n")
-    rows = [
-        f"{index + FIRST} {numbers((SOURCE_FROM_WORLD @ pose @ EGO_FROM_IMU)[:3])}"
-        for index, pose in enumerate(ego_of.values())
-        if pose is not None and (posed is None or index in posed)
-    ]
+    paths = (SOURCE_FROM_WORLD @ truth.ego.pose_at(sweep.time_s) @ EGO_FROM_IMU for sweep in truth.sweeps)
+    rows = [f"{index} {numbers(pose[:3])}" for index, pose in enumerate(paths, FIRST)]
     poses = root / "data_poses" / DRIVE / "poses.txt"
     poses.parent.mkdir(parents=True)
     poses.write_text("\n".join(rows) + "\n")

@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from roundtrip import mounts
 from scipy.spatial.transform import Rotation
 
-from mudg.base.geometry import invert, yaw_matrix, yaw_of
+from mudg.base.geometry import yaw_matrix, yaw_of
 from mudg.base.types import Scene
 from mudg.scene.read import read_image, read_points
 
@@ -100,14 +101,13 @@ def write_nuplan(
         pose, time_us = SOURCE_FROM_WORLD @ pose, us(float(time_s))
         values = token("ego", time_us), time_us, *pose[:3, 3].tolist(), *wxyz(pose)
         add("ego_pose", "token, timestamp, x, y, z, qw, qx, qy, qz", *values)
-    ego = truth.ego.pose_at(truth.sweeps[0].time_s)
-    assert ego is not None
-    mount = invert(ego) @ truth.sweeps[0].world_from_lidar
+    placed = mounts(truth)
+    mount = placed[truth.sweeps[0].sensor]
     place = pickle.dumps(mount[:3, 3].tolist()), pickle.dumps(wxyz(mount))
     add("lidar", "token, channel, translation, rotation", token("lidar"), "MergedPointCloud", *place)
     for channel, name in (cameras or {channel: name for name, channel in CAMERA_OF.items()}).items():
         camera, frames = truth.cameras[name], truth.frames_of(name)
-        mount = invert(ego) @ frames[0].view.world_from_cam
+        mount = placed[name]
         k = [[camera.fx, 0.0, camera.cx - 0.5], [0.0, camera.fy, camera.cy - 0.5], [0.0, 0.0, 1.0]]
         place = pickle.dumps(mount[:3, 3].tolist()), pickle.dumps(wxyz(mount))
         lens = pickle.dumps(k), pickle.dumps(list(distortion))

@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from roundtrip import mounts
 
-from mudg.base.geometry import invert, quaternion_from_matrix, yaw_matrix
+from mudg.base.geometry import quaternion_from_matrix, yaw_matrix
 from mudg.base.types import Scene, Track
 from mudg.formats.importers.nuscenes import CAMERAS
 from mudg.scene.read import open_files, read_points
 
+RELEASE = "v1.0-mini"
 START_US = 1_532_402_927_000_000
 MAP_FROM_WORLD = yaw_matrix(1.9, (411.3, 1180.9, 0.0))
 CHANNELS = {name: raw for raw, name in CAMERAS.items()}
@@ -49,14 +51,10 @@ def pose_row(pose: NDArray[np.float64]) -> dict[str, list[float]]:
     return {"rotation": quaternion_from_matrix(pose).tolist(), "translation": pose[:3, 3].tolist()}
 
 
-def write_nuscenes(
-    truth: Scene, root: Path, *, key_every: int = 1, release: str = "v1.0-mini", name: str = "scene-0007"
-) -> Path:
+def write_nuscenes(truth: Scene, root: Path, *, key_every: int = 1) -> Path:
     """Write ``truth`` below ``root``; every ``key_every``-th sweep is a key frame with boxes. Another scene's rows lie
-    between.
-
-    The LiDAR keeps the truth's axes, so that poses can be compared (the release's look along y).
-    """
+    between. The LiDAR keeps the truth's axes, so that poses can be compared (the release's look along y)."""
+    name = "scene-0007"
     tables: dict[str, list[dict[str, Any]]] = {}
     scene = token("scene", name)
     keys = list(truth.sweeps[::key_every])
@@ -64,21 +62,18 @@ def write_nuscenes(
     chain = ["", *samples.values(), ""]
     tables["scene"] = [
         {"token": token("other"), "name": "scene-0001", "first_sample_token": token("other sample"), "log_token": ""},
-        {
-            "token": scene,
-            "name": name,
-            "first_sample_token": chain[1],
-            "description": "cut } and { shout",
-            "log_token": "",
-        },
+        {"token": scene, "name": name, "first_sample_token": chain[1], "description": "cut } and { x", "log_token": ""},
     ]
     tables["sample"] = [{"token": token("other sample"), "timestamp": 5, "scene_token": token("other"), "next": ""}]
     for at, sweep in enumerate(keys, start=1):
         row = {"token": chain[at], "timestamp": micros(sweep.time_s), "prev": chain[at - 1], "next": chain[at + 1]}
         tables["sample"].insert(0, {**row, "scene_token": scene})
     tables["sensor"], tables["calibrated_sensor"] = [], []
-    mounts = _mounts(truth)
-    for channel, (mount, intrinsics) in {**mounts, "RADAR_FRONT": (np.eye(4), [])}.items():
+    placed = {
+        CHANNELS.get(name, "LIDAR_TOP"): (mount, truth.cameras.get(name)) for name, mount in mounts(truth).items()
+    }
+    for channel, (mount, c) in {**placed, "RADAR_FRONT": (np.eye(4), None)}.items():
+        intrinsics = [] if c is None else [[c.fx, 0.0, c.cx - 0.5], [0.0, c.fy, c.cy - 0.5], [0.0, 0.0, 1.0]]
         tables["sensor"].append({"token": token("sensor", channel), "channel": channel, "modality": "camera"})
         row = {"token": token("calibration", channel), "sensor_token": token("sensor", channel)}
         tables["calibrated_sensor"].append({**row, **pose_row(mount), "camera_intrinsic": intrinsics})
@@ -95,7 +90,7 @@ def write_nuscenes(
         row = {"token": one, "sample_token": chain[after + 1], "ego_pose_token": one, "is_key_frame": is_key}
         row |= {"calibrated_sensor_token": token("calibration", channel), "timestamp": micros(time_s)}
         row |= {"width": 0, "height": 0, "filename": f"{path}.pcd.bin"}
-        if channel in mounts and channel != "LIDAR_TOP":
+        if channel in placed and channel != "LIDAR_TOP":
             camera = record.view.camera
             row |= {"width": camera.width, "height": camera.height, "filename": f"{path}.png"}
             _write(root / row["filename"], open_files(truth.root).read(record.image.path))
@@ -109,21 +104,8 @@ def write_nuscenes(
             tables["sample_data"].append(noise)
     _add_boxes(tables, truth.tracks, [(sweep.time_s, samples[sweep.id]) for sweep in keys])
     for table, rows in tables.items():
-        _write(root / release / f"{table}.json", json.dumps(rows, indent=0).encode())
+        _write(root / RELEASE / f"{table}.json", json.dumps(rows, indent=0).encode())
     return root
-
-
-def _mounts(truth: Scene) -> dict[str, tuple[NDArray[np.float64], list[list[float]]]]:
-    """Channel -> mount and intrinsics with pixel centres at whole numbers."""
-    found = {}
-    for name, camera in truth.cameras.items():
-        view = truth.frames_of(name)[0].view
-        mount = invert(truth.ego.pose_at(view.time_s)) @ view.world_from_cam
-        k = [[camera.fx, 0.0, camera.cx - 0.5], [0.0, camera.fy, camera.cy - 0.5], [0.0, 0.0, 1.0]]
-        found[CHANNELS[name]] = (mount, k)
-    first = truth.sweeps[0]
-    found["LIDAR_TOP"] = (invert(truth.ego.pose_at(first.time_s)) @ first.world_from_lidar, [])
-    return found
 
 
 def _add_boxes(
@@ -159,9 +141,9 @@ def _write(path: Path, content: bytes) -> None:
     path.write_bytes(content)
 
 
-def edit(root: Path, table: str, change: Callable[[list[dict[str, Any]]], None], release: str = "v1.0-mini") -> None:
+def edit(root: Path, table: str, change: Callable[[list[dict[str, Any]]], object]) -> None:
     """Change the rows of a table in place."""
-    path = root / release / f"{table}.json"
+    path = root / RELEASE / f"{table}.json"
     rows = json.loads(path.read_bytes())
     change(rows)
     path.write_text(json.dumps(rows, indent=0))

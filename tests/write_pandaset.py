@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import copyreg
 import gzip
+import io
 import json
 import pickle
-import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -41,14 +40,10 @@ def write_pandaset(
     cameras: Mapping[str, str] | None = None,
     suffix: str = ".png",
 ) -> Path:
-    """``folder`` as one sequence; every fifth point is the solid-state LiDAR's. Returns ``folder``.
-
-    Args:
-        point_times: write the points' own times; else all have the frame's, and boxes stay where they are.
-        new: tables as pandas 2 writes them.
-        cameras: the data set's camera -> camera of the log; None = ``CAMERA_OF``.
-        suffix: of the images; ``.jpg`` is what the data set has, ``.png`` loses nothing.
-    """
+    """``folder`` as one sequence; every fifth point is the solid-state LiDAR's. Returns ``folder``. ``point_times``:
+    write the points' own times; else all have the frame's, and boxes stay where they are. ``new``: tables as pandas 2
+    writes them. ``cameras``: the data set's camera -> camera of the log; None = ``CAMERA_OF``. ``suffix``: of the
+    images; ``.jpg`` is what the data set has, ``.png`` loses nothing."""
     path = EgoPath(
         np.array([sweep.time_s for sweep in truth.sweeps]),
         np.stack([pose_near(truth.ego, sweep.time_s) for sweep in truth.sweeps]),
@@ -57,11 +52,9 @@ def write_pandaset(
         here = folder / "camera" / theirs
         here.mkdir(parents=True)
         frames = truth.frames_of(name)
+        at = lambda time_s: pose_near(path, time_s + STAMPED_LATE_S, 1.0)
         moved = [
-            pose_near(path, f.view.time_s + STAMPED_LATE_S, 1.0)
-            @ invert(pose_near(path, f.view.time_s + STAMPED_LATE_S - POSED_AHEAD_S, 1.0))
-            @ f.view.world_from_cam
-            for f in frames
+            at(v.time_s) @ invert(at(v.time_s - POSED_AHEAD_S)) @ v.world_from_cam for v in (f.view for f in frames)
         ]
         for index, frame in enumerate(frames):
             Image.fromarray(read_image(truth, frame)).save(here / f"{index:02d}{suffix}", quality=95)
@@ -125,13 +118,14 @@ def _dump(path: Path, value: object) -> None:
 
 # --- pickled data frames without pandas -----------------------------------------------------------
 #
-# Classes of pandas' names that pickle as pandas 1.0 and 2.2 do. Files that pandas itself wrote lie in
+# Classes that pickle under pandas' names, as pandas 1.0 and 2.2 do. Files that pandas itself wrote lie in
 # ``golden/pandas_*.pkl.gz``; these here make tables of any content.
 
 
 class DataFrame:
     """A frame whose state holds a manager."""
 
+    __module__ = "pandas.core.frame"
     state: dict[str, Any]
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -141,6 +135,7 @@ class DataFrame:
 class BlockManager:
     """Pandas 1.0: state in a tuple. Pandas 2: blocks and axes as arguments."""
 
+    __module__ = "pandas.core.internals.managers"
     state: Any
     blocks: Any
 
@@ -151,23 +146,21 @@ class BlockManager:
 
 
 class Index:
-    """A plain index."""
+    """A plain index: ``data``. As ``RangeIndex``: ``start``, ``stop`` and ``step`` of row numbers."""
 
-    def __init__(self, data: np.ndarray) -> None:
-        self.data = data
+    __module__ = "pandas.core.indexes.base"
+
+    def __init__(self, **parts: Any) -> None:
+        self.parts = parts
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _new_Index, (Index, {"data": self.data, "name": None})
+        return _new_Index, (type(self), {**self.parts, "name": None})
 
 
-class RangeIndex:
+class RangeIndex(Index):
     """Row numbers."""
 
-    def __init__(self, count: int) -> None:
-        self.count = count
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _new_Index, (RangeIndex, {"name": None, "start": 0, "stop": self.count, "step": 1})
+    __module__ = "pandas.core.indexes.range"
 
 
 class Block:
@@ -186,34 +179,19 @@ def _new_Index(*_: Any) -> None: ...
 def _unpickle_block(*_: Any) -> None: ...
 
 
-_HOMES = {
-    DataFrame: "pandas.core.frame",
-    BlockManager: "pandas.core.internals.managers",
-    Index: "pandas.core.indexes.base",
-    RangeIndex: "pandas.core.indexes.range",
-    _new_Index: "pandas.core.indexes.base",
-    _unpickle_block: "pandas._libs.internals",
-}
+_new_Index.__module__, _unpickle_block.__module__ = Index.__module__, "pandas._libs.internals"
 
 
-@contextmanager
-def _pretended() -> Iterator[None]:
-    """Let pickle find the classes under pandas' names."""
-    own = {thing: thing.__module__ for thing in _HOMES}
-    added = {}
-    for thing, home in _HOMES.items():
-        module = added.setdefault(home, ModuleType(home))
-        setattr(module, thing.__name__, thing)
-        thing.__module__ = home
-    for name in [*added, *{part for home in added for part in (home.split(".")[0],)}]:
-        sys.modules.setdefault(name, added.get(name, ModuleType(name)))
-    try:
-        yield
-    finally:
-        for thing, home in own.items():
-            thing.__module__ = home
-        for name in [name for name in sys.modules if name.split(".")[0] == "pandas"]:
-            del sys.modules[name]
+class _Pickler(pickle._Pickler):
+    """Writes classes and functions by their names without looking whether they are there."""
+
+    def save_global(self, thing: Any, name: str | None = None) -> None:
+        self.save(thing.__module__)
+        self.save(name or thing.__qualname__)
+        self.write(pickle.STACK_GLOBAL)
+        self.memoize(thing)
+
+    dispatch = {**pickle._Pickler.dispatch, FunctionType: save_global}
 
 
 def frame_bytes(columns: Mapping[str, Any], *, new: bool = False) -> bytes:
@@ -229,15 +207,16 @@ def frame_bytes(columns: Mapping[str, Any], *, new: bool = False) -> bytes:
             values[row] = arrays[name]
         blocks.append(Block(values, slice(first, first + len(mine), 1)))
         first += len(mine)
-    axes = [Index(np.array(names, object)), RangeIndex(rows)]
+    axes = [Index(data=np.array(names, object)), RangeIndex(start=0, stop=rows, step=1)]
     manager, frame = BlockManager(), DataFrame()
     manager.state, manager.blocks = None, (tuple(blocks), axes)
     if not new:
         parts = [{"values": block.values, "mgr_locs": block.places} for block in blocks]
         manager.state = (axes, [b.values for b in blocks], axes[:1], {"0.14.1": {"axes": axes, "blocks": parts}})
     frame.state = {"_mgr" if new else "_data": manager, "_typ": "dataframe", "_metadata": []}
-    with _pretended():
-        return pickle.dumps(frame, protocol=5 if new else 4)
+    buffer = io.BytesIO()
+    _Pickler(buffer, 5 if new else 4).dump(frame)
+    return buffer.getvalue()
 
 
 def _column(values: Any) -> np.ndarray:

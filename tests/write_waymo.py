@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
+from roundtrip import mounts
 
 from mudg.base.geometry import CAM_FROM_EGO_AXES, invert, transform_points, yaw_matrix, yaw_of
 from mudg.base.types import Scene, Track
@@ -52,25 +53,17 @@ def log_of(
     columns: int,
     global_from_world: Matrix = GLOBAL_FROM_WORLD,
 ) -> Log:
-    """The scene as a Waymo log.
-
-    Args:
-        truth: cameras and one LiDAR that turns clockwise from behind, in 0.1 s around each sweep's time.
-        moving: where the objects are at any time; a box stands where its object is when the LiDAR looks at it.
-        beams: elevations f64[H], radians, upwards.
-        columns: of the range images.
-        global_from_world: where the data set's world lies.
-    """
-    log = Log()
-    mount = invert(truth.ego.pose_at(truth.sweeps[0].time_s)) @ truth.sweeps[0].world_from_lidar
+    """The scene, cameras and one LiDAR that turns clockwise from behind in 0.1 s around each sweep's time, as a Waymo
+    log. ``moving``: where the objects are at any time; a box stands where its object is when the LiDAR looks at it.
+    ``beams``: elevations f64[H], radians, upwards; ``columns``: of the range images."""
+    log, placed = Log(), mounts(truth)
+    mount = placed[truth.sweeps[0].sensor]
     log.lasers.append(
         {"number": 1, "inclinations": beams, "min": float(beams[0]), "max": float(beams[-1]), "extrinsic": mount}
     )
     for name, camera in truth.cameras.items():
-        first = truth.frames_of(name)[0].view
-        vehicle_from_cam = invert(truth.ego.pose_at(first.time_s)) @ first.world_from_cam
         intrinsic = [camera.fx, camera.fy, camera.cx, camera.cy, 0, 0, 0, 0, 0]
-        facts = CAMERA_NUMBERS[name], camera.width, camera.height, intrinsic, vehicle_from_cam @ CAM_FROM_EGO_AXES
+        facts = CAMERA_NUMBERS[name], camera.width, camera.height, intrinsic, placed[name] @ CAM_FROM_EGO_AXES
         log.cameras.append(named("number width height intrinsic extrinsic", *facts))
     for index, sweep in enumerate(truth.sweeps):
         pose = global_from_world @ truth.ego.pose_at(sweep.time_s)
@@ -277,70 +270,66 @@ def named(names: str, *values: Any) -> dict[str, Any]:
     return dict(zip(names.split(), values, strict=True))
 
 
+CUBOID = [*(f"box.{part}.{axis}" for part in ("center", "size") for axis in "xyz"), "box.heading", "type"]
+SPEEDS = [f"velocity.{kind}_velocity.{axis}" for kind in ("linear", "angular") for axis in "xyz"]
+EXPOSURE = {"shutter": "shutter", "camera_trigger_time": "trigger", "camera_readout_done_time": "done"}
+LENS = [f"intrinsic.{name}" for name in "f_u f_v c_u c_v k1 k2 p1 p2 k3".split()]
+
+
 def write_parquet(log: Log, root: Path) -> Path:
     """The log as a folder of components; small row groups, so that reading crosses them."""
     import pyarrow as pa
     from pyarrow import parquet
 
-    matrix = pa.list_(pa.float64(), 16)
     types = {"beam_inclination.values": pa.list_(pa.float64()), "type": pa.int8()}
-    types |= {f"{name}.transform": matrix for name in ("world_from_vehicle", "extrinsic", "pose")}
+    types |= {f"{name}.transform": pa.list_(pa.float64(), 16) for name in ("world_from_vehicle", "extrinsic", "pose")}
     types |= {f"range_image_return{n}.values": pa.list_(pa.float32()) for n in (1, 2)}
     types |= {f"range_image_return{n}.shape": pa.list_(pa.int32(), 3) for n in (1, 2)}
+    tables: dict[str, list[dict[str, Any]]] = {}
 
-    def save(component: str, title: str, keyed: Iterable[tuple[dict[str, Any], dict[str, Any]]]) -> None:
-        """Rows of keys, and of columns by their names within the component."""
-        rows = [{**keys, **{f"[{title}Component].{n}": v for n, v in values.items()}} for keys, values in keyed]
-        if rows:
-            (root / component).mkdir(parents=True, exist_ok=True)
-            arrays = {name: pa.array([row[name] for row in rows], types.get(name.split("].")[-1])) for name in rows[0]}
-            parquet.write_table(pa.table(arrays), root / component / f"{log.name}.parquet", row_group_size=4)
-
-    def key(frame: dict[str, Any] | None = None, **more: Any) -> dict[str, Any]:
-        time = {} if frame is None else {"key.frame_timestamp_micros": frame["timestamp_us"]}
-        return {"key.segment_context_name": log.name, **time, **{f"key.{name}": value for name, value in more.items()}}
+    def add(
+        component: str, title: str, values: dict[str, Any], frame: dict[str, Any] | None = None, **keys: Any
+    ) -> None:
+        """A row: keys, and values by their names within the component."""
+        keys |= {} if frame is None else {"frame_timestamp_micros": frame["timestamp_us"]}
+        row = {f"key.{name}": value for name, value in {"segment_context_name": log.name, **keys}.items()}
+        row |= {f"[{title}Component].{name}": value for name, value in values.items()}
+        tables.setdefault(component, []).append(row)
 
     def flat(number: int, array: Any) -> dict[str, Any]:
         parts = (None, None) if array is None else (array.astype(np.float32).ravel(), list(array.shape))
         return named(f"range_image_return{number}.values range_image_return{number}.shape", *parts)
 
-    save(
-        "vehicle_pose",
-        "VehiclePose",
-        ((key(f), {"world_from_vehicle.transform": f["pose"].ravel()}) for f in log.frames),
-    )
-    lens = " ".join(f"intrinsic.{name}" for name in "f_u f_v c_u c_v k1 k2 p1 p2 k3".split())
-    size = "extrinsic.transform width height rolling_shutter_direction"
-    cameras = ((c, named(size, c["extrinsic"].ravel(), c["width"], c["height"], 2)) for c in log.cameras)
-    cameras = ((key(camera_name=c["number"]), named(lens, *map(float, c["intrinsic"])) | more) for c, more in cameras)
-    save("camera_calibration", "CameraCalibration", cameras)
-    names = "extrinsic.transform beam_inclination.min beam_inclination.max beam_inclination.values"
-    values = (
-        (one, (one["extrinsic"].ravel(), one["min"], one["max"], list(one["inclinations"]) or None))
-        for one in log.lasers
-    )
-    save(
-        "lidar_calibration",
-        "LiDARCalibration",
-        ((key(laser_name=one["number"]), named(names, *v)) for one, v in values),
-    )
-    images = [(i, key(f, camera_name=i["number"])) for f in log.frames for i in f["images"]]
-    speeds = " ".join(f"velocity.{kind}_velocity.{axis}" for kind in ("linear", "angular") for axis in "xyz")
-    times = "shutter camera_trigger_time camera_readout_done_time".split()
-    times = " ".join(["image pose_timestamp", *(f"rolling_shutter_params.{name}" for name in times)])
-    facts = ((i, keys, [i[k] for k in ("image", "pose_time", "shutter", "trigger", "done")]) for i, keys in images)
-    poses = ((i, keys, named(times, *values) | {"pose.transform": i["pose"].ravel()}) for i, keys, values in facts)
-    save("camera_image", "CameraImage", ((keys, row | named(speeds, *i["velocity"])) for i, keys, row in poses))
-    names = "panoptic_label_divisor panoptic_label"
-    labels = ((keys, named(names, DIVISOR, i["panoptic"])) for i, keys in images if i["panoptic"] is not None)
-    save("camera_segmentation", "CameraSegmentationLabel", labels)
-    lasers = [(key(f, laser_name=one["number"]), one) for f in log.frames for one in f["lasers"]]
-    returns = ((keys, [*one["returns"], None][:2]) for keys, one in lasers)
-    save("lidar", "LiDAR", ((keys, flat(1, one) | flat(2, two)) for keys, (one, two) in returns))
-    with_poses = ((keys, flat(1, one["poses"])) for keys, one in lasers if one.get("poses") is not None)
-    save("lidar_pose", "LiDARPose", with_poses)
-    names = " ".join((*(f"box.{part}.{axis}" for part in ("center", "size") for axis in "xyz"), "box.heading type"))
-    boxes = ((key(f, laser_object_id=b["id"]), b) for f in log.frames for b in f["boxes"])
-    boxes = ((keys, [*map(float, (*b["centre"], *b["size"], b["heading"])), b["type"]]) for keys, b in boxes)
-    save("lidar_box", "LiDARBox", ((keys, named(names, *values)) for keys, values in boxes))
+    for camera in log.cameras:
+        values = dict(zip(LENS, map(float, camera["intrinsic"]), strict=True)) | {"rolling_shutter_direction": 2}
+        values |= {"width": camera["width"], "height": camera["height"]}
+        values["extrinsic.transform"] = camera["extrinsic"].ravel()
+        add("camera_calibration", "CameraCalibration", values, camera_name=camera["number"])
+    for laser in log.lasers:
+        names = "beam_inclination.min beam_inclination.max beam_inclination.values extrinsic.transform"
+        beams = laser["min"], laser["max"], list(laser["inclinations"]) or None
+        values = named(names, *beams, laser["extrinsic"].ravel())
+        add("lidar_calibration", "LiDARCalibration", values, laser_name=laser["number"])
+    for frame in log.frames:
+        add("vehicle_pose", "VehiclePose", {"world_from_vehicle.transform": frame["pose"].ravel()}, frame)
+        for image in frame["images"]:
+            values = {"image": image["image"], "pose_timestamp": image["pose_time"]}
+            values |= {f"rolling_shutter_params.{name}": image[ours] for name, ours in EXPOSURE.items()}
+            values |= dict(zip(SPEEDS, image["velocity"], strict=True)) | {"pose.transform": image["pose"].ravel()}
+            add("camera_image", "CameraImage", values, frame, camera_name=image["number"])
+            if image["panoptic"] is not None:
+                values = {"panoptic_label_divisor": DIVISOR, "panoptic_label": image["panoptic"]}
+                add("camera_segmentation", "CameraSegmentationLabel", values, frame, camera_name=image["number"])
+        for laser in frame["lasers"]:
+            one, two = [*laser["returns"], None][:2]
+            add("lidar", "LiDAR", flat(1, one) | flat(2, two), frame, laser_name=laser["number"])
+            if laser.get("poses") is not None:
+                add("lidar_pose", "LiDARPose", flat(1, laser["poses"]), frame, laser_name=laser["number"])
+        for box in frame["boxes"]:
+            values = *map(float, (*box["centre"], *box["size"], box["heading"])), box["type"]
+            add("lidar_box", "LiDARBox", dict(zip(CUBOID, values, strict=True)), frame, laser_object_id=box["id"])
+    for component, rows in tables.items():
+        (root / component).mkdir(parents=True, exist_ok=True)
+        arrays = {name: pa.array([row[name] for row in rows], types.get(name.split("].")[-1])) for name in rows[0]}
+        parquet.write_table(pa.table(arrays), root / component / f"{log.name}.parquet", row_group_size=4)
     return root

@@ -40,27 +40,22 @@ def test_importing(code: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def best_of(count: int, command: list[str]) -> float:
-    """Least processor time of several runs: what the program costs, not what else the machine does meanwhile."""
-    times = []
-    for _ in range(count):
-        before = os.times()
-        subprocess.run(command, capture_output=True, timeout=300, check=False)
-        after = os.times()
-        times.append(after.children_user + after.children_system - before.children_user - before.children_system)
-    return min(times)
+def processor_s(*words: str) -> float:
+    """Processor time of Python with these words: what it costs, not what else the machine does meanwhile."""
+    before = os.times()
+    subprocess.run([sys.executable, *words], capture_output=True, timeout=300, check=False)
+    after = os.times()
+    return after.children_user + after.children_system - before.children_user - before.children_system
 
 
-@pytest.fixture(scope="module")
-def library_s() -> float:
-    """What Python takes to import a piece of its own library."""
-    code = "import asyncio, unittest.mock, xml.dom.minidom, email.message, http.client"
-    return best_of(3, [sys.executable, "-c", code])
+LIBRARY = "import asyncio, unittest.mock, xml.dom.minidom, email.message, http.client"
 
 
 @pytest.mark.parametrize("words", ["-c import\tmudg", "-m mudg --help", "-m mudg run --help", "-m mudg learn --help"])
-def test_starting_takes_a_third_of_a_second(words: str, library_s: float) -> None:
-    """On a machine that is slow just now: less than six times what Python takes to import a piece of its own
-    library."""
-    allowed_s = max(0.35, 6 * library_s) * float(os.environ.get("MUDG_SLOW_MACHINE", "1"))
-    assert best_of(3, [sys.executable, *words.split(" ")]) < allowed_s
+def test_starting_takes_a_third_of_a_second(words: str) -> None:
+    """In one of three runs; on a machine that is slow just now, less than six times what Python takes to import a piece
+    of its own library."""
+    slow = float(os.environ.get("MUDG_SLOW_MACHINE", "1"))
+    if not any(processor_s(*words.split(" ")) < 0.35 * slow for _ in range(3)):
+        library_s = min(processor_s("-c", LIBRARY) for _ in range(3))
+        assert processor_s(*words.split(" ")) < 6 * library_s * slow

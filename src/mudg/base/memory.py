@@ -140,11 +140,9 @@ class Meter:
         self._peak = held_bytes() or 0
         self._last: Usage | None = None
         self._stopped = threading.Event()
-        watch = threading.Thread(
-            target=_watch, args=(weakref.ref(self), self._stopped), name="memory meter", daemon=True
-        )
+        given = weakref.ref(self), self._stopped
         with contextlib.suppress(RuntimeError):  # no thread to be had: the samples of start and end remain
-            watch.start()
+            threading.Thread(target=_watch, args=given, name="memory meter", daemon=True).start()
 
     def look(self) -> None:
         """Take a sample of memory."""

@@ -272,9 +272,9 @@ def known_input(folder: Path, name: str) -> Path | None:
 
 
 def _owner(lock: Path) -> tuple[int, str] | None:
-    """Process and machine that hold a lock."""
+    """Process and machine that hold a lock; None where there is none, or something else."""
     with contextlib.suppress(InputError, KeyError, TypeError, ValueError):
-        owner = store.read_json(lock)
+        owner = store.read_json(lock) if lock.is_file() else {}
         return int(owner["pid"]), str(owner["host"])
     return None
 
@@ -505,7 +505,7 @@ def _refuse_other(
 
 def _drop_lock_of_the_dead(lock: Path) -> None:
     """Remove the lock of a run that was killed after it had finished its work."""
-    owner = _owner(lock) if lock.is_file() else None
+    owner = _owner(lock)
     if owner is not None and owner[1] == socket.gethostname() and not process_alive(owner[0]):
         with contextlib.suppress(OSError):
             lock.unlink(missing_ok=True)
@@ -540,7 +540,7 @@ def take_lock(lock: Path, what: Path | None = None) -> None:
 
 def refuse_while_others_work(lock: Path, what: Path | None = None) -> None:
     """ResourceError if the process that wrote this lock still runs on this machine."""
-    pid, host = (_owner(lock) if lock.is_file() else None) or (os.getpid(), "")
+    pid, host = _owner(lock) or (os.getpid(), "")
     if pid != os.getpid() and host == socket.gethostname() and process_alive(pid):
         busy = "writing this file" if what else "working in this folder"
         got = f"pid {pid} on {host}"

@@ -22,7 +22,7 @@ from typing import Any, Final
 from mudg.base import log, store
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.location import PACKAGES, Location, checked_address, scheme_of
-from mudg.base.run_folder import take_lock
+from mudg.base.run_folder import locked
 
 _OUTPUTS: Final = ("out", "to")
 """Flags that name what a verb writes."""
@@ -125,14 +125,13 @@ def _alone_in(folder: Path) -> Iterator[None]:
         if folder.is_symlink() or not folder.is_dir() or (hasattr(os, "getuid") and found.st_uid != os.getuid()):
             what, remedy = "the scratch folder belongs to somebody else", "choose another --scratch"
             raise ResourceError(what, where=str(folder), remedy=remedy)
-    take_lock(folder / "lock")
-    try:
-        yield
-    except BaseException:
-        store.remove(folder / "lock")
-        again = "the same command goes on with it. Delete the folder to give it up"
-        log.info(f"{folder} keeps what was fetched and made: {again}")
-        raise
+    with locked(folder / "lock"):
+        try:
+            yield
+        except BaseException:
+            again = "the same command goes on with it. Delete the folder to give it up"
+            log.info(f"{folder} keeps what was fetched and made: {again}")
+            raise
 
 
 def _address(value: Any) -> Location | None:

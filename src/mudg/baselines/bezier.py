@@ -8,7 +8,7 @@ out: the velocity of the background, which here has no curves. Everything else i
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final, Self
 
 import numpy as np
@@ -52,19 +52,23 @@ def bernstein(tau: Array) -> Array:
     return np.concatenate([(1 - u) ** 3, 3 * u * (1 - u) ** 2, 3 * u**2 * (1 - u), u**3], -1)
 
 
-@dataclass(frozen=True, eq=False)
 class BezierPath:
-    """A cubic curve and the parameter that belongs to a time. ``control``: f64[4, 3] metres. ``clock``: coefficients of
-    the cubic in time, highest power first. ``middle_s``, ``span_s``: time that it is a polynomial in,
-    ``(t - middle) / span``. ``tau``: parameters of the keys, f64[K]. ``error_m``: root mean square distance of the
-    curve from the keys at their times."""
+    """A cubic curve through keys, and the parameter that belongs to a time. ``control``: f64[4, 3] metres. ``clock``:
+    coefficients of the cubic in time, highest power first, in ``(t - middle_s) / span_s``. ``tau``: parameters of the
+    keys f64[K], from those given on. ``error_m``: root mean square distance of the curve from the keys at their
+    times."""
 
-    control: Array
-    clock: Array
-    middle_s: float
-    span_s: float
-    tau: Array
-    error_m: float
+    def __init__(self, times_s: Array, positions: Array, tau: Array) -> None:
+        for _ in range(ROUNDS):
+            nearer = _nearest(control_points(tau, positions), positions, tau)
+            settled = np.abs(nearer - tau).max() < 1e-12
+            tau = nearer
+            if settled:
+                break
+        self.control, self.tau = control_points(tau, positions), tau
+        self.middle_s, self.span_s = float(times_s[0] + times_s[-1]) / 2, span_of(times_s)
+        self.clock = np.polyfit((times_s - self.middle_s) / self.span_s, tau, min(DEGREE, len(times_s) - 1))
+        self.error_m = float(np.sqrt(((self.at(times_s) - positions) ** 2).sum(1).mean()))
 
     def tau_at(self, time_s: float | Array) -> Array:
         """Parameters of times."""
@@ -75,32 +79,18 @@ class BezierPath:
         return bernstein(self.tau_at(time_s)) @ self.control
 
 
+def span_of(times_s: Array) -> float:
+    """Length of a track in seconds; not 0, also of a single key."""
+    return max(float(times_s[-1] - times_s[0]), 1e-6)
+
+
 def fit_path(times_s: Array, positions: Array) -> BezierPath:
     """The curve of a track: from parameters along the chord, and from such in proportion to the time; the better one.
     ``times_s``: f64[K], rising. ``positions``: f64[K, 3] metres."""
-    times = np.asarray(times_s, np.float64)
-    span = max(float(times[-1] - times[0]), 1e-6)
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    even = (times - times[0]) / span
+    even = (times_s - times_s[0]) / span_of(times_s)
     chord = np.concatenate([[0.0], np.cumsum(steps)]) / steps.sum() if steps.sum() > 1e-3 else even
-    middle = float(times[0] + times[-1]) / 2
-    paths = [_refined(times, positions, start, middle, span) for start in (even, chord)]
-    return min(paths, key=lambda path: path.error_m)
-
-
-def _refined(times: Array, positions: Array, tau: Array, middle: float, span: float) -> BezierPath:
-    for _ in range(ROUNDS):
-        control = control_points(tau, positions)
-        nearer = _nearest(control, positions, tau)
-        settled = np.abs(nearer - tau).max() < 1e-12
-        tau = nearer
-        if settled:
-            break
-    control = control_points(tau, positions)
-    degree = min(DEGREE, len(times) - 1)
-    clock = np.polyfit((times - middle) / span, tau, degree)
-    path = BezierPath(control, clock, middle, span, tau, 0.0)
-    return replace(path, error_m=float(np.sqrt(((path.at(times) - positions) ** 2).sum(1).mean())))
+    return min((BezierPath(times_s, positions, start) for start in (even, chord)), key=lambda path: path.error_m)
 
 
 def control_points(tau: Array, values: Array) -> Array:
@@ -145,7 +135,6 @@ class BezierNode(RigidNode):
         return cls(node.name, node.label, node.size_m, node.times_s, node.world_from_object)
 
     def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
-        """See ``StaticNode``."""
         placement = self._placement(time_s)
         if placement is None:
             return None
@@ -174,7 +163,6 @@ class BezierNode(RigidNode):
         return self._curves[tau]
 
     def to(self, device: torch.device) -> Self:
-        """See ``Node``."""
         return super().to(device).with_values(learnt=self.learnt.to(device), _curves={})
 
     def moved(self, object_from_new: NDArray[np.float64]) -> Self:
@@ -184,7 +172,6 @@ class BezierNode(RigidNode):
         return made
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """See ``StaticNode``."""
         facts, tensors = super().state()
         return facts, tensors | {f"learnt.{name}": value for name, value in self.learnt.state().items()}
 
@@ -213,7 +200,6 @@ class BezierRecipe(Recipe):
     """See the module's text."""
 
     def start(self, given: FitStart) -> SceneModel:
-        """See ``Recipe``."""
         model = given.model()
         columns = {name: value.detach() for name, value in model.table.columns.items()}
         table = Table(columns | {"curve": torch.zeros(len(model.table), 4, 3)}, model.table.labels)
@@ -221,7 +207,6 @@ class BezierRecipe(Recipe):
         return replace(model, table=table, nodes=nodes)
 
     def terms(self, drawn: DrawnView) -> dict[str, Tensor]:
-        """See ``Recipe``."""
         view = drawn.view
         terms = {"smooth": SMOOTH_WEIGHT * losses.edge_aware(drawn.inverse_depth, view.rgb)}
         terms |= drawn.lidar_term(LIDAR_WEIGHT)

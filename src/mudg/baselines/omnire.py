@@ -144,23 +144,19 @@ class DeformedNode(RigidNode):
         return made
 
     def linked(self, nodes: Sequence[StaticNode | RigidNode]) -> Self:
-        """See ``Node``."""
         field = next((node for node in nodes if isinstance(node, DeformationField)), None)
         return self if field is self.field else self.with_values(field=field)
 
     def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
-        """See ``Node``."""
         if self.field is None or self.rests or len(rows.means) == 0 or self.keys_around(time_s) is None:
             return super().at_time(rows, time_s)
         moved = self.field.displacement(self.place_in_box(rows.means), time_s, self.instance)
         return super().at_time(replace(rows, means=rows.means + moved), time_s)
 
     def moved(self, object_from_new: NDArray[Any]) -> Self:
-        """See ``RigidNode``."""
         return super().moved(object_from_new).with_values(instance=self.instance, field=self.field)
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """See ``StaticNode``."""
         facts, tensors = super().state()
         return facts | {"instance": self.instance}, tensors
 
@@ -186,7 +182,6 @@ class OmniRecipe(Recipe):
     last_densified: ClassVar[float] = 0.5
 
     def start(self, given: FitStart) -> SceneModel:
-        """See ``Recipe``."""
         model, config = given.model(), given.config
         limbed = [node for node in model.nodes if isinstance(node, DeformableNode)]
         if not limbed:
@@ -207,7 +202,6 @@ class OmniRecipe(Recipe):
         return model.with_nodes(tuple(resting))
 
     def terms(self, drawn: DrawnView) -> dict[str, Tensor]:
-        """See ``Recipe``."""
         if (lidar := drawn.view.lidar) is None:
             return {}
         return {"lidar": LIDAR_WEIGHT * (drawn.render.depth.reshape(-1)[lidar.pixel] - lidar.depth_m).abs().mean()}

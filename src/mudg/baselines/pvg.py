@@ -56,17 +56,17 @@ class VibrationNode(StaticNode):
     kind = "vibration"
     facts = ("name", "middle_s", "frame_s")
     short_life = 0.01
+    early = 0.0
 
-    def __init__(self, name: str, middle_s: float, frame_s: float, early: float = 0.0) -> None:
+    def __init__(self, name: str, middle_s: float, frame_s: float) -> None:
         super().__init__(name)
-        self.middle_s, self.frame_s, self.early = float(middle_s), float(frame_s), float(early)
+        self.middle_s, self.frame_s = float(middle_s), float(frame_s)
 
     def time_of(self, time_s: float) -> float:
         """Seconds to units of time."""
         return (time_s - self.middle_s) / self.frame_s * FRAME
 
     def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
-        """See ``Node``."""
         tau, beta, velocity = rows.own["tau"], rows.own["log_beta"].exp(), rows.own["velocity"]
         since = self.time_of(time_s) - self.early - tau
         factor = torch.exp(-(since**2) / (2 * beta**2))

@@ -124,7 +124,6 @@ class HexPlaneNode(StaticNode):
             return inside.nonzero()[:, 0]
 
     def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
-        """See ``StaticNode``."""
         if self.rests:
             return rows
         asked = self.asked(rows.means)
@@ -133,7 +132,6 @@ class HexPlaneNode(StaticNode):
         return replace(rows, means=means, sh_dc=colors)
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """See ``StaticNode``."""
         facts = {"name": self.name, "low": list(self.low), "high": list(self.high), "gain": self.gain}
         return {**facts, **asdict(self.sizes)}, self.learnt.state()
 
@@ -197,7 +195,6 @@ class FieldRecipe(Recipe):
     last_densified: ClassVar[float] = 0.5
 
     def common(self, config: FitConfig) -> FitConfig:
-        """See ``Recipe``."""
         return replace(config, loss=replace(config.loss, lidar_weight=0.0, ssim_weight=SSIM_SHARE / (1 + SSIM_SHARE)))
 
     def start(self, given: FitStart) -> SceneModel:
@@ -222,7 +219,6 @@ class FieldRecipe(Recipe):
         return model.with_nodes(tuple(node.with_values(**changes) for node in model.nodes))
 
     def terms(self, drawn: DrawnView) -> dict[str, Tensor]:
-        """See ``Recipe``."""
         terms: dict[str, Tensor] = {}
         lidar, whole = drawn.view.lidar, 1 + SSIM_SHARE
         if lidar is not None:

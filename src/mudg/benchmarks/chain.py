@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -19,12 +20,13 @@ from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.layout import OBSERVATION_FILES, below
 from mudg.base.processes import run_in_processes
-from mudg.base.run_folder import RunDir, is_temporary
+from mudg.base.run_folder import RunDir, is_temporary, refuse_overlap
 from mudg.base.types import Trajectory
-from mudg.benchmarks.rows import FILL, FULL, LONGER, MIXED, REPAIRED, Row, usual_fit
+from mudg.benchmarks.rows import FILL, FULL, LONGER, MIXED, REPAIRED, Facts, Row, refuse_unfit, usual_fit
 from mudg.benchmarks.settings import BenchConfig
 from mudg.core.pictures import resize_area
 from mudg.core.raster.rasterize import drawing_device
+from mudg.diffusion import model_files
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing.settings import RenderConfig
 from mudg.formats.exporters.video import jpeg_bytes, mp4_within, video_encoders
@@ -38,11 +40,10 @@ from mudg.steps.fit import Fit
 from mudg.steps.ingest import Fuse
 from mudg.steps.pipeline import WITHOUT_DIFFUSION, fits_of
 from mudg.steps.render import RenderViews
+from mudg.steps.settings import PresetName
 from mudg.steps.synthesize import Synthesize
-from mudg.viewer.report import FPS, panel_grid, panel_size
+from mudg.viewer.report import FPS, PANEL_WIDTH, panel_grid, panel_size
 
-Facts = Mapping[str, Any]
-"""What was measured, by name, as in JSON."""
 PAGES: Final = ("bench.json", "bench.md")
 
 
@@ -56,10 +57,12 @@ def compare(
     """Do all jobs (title -> what another process can measure), several at a time with one thread each; write
     ``bench.json`` and ``bench.md``. Results do not depend on how many run at a time; finished steps of an interrupted
     benchmark are reused. ``document``: what ``bench.json`` holds, from what the jobs measured, in their order."""
-    measured, titles = {}, list(jobs)
+    measured, titles, at_once = {}, list(jobs), config.processes
+    if not at_once:  # one per core, or one where they would share a GPU
+        at_once = os.cpu_count() or 1 if drawing_device(config.device, "benchmark").type == "cpu" else 1
     with log.task("logs", len(jobs)) as bar, native.one_thread():
         work = [(measure,) for measure in jobs.values()]
-        for index, facts in run_in_processes(operator.call, work, min(at_once(config), len(jobs))):
+        for index, facts in run_in_processes(operator.call, work, min(at_once, len(jobs))):
             measured[index] = facts
             bar.update(titles[index])
             bar.advance()
@@ -67,14 +70,6 @@ def compare(
     store.write_json(out / "bench.json", content)
     store.write_text(out / "bench.md", markdown(content))
     return out
-
-
-def at_once(config: BenchConfig) -> int:
-    """Logs that are processed at the same time: as many as asked for, else one per core, or one where they would share
-    a GPU."""
-    if config.processes:
-        return config.processes
-    return os.cpu_count() or 1 if drawing_device(config.device, "benchmark").type == "cpu" else 1
 
 
 def run_step(step: Result) -> Path:
@@ -87,12 +82,25 @@ def run_step(step: Result) -> Path:
         return step.run()
 
 
-def refuse_foreign(out: Path, bench: str, table: str = "", may_be: Callable[[Path], bool] = Path.is_dir) -> None:
-    """UsageError if a folder, which need not exist, holds anything that a benchmark (under a table of a paper) does not
-    write. ``may_be``: whether an entry may belong to it that is none of ``PAGES``."""
+def refuse(
+    bench: str,
+    config: BenchConfig,
+    preset: PresetName,
+    rows: Sequence[Row],
+    out: Path,
+    *,
+    read: Mapping[str, Path | str] = MappingProxyType({}),
+    table: str = "",
+) -> None:
+    """Refuse, before anything is written, what a benchmark (under a table of a paper) cannot do. UsageError: ``out``,
+    which need not exist, touches what is ``read`` or holds anything that it does not write, or as `rows.refuse_unfit`.
+    InputError: there is no such model."""
+    refuse_overlap(out, {"model": model_files.folder_of(config.model), **read})
+    refuse_unfit(config, preset, rows)
     if not out.exists():
         return
     entries = [entry for entry in out.iterdir() if not is_temporary(entry.name)] if out.is_dir() else [out]
+    may_be = (lambda entry: entry.name.isdigit()) if bench in ("shift", "loop") else Path.is_dir
     foreign = [entry.name for entry in entries if entry.name not in PAGES and not may_be(entry)]
     pages = [entry.name for entry in entries if entry.name in PAGES]
     if pages and not foreign:
@@ -105,6 +113,27 @@ def refuse_foreign(out: Path, bench: str, table: str = "", may_be: Callable[[Pat
     if foreign:
         what = "the output folder holds files that do not belong to this run"
         raise UsageError(what, where=str(out), got=", ".join(sorted(foreign)[:8]), remedy="choose an empty --out")
+
+
+def standard_error(of: Callable[[Sequence[Any]], float | None], items: Sequence[Any]) -> float | None:
+    """Standard error of a statistic of independent items by leaving out each in turn; None for fewer than two items."""
+    count = len(items)
+    values = [of([*items[:i], *items[i + 1 :]]) for i in range(count)] if count > 1 else [None]
+    known = [value for value in values if value is not None]
+    if len(known) < len(values):
+        return None
+    center = mean(known)
+    return math.sqrt((count - 1) / count * sum((value - center) ** 2 for value in known))
+
+
+def mean(values: Sequence[float]) -> float:
+    """The sum over the number."""
+    return sum(values) / len(values)
+
+
+def virtual_fits_of(settings: Facts) -> str:
+    """How many iterations fits under virtual views have, as part of a sentence."""
+    return f"{settings['guided_share']:g} times as many under virtual views"
 
 
 def seconds_of(out: Path) -> dict[str, float]:
@@ -174,9 +203,7 @@ class Chain:
 
     def fitted(self, row: Row, virtual: Sequence[Path] = ()) -> Path:
         """The fit of a row; ``virtual``: views that it learns from, if its method learns from such."""
-        out, settings = self.out / "fit" / row.name, row.fit or usual_fit(self.config)
-        if row.name == MIXED:
-            out = self.out / "fit" / FULL
+        out, settings = self.out / "fit" / (FULL if row.name == MIXED else row.name), row.fit or usual_fit(self.config)
         if row.name == LONGER:
             further = max(1, round((self.config.guided_share - 1) * settings.iterations))
             return self._fit(replace(settings, iterations=further), out, begun=self.first())
@@ -237,7 +264,6 @@ class FillViews(Output):
         return self.key_settings()
 
 
-PANEL_WIDTH: Final = 320
 QUALITY: Final = (29, 41)
 VIDEO_BYTES: Final = 900 * 1024
 """A video larger than this is made anew in lower quality: eight logs of seven trajectories stay under 60 MB."""
@@ -281,7 +307,7 @@ def _frames(
     sets: Mapping[str, ObservationSet], order: Sequence[str], frames: Sequence[int]
 ) -> Iterator[NDArray[np.uint8]]:
     camera = next(iter(sets.values())).views[0].camera
-    size = panel_size(camera.width, camera.height, PANEL_WIDTH)
+    size = panel_size(camera.width, camera.height)
     rows = [row for row in ROWS if row != "error" or "truth" in sets]
     for frame in frames:
         seen = {column: sets[column][frame] if column in sets else None for column in order}

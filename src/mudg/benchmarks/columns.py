@@ -43,22 +43,6 @@ LEAST_POINTS: Final = 10
 """A dynamic object counts in a view that shows at least this many of its LiDAR points."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Target:
-    """A view to score: where its values are pooled (``place``), the recorded frame (of its moment), and its maps by
-    name."""
-
-    place: str
-    frame: Frame
-    view: View
-    maps: Mapping[str, NDArray[Any]]
-    color_map: ColorMap
-
-    def photo(self, scene: Scene) -> Tensor:
-        """The photograph f32[3, H, W] in 0..1."""
-        return torch.from_numpy(read_image(scene, self.frame).copy()).permute(2, 0, 1).float() / 255
-
-
 @dataclass(frozen=True)
 class Targets:
     """All views of a log under a protocol; ``reason`` says why there are none."""
@@ -69,16 +53,27 @@ class Targets:
     facts: Mapping[str, Any]
     reason: str
 
-    def __len__(self) -> int:
-        return len(self.records)
-
-    def load(self, index: int, scene: Scene) -> Target:
-        """One view."""
-        record = self.records[index]
+    def sight(
+        self, number: int, scene: Scene, views: ViewFinder, protocol: Protocol, distance: Distance | None
+    ) -> Sight:
+        """A method's view brought to the size and the colours of its target."""
+        record = self.records[number]
         frame = next(frame for frame in scene.frames if frame.id == record["frame"])
-        maps = store.read_safetensors(self.folder / "maps" / f"{index:06d}.safetensors")
         view = _view_of(scene, frame, float(record["shift_m"]))
-        return Target(record["place"], frame, view, maps, self.color_maps.get(record["place"], ColorMap()))
+        colors = self.color_maps.get(record["place"], ColorMap())
+        seen, height, width = views.at(view), view.camera.height, view.camera.width
+        rgb, depth, photo = resize_rgb(seen.rgb, height, width), None, None
+        if colors.pairs:
+            gain, offset = (torch.tensor(part).view(3, 1, 1) for part in (colors.gain, colors.offset))
+            rgb = (rgb * gain + offset).clamp(0, 1)
+        if seen.depth is not None:
+            depth = resize_nearest(seen.depth, height, width)
+            given = torch.isfinite(depth) & (depth > 0)
+            depth = torch.where(given, depth, DEPTH_LIMIT_M).clamp(max=DEPTH_LIMIT_M)
+        if "photo" in protocol.maps:
+            photo = torch.from_numpy(read_image(scene, frame).copy()).permute(2, 0, 1).float() / 255
+        maps = store.read_safetensors(self.folder / "maps" / f"{number:06d}.safetensors")
+        return Sight(maps, rgb, depth, photo, distance)
 
 
 class MakeTargets(Output):
@@ -99,14 +94,35 @@ class MakeTargets(Output):
         return {"protocol": asdict(self.protocol), "held_out": list(self.held), "cameras": list(self.cameras)}
 
     def make(self, work: RunDir) -> dict[str, Any]:
-        scene, hidden = read_scene(self.log), set(self.held)
-        maker = _Maker(self.protocol, scene, self.shown)
+        scene, hidden, protocol = read_scene(self.log), set(self.held), self.protocol
+        maker = _Maker(protocol, scene, self.shown)
         frames = [f for f in scene.frames if (f.id in hidden if hidden else f.view.camera.name in self.cameras)]
-        by_camera = {name: [f for f in frames if f.view.camera.name == name] for name in scene.cameras}
-        records, left_out, color_maps = _written(maker, by_camera, work.path)
+        records, left_out, color_maps = [], {}, {}
+        with log.task(f"truth of {protocol.name}", len(frames)) as bar:
+            for name in scene.cameras:
+                own = [frame for frame in frames if frame.view.camera.name == name]
+                reason = maker.unsuitable(own) if own else ""
+                if reason:
+                    left_out[name] = reason
+                elif own and "seen" in protocol.maps:
+                    color_maps[name] = asdict(maker.color_map(own[:: protocol.every]))
+                for number, frame in enumerate(own):
+                    bar.advance()
+                    if reason or (protocol.every > 1 and number % protocol.every == 0):
+                        continue
+                    for shift_m in protocol.shifts_m:
+                        maps = maker.maps(frame, shift_m)
+                        if maps is None:
+                            continue
+                        place = f"{abs(shift_m):g} m" if shift_m else name
+                        record = {"place": place, "frame": frame.id, "shift_m": shift_m}
+                        if "seen" in maps:
+                            seen, share = int(maps["seen"].sum()), round(float(maps["seen"].mean()), 4)
+                            record |= {"seen_px": seen, "seen_share": share}
+                        store.write_safetensors(work.path / "maps" / f"{len(records):06d}.safetensors", maps)
+                        records.append(record)
         reason = "" if records else next(iter(left_out.values()), "no frame to score")
-        document = {"views": records, "color_maps": {name: asdict(found) for name, found in color_maps.items()}}
-        document |= {"left_out": left_out, "reason": reason}
+        document = {"views": records, "color_maps": color_maps, "left_out": left_out, "reason": reason}
         store.write_json(work.path / "targets.json", document)
         return {"views": len(records)}
 
@@ -133,37 +149,6 @@ def _view_of(scene: Scene, frame: Frame, shift_m: float) -> View:
     name = frame.view.camera.name
     index = [f.id for f in scene.frames_of(name)].index(frame.id)
     return trajectory.shifted(scene, name, shift_m).views[index]
-
-
-def _written(
-    maker: _Maker, by_camera: Mapping[str, Sequence[Frame]], out: Path
-) -> tuple[list[dict[str, Any]], dict[str, str], dict[str, ColorMap]]:
-    """Write the maps of all views; returns their records, the cameras left out with the reason, and the colour maps of
-    cameras."""
-    protocol, records, left_out, color_maps = maker.protocol, [], {}, {}
-    with log.task(f"truth of {protocol.name}", sum(map(len, by_camera.values()))) as bar:
-        for name, frames in by_camera.items():
-            reason = maker.unsuitable(frames) if frames else ""
-            if reason:
-                left_out[name] = reason
-            elif frames and "seen" in protocol.maps:
-                color_maps[name] = maker.color_map(frames[:: protocol.every])
-            for number, frame in enumerate(frames):
-                bar.advance()
-                if reason or (protocol.every > 1 and number % protocol.every == 0):
-                    continue
-                for shift_m in protocol.shifts_m:
-                    maps = maker.maps(frame, shift_m)
-                    if maps is None:
-                        continue
-                    place = f"{abs(shift_m):g} m" if shift_m else name
-                    record = {"place": place, "frame": frame.id, "shift_m": shift_m}
-                    if "seen" in maps:
-                        seen, share = int(maps["seen"].sum()), round(float(maps["seen"].mean()), 4)
-                        record |= {"seen_px": seen, "seen_share": share}
-                    store.write_safetensors(out / "maps" / f"{len(records):06d}.safetensors", maps)
-                    records.append(record)
-    return records, left_out, color_maps
 
 
 class _Maker:
@@ -253,23 +238,22 @@ Distance = Callable[[metrics.Pair], float | None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
-    """A method's view beside its truth: colour f32[3, H, W] as the target's camera would record it, depth f32[1, H, W]
-    metres (80 m where there is none); the photograph f32[3, H, W] or None; ``distance``:
+    """A method's view beside its truth: the target's maps by name; colour f32[3, H, W] as the target's camera would
+    record it, depth f32[1, H, W] metres (80 m where there is none); the photograph f32[3, H, W] or None; ``distance``:
     perceptual, or None at a view where it is not computed."""
 
-    target: Target
+    maps: Mapping[str, NDArray[Any]]
     rgb: Tensor
     depth: Tensor | None
     photo: Tensor | None
     distance: Distance | None
 
     def mask(self, name: str) -> Tensor | None:
-        """A mask bool[1, H, W] by the name of its map; ``upper``: the upper third of the image. None where the truth
-        has no such map."""
+        """A mask bool[1, H, W] by the name of its map, None where the truth has none; ``upper``: the upper third."""
         if name == "upper":
             height, width = self.rgb.shape[-2:]
             return (torch.arange(height) < height // 3)[None, :, None].expand(1, height, width)
-        values = self.target.maps.get(name)
+        values = self.maps.get(name)
         return None if values is None else torch.from_numpy(values > 0)[None]
 
     def part(self, known: Tensor, name: str) -> Tensor:
@@ -365,7 +349,7 @@ def _depth(error: Callable[[Tensor, Tensor], Tensor], part: str = "") -> Measure
     def of(sight: Sight) -> Sum | None:
         if sight.depth is None:
             return None
-        true = torch.from_numpy(sight.target.maps["depth"])[None]
+        true = torch.from_numpy(sight.maps["depth"])[None]
         chosen = sight.part(true > 0, part)
         return _summed(error(sight.depth[chosen].double(), true[chosen].double()))
 
@@ -379,7 +363,7 @@ def _point_color(error: Callable[[Tensor], Tensor], part: str) -> Measure:
         colored = sight.mask("colored")
         if colored is None:
             return None
-        true = torch.from_numpy(sight.target.maps["color"]).permute(2, 0, 1).float() / 255
+        true = torch.from_numpy(sight.maps["color"]).permute(2, 0, 1).float() / 255
         return _summed(error((sight.rgb.clamp(0, 1) - true)[:, sight.part(colored, part)[0]].double()))
 
     return of
@@ -389,12 +373,12 @@ def _relative(generated: Tensor, true: Tensor) -> Tensor:
     return (generated - true).abs() / true
 
 
-def _within(generated: Tensor, true: Tensor) -> Tensor:
-    return (torch.maximum(generated.clamp_min(1e-6) / true, true / generated.clamp_min(1e-6)) < 1.25).double()
-
-
 def _squared(generated: Tensor, true: Tensor) -> Tensor:
     return (generated - true) ** 2
+
+
+def _within(generated: Tensor, true: Tensor) -> Tensor:
+    return (torch.maximum(generated.clamp_min(1e-6) / true, true / generated.clamp_min(1e-6)) < 1.25).double()
 
 
 _PARTS: Final = ("seen", "static", "dynamic")
@@ -450,23 +434,21 @@ class ScoreTargets(Output):
     def make(self, work: RunDir) -> dict[str, Any]:
         scene, targets, finder = read_scene(self.log), read_targets(self.truth), ViewFinder(self.views)
         protocol, sampled, features = self.protocol, set(), None
+        places = [record["place"] for record in targets.records]
         if any(name.startswith("perceptual") for name in protocol.columns):
-            places = [record["place"] for record in targets.records]
             own = [[n for n, place in enumerate(places) if place == one] for one in dict.fromkeys(places)]
             sampled = {number for numbers in own for number in evenly(numbers, PERCEPTUAL_VIEWS)}
         if sampled:
             network = choose_device(self.device, "networks of the scores")
             features = PerceptualDistance(shipped_features(network), device=network)
         sums: dict[str, dict[str, Sum]] = {}
-        with log.task(f"score {protocol.name}", len(targets)) as bar:
-            for number in range(len(targets)):
-                target = targets.load(number, scene)
-                distance, view = features if number in sampled else None, finder.at(target.view)
-                sight = sight_of(target, view, scene, protocol, distance)
-                _add(sums.setdefault(target.place, {}), {name: COLUMNS[name].of(sight) for name in protocol.columns})
+        with log.task(f"score {protocol.name}", len(places)) as bar:
+            for number, place in enumerate(places):
+                sight = targets.sight(number, scene, finder, protocol, features if number in sampled else None)
+                _add(sums.setdefault(place, {}), {name: COLUMNS[name].of(sight) for name in protocol.columns})
                 bar.advance()
         store.write_json(work.path / "metrics.json", values_of(protocol, sums))
-        return {"views": len(targets)}
+        return {"views": len(places)}
 
 
 def _add(total: dict[str, Sum], part: Mapping[str, Sum | None]) -> None:
@@ -495,21 +477,6 @@ def mean_values(rows: list[dict[str, float | str]], columns: tuple[str, ...]) ->
     """Means by column over the rows that have a number."""
     numbers = {name: [value for row in rows if not isinstance(value := row[name], str)] for name in columns}
     return {name: round(sum(values) / len(values), 6) if values else NONE for name, values in numbers.items()}
-
-
-def sight_of(target: Target, seen: Observation, scene: Scene, protocol: Protocol, distance: Distance | None) -> Sight:
-    """A method's view brought to the size and the colours of its target."""
-    height, width = target.view.camera.height, target.view.camera.width
-    rgb = resize_rgb(seen.rgb, height, width)
-    if target.color_map.pairs:
-        gain, offset = (torch.tensor(part).view(3, 1, 1) for part in (target.color_map.gain, target.color_map.offset))
-        rgb = (rgb * gain + offset).clamp(0, 1)
-    depth = None
-    if seen.depth is not None:
-        depth = resize_nearest(seen.depth, height, width)
-        given = torch.isfinite(depth) & (depth > 0)
-        depth = torch.where(given, depth, DEPTH_LIMIT_M).clamp(max=DEPTH_LIMIT_M)
-    return Sight(target, rgb, depth, target.photo(scene) if "photo" in protocol.maps else None, distance)
 
 
 class ViewFinder:

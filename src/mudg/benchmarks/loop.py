@@ -18,30 +18,16 @@ from numpy.typing import NDArray
 from mudg.base import geometry, store
 from mudg.base.errors import UsageError
 from mudg.base.html import markdown_table
-from mudg.base.run_folder import refuse_overlap
 from mudg.base.types import Camera, View
-from mudg.benchmarks.chain import Facts, compare, refuse_foreign
+from mudg.benchmarks.chain import compare, mean, refuse, standard_error
 from mudg.benchmarks.places import Views, listed_cities, score_settings
-from mudg.benchmarks.rows import (
-    BASE,
-    FULL,
-    MIXED,
-    PaperPlace,
-    PaperTable,
-    chain_settings,
-    method_rows,
-    model_settings,
-    refuse_unfit,
-)
+from mudg.benchmarks.rows import BASE, FULL, MIXED, Facts, PaperPlace, PaperTable, method_rows, settings_of
 from mudg.benchmarks.settings import BenchConfig
-from mudg.benchmarks.shift import standard_error
-from mudg.city import logs as city_logs
-from mudg.city.logs import STANDARD, LogRules
+from mudg.city.config import CityConfig
+from mudg.city.logs import STANDARD
 from mudg.city.world import CityWorld
 from mudg.core import metrics
-from mudg.diffusion import model_files
 from mudg.scene.motion import Road
-from mudg.scene.read import read_scene
 from mudg.sim.drive import Cockpit, Drive, Following, RoadUser, beginning
 from mudg.sim.lidar import LidarRequest, MountedLidar, mounted
 from mudg.sim.pilots import DriverView, EdgePilot, RoutePilot
@@ -77,43 +63,32 @@ COLUMNS: Final[Mapping[str, tuple[str, int]]] = {
 }
 
 
-@dataclass(frozen=True)
 class LoopLog(Views):
     """One log of the list."""
-
-    rules: LogRules = STANDARD
 
     def measure(self) -> dict[str, Any]:
         """What every row measured with every pilot."""
         self.chain.fuse()
-        course = Course.of(CityWorld(city_logs.log_config(int(self.log.name), self.rules)))
-        drives = self.out / "drives"
+        course, drives = Course.of(self.city), self.out / "drives"
 
-        def finished(path: Path, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        def finished(row: str, pilot: str, *judged: Any) -> dict[str, Any]:
             """What an interrupted benchmark wrote, else measured now."""
+            path = drives / f"{row}-{pilot.replace(' ', '_')}.json"
             if not path.is_file():
-                store.write_json(path, measure())
+                picture = path.with_suffix(".jpg") if judged else None
+                store.write_json(path, measure_drive(course, pilot, *judged, picture=picture))
             return store.read_json(path)
 
-        exact = {
-            pilot: finished(drives / f"exact-{pilot.replace(' ', '_')}.json", partial(measure_drive, course, pilot))
-            for pilot in PILOTS
-        }
-        scene = read_scene(self.scene)
-        lidar = mounted(scene, scene.sweeps[0].sensor)
+        exact = {pilot: finished("exact", pilot) for pilot in PILOTS}
+        lidar = mounted(self.loaded, self.loaded.sweeps[0].sensor)
         values = {EXACT: {pilot: parting(of["path"], of["path"]) for pilot, of in exact.items()}}
         for row in self.rows:
-            virtual: tuple[Path, ...] = ()
-            if row.learns_virtual:
-                virtual = (self.chain.generated(self.off_path, self.out / self.virtual),)
-            cockpit = Cockpit(Session(self.chain.fitted(row, virtual), scene=self.scene), (), 0, SEEN)
-            sweep = partial(sweep_errors, course, cockpit.session, lidar)
-            values[row.name] = {}
+            session = Session(self.chain.fitted(row, self.learned(row)), scene=self.scene)
+            cockpit = Cockpit(session, (), 0, SEEN)
+            eyes = lambda drive, cockpit=cockpit: next(iter(cockpit.see(drive).values())).layers
+            sweep, values[row.name] = partial(sweep_errors, course, session, lidar), {}
             for pilot in PILOTS:
-                name = f"{row.name}-{pilot.replace(' ', '_')}"
-                eyes = lambda drive, cockpit=cockpit: next(iter(cockpit.see(drive).values())).layers
-                go = partial(measure_drive, course, pilot, eyes, drives / f"{name}.jpg", sweep)
-                drive = finished(drives / f"{name}.json", go)
+                drive = finished(row.name, pilot, eyes, sweep)
                 scores = {key: value for key, value in drive.items() if key != "path"}
                 values[row.name][pilot] = {**scores, **parting(drive["path"], exact[pilot]["path"])}
         return {"log": int(self.log.name), "values": values}
@@ -178,8 +153,9 @@ def measure_drive(
     course: Course,
     pilot: str,
     eyes: Eyes | None = None,
-    picture: Path | None = None,
     sweep: Callable[[Drive], dict[str, float]] | None = None,
+    *,
+    picture: Path | None = None,
 ) -> dict[str, Any]:
     """One drive: where it led, and how right its pictures were. ``eyes``: None: the exact city, whose pictures need no
     score. ``picture``: where one of them is written beside the exact one. ``sweep``: judges the LiDAR at a moment."""
@@ -200,8 +176,8 @@ def measure_drive(
         counts = counts + metrics.confusion(*(torch.from_numpy(of["classes"].astype(np.int64)) for of in (seen, truth)))
     if picture is not None and shown:
         store.write_image(picture, np.concatenate(shown[3 * len(shown) // 4], 1), quality=90)
-    mean = lambda rows: {name: float(np.mean([one[name] for one in rows])) for name in (rows[0] if rows else {})}
-    means = mean(errors) | mean(swept)
+    mean_of = lambda rows: {name: float(np.mean([one[name] for one in rows])) for name in (rows[0] if rows else {})}
+    means = mean_of(errors) | mean_of(swept)
     if errors:
         means["miou"] = float(np.mean(list(metrics.iou_of(counts).values())))
     return {"path": path, **means}
@@ -243,7 +219,7 @@ def run(
     *,
     preset: PresetName = "default",
     overwrite: bool = False,
-    rules: LogRules = STANDARD,
+    rules: CityConfig = STANDARD,
 ) -> Path:
     """Drive in the logs of a list; returns ``out`` with ``bench.json`` and ``bench.md``. Arguments and errors as of
     ``shift.run``."""
@@ -253,22 +229,15 @@ def run(
     without = [row.name for row in rows if row.fit is None or row.name == MIXED]
     if without:
         raise UsageError("nobody can drive in this row: it is no scene", where="--methods", got=", ".join(without))
-    refuse_overlap(out, {"model": model_files.folder_of(config.model)})
-    refuse_foreign(out, "loop", may_be=lambda entry: entry.name.isdigit())
-    refuse_unfit(config, preset, rows, [])
+    refuse("loop", config, preset, rows, out)
     shifts_m = [d * side for d in (2.0, 3.0, 4.0) for side in (1, -1)]
     table = PaperTable(name="loop", places=[PaperPlace(name="off", title="", shifts_m=shifts_m)], columns=[])
     last = (config, score_settings(config, table), overwrite, "synthesize")
     logs = listed_cities(config.list, config.logs, rules)
-    jobs = {log.name: LoopLog(log, out / log.name, table, rows, *last, rules=rules).measure for log in logs}
-    settings = {
-        "list": config.list,
-        **model_settings(config),
-        "frames": rules.frames,
-        "size_px": [rules.width, rules.height],
-        "aims_m": {name: aim_m for name, (_, aim_m) in PILOTS.items()},
-        **chain_settings(config, preset),
-    }
+    jobs = {log.name: LoopLog(log, out / log.name, table, rows, *last).measure for log in logs}
+    how = {"frames": rules.n_frames, "size_px": [rules.width, rules.height]}
+    how |= {"aims_m": {name: aim_m for name, (_, aim_m) in PILOTS.items()}}
+    settings = settings_of(config, preset, {"list": config.list}, how)
     names = [EXACT, *(row.name for row in rows)]
     filled = lambda logs: {"schema": 1, "bench": "loop", "settings": settings, "rows": names, **pooled(names, logs)}
     return compare(out, jobs, config, filled, markdown)
@@ -283,8 +252,7 @@ def pooled(names: Sequence[str], logs: Sequence[Facts]) -> dict[str, Any]:
         for column in COLUMNS:
             values = [float(np.mean([drive[column] for drive in drives])) for drives in per_log if column in drives[0]]
             if values:
-                error = standard_error(lambda items: sum(items) / len(items), values)
-                means[name][column] = {"mean": float(np.mean(values)), "standard_error": error}
+                means[name][column] = {"mean": float(np.mean(values)), "standard_error": standard_error(mean, values)}
     return {"logs": list(logs), "pooled": means}
 
 
@@ -293,9 +261,7 @@ def markdown(doc: Facts) -> str:
     settings, names = doc["settings"], doc["rows"]
     heads = ["row", *(title for title, _ in COLUMNS.values())]
     rows = [[name, *_cells({c: of["mean"] for c, of in doc["pooled"][name].items()})] for name in names]
-    drives = [
-        (e["log"], name, pilot, of) for e in doc["logs"] for name in names for pilot, of in e["values"][name].items()
-    ]
+    drives = [(log["log"], name, *one) for log in doc["logs"] for name in names for one in log["values"][name].items()]
     each = [[str(log), name, pilot, *_cells(drive)] for log, name, pilot, drive in drives]
     title = f"# Closed loop: {len(doc['logs'])} logs of the {settings['list']} list"
     about = (

@@ -5,7 +5,7 @@ compare the views of all logs at a place, as one set: a mean of the distances of
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from statistics import fmean
 from types import MappingProxyType
@@ -18,36 +18,11 @@ from mudg.base import config as configuration
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.html import ARROWS, best_of, markdown_table
-from mudg.base.run_folder import refuse_overlap
-from mudg.benchmarks.chain import Facts, compare, refuse_foreign, seconds_of
-from mudg.benchmarks.places import (
-    TRUTH,
-    ListedCity,
-    Views,
-    first_camera,
-    logs_of,
-    missing_scenes,
-    of_log,
-    score_settings,
-)
-from mudg.benchmarks.rows import (
-    FILL,
-    PAPERS,
-    TABLES,
-    PaperColumn,
-    PaperTable,
-    Row,
-    chain_settings,
-    generator_of,
-    model_settings,
-    paper_rows,
-    refuse_unfit,
-)
+from mudg.benchmarks.chain import compare, refuse, seconds_of, standard_error, virtual_fits_of
+from mudg.benchmarks.places import TRUTH, Views, first_camera, logs_of, missing_scenes, of_log, score_settings
+from mudg.benchmarks.rows import FILL, PAPERS, TABLES, Facts, PaperColumn, PaperTable, Row, paper_rows, settings_of
 from mudg.benchmarks.settings import BenchConfig
-from mudg.benchmarks.shift import standard_error, virtual_fits_of
 from mudg.core.metrics import METRICS
-from mudg.diffusion import model_files as mdm_files
-from mudg.gaussians.settings import METHODS
 from mudg.scoring.sets import FEATURES_FOLDER, FEWEST, distances, video_entry
 from mudg.scoring.tables import NO_TRUTH, NOT_COMPUTED, SET_METRICS
 from mudg.steps.settings import PresetName
@@ -70,7 +45,6 @@ Values = dict[str, dict[str, Any]]
 """Column -> ``{"value": number or reason, "n", "n_reference"}``."""
 
 
-@dataclass(frozen=True)
 class PaperLog(Views):
     """One log under a table."""
 
@@ -104,7 +78,12 @@ class PaperLog(Views):
         counts = {"frames": len(scene.frames_of(first_camera(scene, ()))), "size": ", ".join(sizes)}
         counts |= {"held_out": len(scene.frames_in("test")), "tracks": len(scene.tracks)}
         about = {"note": self.log.note, "exact": truth is not None}
-        scores = {"values": values, "features": features, "made": _made_of(fill)}
+        # how distances of sets were made: networks, digests of their weights, resize rules, epsilon, clips
+        made: dict[str, Any] = {"depth_rule": fill[0]["rules"][3] if len(fill[0]["rules"]) > 3 else ""}
+        for entry, document in product(dict.fromkeys(SET_METRICS.values()), fill):
+            if of := document.get(entry):
+                made[entry] = {name: value for name, value in of.items() if name not in ("floors", "sets")}
+        scores = {"values": values, "features": features, "made": made}
         return {**names, **counts, **about, **scores, "seconds": seconds_of(self.out)}
 
 
@@ -120,27 +99,19 @@ def run(
     table, out = TABLES[config.table], Path(out)
     rows = paper_rows(config, table, preset)
     logs = logs_of(config, sources, table)
-    read = {f"log {log.name}": log.source for log in logs if not isinstance(log, ListedCity)}
+    read = {f"log {log.name}": log.source for log in logs if isinstance(log.source, Path)}
     files = {name: value for name, value in configuration.to_dict(config.score).items() if isinstance(value, str)}
     weights = {name: at for name, at in files.items() if at and (name.endswith("weights") or Path(at).exists())}
-    refuse_overlap(out, {"model": mdm_files.folder_of(config.model), **read, **weights})
     digests = {name: store.digest(Path(path)) for name, path in weights.items()}  # before any work: one may be missing
-    refuse_foreign(out, "paper", table.name)
-    generates = [row.changes for row in rows if METHODS[row.method].made_by == "synthesize"]
-    refuse_unfit(config, preset, rows, [replace(generator_of(config), **changes) for changes in generates])
+    refuse("paper", config, preset, rows, out, read={**read, **weights}, table=table.name)
     measured = score_settings(config, table)
     jobs, first = {}, (table, (Row(FILL, ANCHORS[FILL]), *rows), config)
     for log in logs:
         own = of_log(measured, log.name)
         jobs[log.name] = PaperLog(log, out / log.name, *first, own, overwrite).measure
-    settings = {
-        "list": str(sources[0]) if isinstance(logs[0], ListedCity) else "",
-        "missing_scenes": missing_scenes(table, logs),
-        **model_settings(config),
-        "score": configuration.result_settings(measured),
-        "digests": digests,
-        **chain_settings(config, preset),
-    }
+    which = {"list": "" if read else str(sources[0]), "missing_scenes": missing_scenes(table, logs)}
+    how = {"score": configuration.result_settings(measured), "digests": digests}
+    settings = settings_of(config, preset, which, how)
     values = [{"name": r.name, "title": r.title, "method": r.method, "changes": dict(r.changes)} for r in rows]
     return compare(out, jobs, config, lambda logs: document(table, logs, values, settings, pooled(logs, out)), markdown)
 
@@ -194,16 +165,6 @@ def floors_at(documents: Sequence[Facts], names: Sequence[str], columns: Sequenc
         else:
             missing = SELF if column.key in BY_DEFINITION else NOT_COMPUTED if entry else NO_TRUTH
             result[column.key] = {"value": _reason(column, missing)}
-    return result
-
-
-def _made_of(documents: Sequence[Facts]) -> dict[str, Any]:
-    """How distances of sets were made: networks, digests of their weights, resize rules, epsilon, clips."""
-    result: dict[str, Any] = {"depth_rule": documents[0]["rules"][3] if len(documents[0]["rules"]) > 3 else ""}
-    for document in documents:
-        for entry in dict.fromkeys(SET_METRICS.values()):
-            if of := document.get(entry):
-                result[entry] = {name: value for name, value in of.items() if name not in ("floors", "sets")}
     return result
 
 
@@ -349,13 +310,18 @@ def notes_of(doc: Facts) -> list[str]:
     sizes = dict.fromkeys(f"{e['size']}, {e['frames']} frames, {e['held_out']} images held out" for e in doc["logs"])
     ours = "generated cities, not the paper's data" if settings["list"] else "the logs below"
     missing, ranked = ", ".join(settings["missing_scenes"]), "best of ours; truth and published rows are not ranked"
+    cells = [*table["cells"], *((place["name"], c["key"]) for place in table["places"] for c in doc["further"])]
+    empty: dict[str, dict[str, None]] = {}
+    for place, key in cells:
+        if reason := _shared_reason(doc, place, key):
+            empty.setdefault(reason, {})[_columns(doc)[key]["title"]] = None
     return [
         f"Published rows: {table['data']}. Ours: {ours} ({'; '.join(sizes)}). The two cannot be compared number by"
         " number.",
         f"Every fit has {settings['iterations']} iterations, {virtual_fits_of(settings)}; seed {settings['seed']}.",
         f"Means over logs; in brackets the standard error over logs. Bold: {ranked}.",
         *table["notes"],
-        *(f"{', '.join(titles)} ({NONE}): {reason}." for reason, titles in _empty_columns(doc).items()),
+        *(f"{', '.join(titles)} ({NONE}): {reason}." for reason, titles in empty.items()),
         *_notes_of_sets(doc["made"]),
         *(f"{entry['log']}: {entry['note']}." for entry in doc["logs"] if entry["note"]),
         *([f"Segments of list {table['scenes']} that were not given: {missing}."] if missing else []),
@@ -387,16 +353,6 @@ def _shared_reason(doc: Facts, place: str, key: str) -> str:
     """Why no row at all has a number in a column; empty if one has, or if reasons differ."""
     reasons = {of[place][key].get("reason", "") for of in doc["cells"].values()}
     return reasons.pop() if len(reasons) == 1 else ""
-
-
-def _empty_columns(doc: Facts) -> dict[str, dict[str, None]]:
-    """Reason -> titles of the columns in which no row has a number."""
-    wanted = [*doc["table"]["cells"], *((p["name"], c["key"]) for p in doc["table"]["places"] for c in doc["further"])]
-    of: dict[str, dict[str, None]] = {}
-    for place, key in wanted:
-        if reason := _shared_reason(doc, place, key):
-            of.setdefault(reason, {})[_columns(doc)[key]["title"]] = None
-    return of
 
 
 def main_table(doc: Facts) -> list[str]:
@@ -447,16 +403,6 @@ def _count(doc: Facts, place: str, key: str) -> str:
     return str(sum(counts["n"])) + (f" against {sum(reference)}" if reference else "")
 
 
-LOG_HEADS: Final = ("log", "dataset", "cameras", "frames", "size", "images held out", "tracked boxes", "seconds")
-
-
-def _log_cells(entry: Facts) -> list[str]:
-    """A log's row under ``LOG_HEADS``."""
-    facts = [str(entry[key]) for key in ("frames", "size", "held_out", "tracks")]
-    seconds = f"{sum(entry['seconds'].values()):.0f}"
-    return [entry["log"], entry["dataset"], ", ".join(entry["cameras"]), *facts, seconds]
-
-
 def markdown(doc: Facts) -> str:
     """The table for people; below it the further columns, one table per place."""
     lines = [f"# {heading(doc)}", "", *(f"* {note}" for note in notes_of(doc)), "", *main_table(doc), ""]
@@ -464,4 +410,10 @@ def markdown(doc: Facts) -> str:
         own = [(place["name"], column["key"]) for column in doc["further"]]
         table = markdown_table(["", *map(_headed, doc["further"])], _ours(doc, own))
         lines += [f"## {doc['further_title']}: {place['title']}", "", *table, ""]
-    return "\n".join([*lines, "## Logs", "", *markdown_table(LOG_HEADS, map(_log_cells, doc["logs"])), ""])
+    heads = ("log", "dataset", "cameras", "frames", "size", "images held out", "tracked boxes", "seconds")
+    rows = []
+    for entry in doc["logs"]:
+        facts = [str(entry[key]) for key in ("frames", "size", "held_out", "tracks")]
+        seconds = f"{sum(entry['seconds'].values()):.0f}"
+        rows.append([entry["log"], entry["dataset"], ", ".join(entry["cameras"]), *facts, seconds])
+    return "\n".join([*lines, "## Logs", "", *markdown_table(heads, rows), ""])

@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -22,7 +23,9 @@ from mudg.benchmarks.chain import Chain, Film, run_step
 from mudg.benchmarks.rows import FILL, RECORDED, SCENE_LISTS, PaperTable, Row, generator_of
 from mudg.benchmarks.settings import BenchConfig
 from mudg.city import logs as city_logs
-from mudg.city.logs import STANDARD, LogRules
+from mudg.city.config import CityConfig
+from mudg.city.logs import STANDARD
+from mudg.city.world import CityWorld
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing import render
 from mudg.editing.settings import RenderConfig, ScoreConfig
@@ -50,31 +53,19 @@ _NAME: Final = re.compile(r"[^A-Za-z0-9_.+-]+")
 
 
 @dataclass(frozen=True)
-class ListedCity:
-    """A generated log: its seed and what it is recorded with."""
+class Log:
+    """A log of a benchmark. ``name``: of its folder. ``source``: a dataset's log or a scene, or what a city is
+    generated with. ``frames``: first and last frame (both included), or None for all. ``size``: of imported images
+    (empty = as recorded). ``side``: of one-sided shifts. ``note``: what is to be said of it. ``identity``: where the
+    name of a segment is looked for: the name of a recorded log's folder, and the id of a scene."""
 
     name: str
-    seed: int
-    rules: LogRules
+    source: Path | CityConfig
+    frames: tuple[int, int] | None = None
+    size: str = ""
     side: int = 1
     note: str = ""
-
-
-@dataclass(frozen=True)
-class RecordedLog:
-    """A recorded log. ``name``: of its folder. ``source``: a dataset's log or a scene. ``frames``: first and last frame
-    (both included), or None for all. ``size``: of imported images (empty = as recorded). ``side``: of one-sided shifts.
-    ``note``: what is to be said of it."""
-
-    name: str
-    source: Path
-    frames: tuple[int, int] | None
-    size: str
-    side: int
-    note: str
-
-
-Log = ListedCity | RecordedLog
+    identity: str = ""
 
 
 def logs_of(config: BenchConfig, sources: Sequence[Path], table: PaperTable) -> tuple[Log, ...]:
@@ -104,41 +95,38 @@ def _cities(config: BenchConfig, name: str, table: PaperTable) -> tuple[Log, ...
         what, got = "a generated city takes a whole size and frames from 0 on", f"{config.resolution} {config.frames}"
         raise UsageError(what, expected="--resolution WIDTHxHEIGHT, --frames 0:END", got=got.strip())
     width, height = size or (STANDARD.width, STANDARD.height)
-    cameras = ("front",) if table.front_only else STANDARD.cameras
-    return listed_cities(name, config.logs, LogRules(frames[1] if frames else STANDARD.frames, width, height, cameras))
+    cameras, count = ("front",) if table.front_only else STANDARD.cameras, frames[1] if frames else STANDARD.n_frames
+    rules = replace(STANDARD, n_frames=count, width=width, height=height, cameras=cameras)
+    return listed_cities(name, config.logs, rules)
 
 
-def listed_cities(name: str, count: int, rules: LogRules) -> tuple[ListedCity, ...]:
+def listed_cities(name: str, count: int, rules: CityConfig) -> tuple[Log, ...]:
     """The first cities of a list."""
-    return tuple(ListedCity(str(seed), seed, rules) for seed in city_logs.LISTS[name][:count])
+    return tuple(Log(str(seed), city_logs.log_config(seed, rules)) for seed in city_logs.LISTS[name][:count])
 
 
-def _recorded(config: BenchConfig, name: str, source: Path, table: PaperTable) -> RecordedLog:
+def _recorded(config: BenchConfig, name: str, source: Path, table: PaperTable) -> Log:
     limits = parse_frame_range(config.frames)
     frames = (limits[0], limits[1] - 1) if limits else None
-    segments, note = SCENE_LISTS.get(table.scenes, ()), ""
-    segment = next((one for one in segments if one.segment in _identity(source)), None)
+    segments, note, prepared = SCENE_LISTS.get(table.scenes, ()), "", ingest.is_scene(source)
+    identity = f"{source.name} {read_scene(source).id if prepared else ''}"
+    segment = next((one for one in segments if one.segment in identity), None)
     if segment is not None and frames is None:
         frames = (segment.first, segment.last)
     elif segments and segment is None:
         note = f"not in the table's list {table.scenes}"
     elif segment is not None and frames != (segment.first, segment.last):
         note = f"the table's frames are {segment.first} to {segment.last}"
-    if config.resolution and ingest.is_scene(source):
+    if config.resolution and prepared:
         remedy = "leave it out, or give the dataset's own folder"
         raise UsageError("a scene's images keep their size", where=str(source), got="--resolution", remedy=remedy)
-    size = "" if ingest.is_scene(source) else config.resolution or table.size
-    return RecordedLog(name, source, frames, size, 1 if segment is None else segment.side, note)
-
-
-def _identity(source: Path) -> str:
-    """Text in which a segment's name is looked for: the path's name, and a scene's id."""
-    return f"{source.name} {read_scene(source).id if ingest.is_scene(source) else ''}"
+    size = "" if prepared else config.resolution or table.size
+    return Log(name, source, frames, size, 1 if segment is None else segment.side, note, identity)
 
 
 def missing_scenes(table: PaperTable, logs: Sequence[Log]) -> list[str]:
     """Segments of the table's list that no recorded log belongs to; none where cities are scored."""
-    identities = " ".join(_identity(log.source) for log in logs if isinstance(log, RecordedLog))
+    identities = " ".join(log.identity for log in logs).strip()
     return [one.segment for one in SCENE_LISTS.get(table.scenes, ()) if identities and one.segment not in identities]
 
 
@@ -164,8 +152,8 @@ def make_scene(log: Log, table: PaperTable, out: Path, device: DeviceName, overw
     """The scene of a log under the rules of a table, made if need be. ``out``: folder of the log. ``device``: of the
     labeller's network. ``overwrite``: replace what other settings left there. InputError: the log has fewer frames than
     the table asks for. Whatever a verb raises."""
-    if isinstance(log, ListedCity):
-        settings = IngestConfig(test_every=table.held_out_every, city=city_logs.log_config(log.seed, log.rules))
+    if isinstance(log.source, CityConfig):
+        settings = IngestConfig(test_every=table.held_out_every, city=log.source)
         return run_step(Ingest(log=ingest.CITY, out=out / "scene", overwrite=overwrite, settings=settings))
     refuse_overlap(out, {"log": log.source})
     whole, frames = log.source, log.frames
@@ -270,9 +258,7 @@ class Protocol:
 
 
 SPLITS: Final[dict[str, Split]] = {
-    "gap-1": Split("gap-1", block=1),
-    "gap-3": Split("gap-3", block=3),
-    "gap-5": Split("gap-5", block=5),
+    **{f"gap-{block}": Split(f"gap-{block}", block) for block in (1, 3, 5)},
     "camera": Split("camera", by_camera=True),
     "all": Split("all", all_cameras=False, shifts_m=(2.0, -2.0, 3.0, -3.0)),
 }
@@ -282,12 +268,13 @@ _LIDAR: Final = (
     *("abs_rel_static", "rmse_static", "delta1_static", "abs_rel_dynamic", "rmse_dynamic", "delta1_dynamic"),
     *("point_psnr_static", "point_abs_static", "point_psnr_dynamic", "point_abs_dynamic"),
 )
+_ALL: Final = ("photo", "depth", "dynamic")
 _SEEN: Final = ("photo", "depth", "seen")
 _POINTS: Final = ("depth", "dynamic", "color")
 PROTOCOLS: Final[tuple[Protocol, ...]] = (
-    Protocol("gap-1", "gap", "Single held-out frames", "gap-1", ("photo", "depth", "dynamic"), _GAP),
-    Protocol("gap-3", "gap", "Blocks of 3 held-out frames", "gap-3", ("photo", "depth", "dynamic"), _GAP),
-    Protocol("gap-5", "gap", "Blocks of 5 held-out frames", "gap-5", ("photo", "depth", "dynamic"), _GAP),
+    Protocol("gap-1", "gap", "Single held-out frames", "gap-1", _ALL, _GAP),
+    Protocol("gap-3", "gap", "Blocks of 3 held-out frames", "gap-3", _ALL, _GAP),
+    Protocol("gap-5", "gap", "Blocks of 5 held-out frames", "gap-5", _ALL, _GAP),
     Protocol("camera", "camera", "Cameras that the methods never saw", "camera", _SEEN, _CAMERA, every=2, pooled=True),
     Protocol("lidar", "lidar", "LiDAR beside the recorded path", "all", _POINTS, _LIDAR, (2.0, -2.0, 3.0, -3.0)),
 )
@@ -344,16 +331,14 @@ def held_out(scene: Scene, split: Split, wanted: Sequence[str]) -> HeldOut:
         frames = tuple(frame.id for frame in scene.frames if frame.view.camera.name in hidden)
         facts = {"shown_cameras": list(shown), "hidden_cameras": hidden, "held_out_frames": len(frames)}
         return HeldOut(frames, (), facts, "" if frames else "the log has no camera besides those that are shown")
-    return _hidden_blocks(scene, split.block) if split.block else HeldOut()
-
-
-def _hidden_blocks(scene: Scene, length: int) -> HeldOut:
-    """Moments are the times of the camera with the fewest frames; every frame and sweep belongs to the nearest one."""
+    if not split.block:
+        return HeldOut()
+    # moments are the times of the camera with the fewest frames; every frame and sweep belongs to the nearest one
     name = min((n for n in scene.cameras if scene.frames_of(n)), key=lambda n: len(scene.frames_of(n)))
     times = np.array([frame.view.time_s for frame in scene.frames_of(name)])
-    blocks = blocks_of(len(times), length)
+    blocks = blocks_of(len(times), split.block)
     if not blocks:
-        return HeldOut(reason=f"its {len(times)} frames are too few for a block of {length} between shown ones")
+        return HeldOut(reason=f"its {len(times)} frames are too few for a block of {split.block} between shown ones")
     hidden = {moment for block in blocks for moment in block}
     is_hidden = lambda time_s: int(np.argmin(np.abs(times - time_s))) in hidden
     frames = tuple(frame.id for frame in scene.frames if is_hidden(frame.view.time_s))
@@ -421,9 +406,14 @@ class Views:
         return Chain(self.out, self.scene, self.config, self.overwrite, self.off_path)
 
     @cached_property
+    def city(self) -> CityWorld:
+        """The world of a generated log."""
+        return CityWorld.from_source(self.loaded.source)
+
+    @cached_property
     def truth(self) -> Path | None:
         """Exact truth of a generated log."""
-        if not isinstance(self.log, ListedCity):
+        if not isinstance(self.log.source, CityConfig):
             return None
         return self.chain.run(DrawTruth(scene=self.scene, trajectories=self.paths, out=self.out / TRUTH))
 
@@ -440,19 +430,20 @@ class Views:
         if row.name == FILL:
             return (self.chain.filled(self.paths),)
         if METHODS[row.method].made_by == "synthesize":
-            folders = []
-            if any(path.origin != "recorded" for path in self.paths):
+            folders, recorded = [], [path.origin == "recorded" for path in self.paths]
+            if not all(recorded):
                 folder = self.out / "generated" / row.name if row.changes else self.out / self.virtual
                 folders.append(self.chain.generated(replace(self.off_path, **row.changes), folder))
-            if self.on_path and any(path.origin == "recorded" for path in self.paths):
+            if self.on_path and any(recorded):
                 on_path = replace(self.off_path, shifts_m=(0.0,), paths=(), **row.changes)
                 folder = self.out / "generated" / f"{row.name}-{RECORDED}"
                 folders.append(self.chain.generated(on_path, folder))
             return tuple(folders)
-        virtual: tuple[Path, ...] = ()
-        if row.learns_virtual:
-            virtual = (self.chain.generated(self.off_path, self.out / self.virtual),)
-        return (self.chain.rendered(row, virtual, self.drawn),)
+        return (self.chain.rendered(row, self.learned(row), self.drawn),)
+
+    def learned(self, row: Row) -> tuple[Path, ...]:
+        """The generated views that a row's fit learns from, made if need be."""
+        return (self.chain.generated(self.off_path, self.out / self.virtual),) if row.learns_virtual else ()
 
     def scores(self, name: str, folders: Sequence[Path]) -> dict[Path, Mapping[str, Any]]:
         """What the scorer says of every folder of a row's views, by its own folder; the truth needs no networks that
@@ -488,8 +479,8 @@ def of_log(config: ScoreConfig, log: str) -> ScoreConfig:
     """How the rows of one log are scored: where a folder of detections or lanes has an entry of the log's
     name (or such a ``.json``), that one is taken."""
     own: dict[str, Any] = {}
-    for name in PER_LOG:
-        folder = getattr(config, name, "")
-        entries = [path for ending in ("", ".json") if folder and (path := Path(folder) / f"{log}{ending}").exists()]
-        own |= {name: str(entries[0])} if entries else {}
+    for name, ending in product(PER_LOG, (".json", "")):
+        folder = getattr(config, name)
+        if folder and (path := Path(folder) / f"{log}{ending}").exists():
+            own[name] = str(path)
     return replace(config, **own)

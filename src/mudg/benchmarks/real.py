@@ -12,9 +12,9 @@ from typing import Any
 from mudg.base import store
 from mudg.base.html import markdown_table
 from mudg.base.layout import SCENE_FILES
-from mudg.base.run_folder import RunDir, refuse_overlap
+from mudg.base.run_folder import RunDir
 from mudg.base.types import Scene
-from mudg.benchmarks.chain import Chain, Facts, compare, refuse_foreign, run_step
+from mudg.benchmarks.chain import Chain, compare, refuse, run_step, virtual_fits_of
 from mudg.benchmarks.columns import COLUMNS, MakeTargets, ScoreTargets, mean_values, read_targets
 from mudg.benchmarks.places import (
     SPLITS,
@@ -28,21 +28,8 @@ from mudg.benchmarks.places import (
     names_of,
     protocols_of,
 )
-from mudg.benchmarks.rows import (
-    BASE,
-    DIFFUSION,
-    FILL,
-    SCENES,
-    Row,
-    chain_settings,
-    generator_of,
-    method_rows,
-    model_settings,
-    refuse_unfit,
-)
+from mudg.benchmarks.rows import BASE, FILL, SCENES, Facts, Row, generator_of, method_rows, settings_of
 from mudg.benchmarks.settings import BenchConfig
-from mudg.benchmarks.shift import virtual_fits_of
-from mudg.diffusion import model_files as mdm_files
 from mudg.editing import render
 from mudg.editing.settings import RenderConfig
 from mudg.scene.read import read_scene
@@ -82,37 +69,28 @@ def run(
     name, or ``out`` holds something else. Whatever a verb raises."""
     rows, protocols = method_rows(config, preset, SCENES), protocols_of(config.protocols)
     logs, out = names_of(sources), Path(out)
-    read = {f"log {name}": path for name, path in logs.items()}
-    refuse_overlap(out, {"model": mdm_files.folder_of(config.model), **read})
-    refuse_foreign(out, "real")
-    generates = any(row.name == DIFFUSION for row in rows)
-    refuse_unfit(config, preset, rows, [generator_of(config)] * generates)
+    refuse("real", config, preset, rows, out, read={f"log {name}": path for name, path in logs.items()})
     scenes = {name: imported(config, path, out / name / "scene", overwrite) for name, path in logs.items()}
-    last, own = (rows, config, overwrite), {}
+    own: dict[str, list[Protocol]] = {}
     for protocol in protocols:
         own.setdefault(protocol.split, []).append(protocol)
-    every = [(name, scene, split) for name, scene in scenes.items() for split in own]
-    jobs = [SplitJob(out / name, scene, SPLITS[split], tuple(own[split]), *last) for name, scene, split in every]
-    settings = {
-        "protocols": list(config.protocols),
-        **model_settings(config),
-        "shown_cameras": list(config.shown),
-        "resolution": config.resolution,
-        "frames": config.frames,
-        "virtual_shifts_m": list(config.synthesize.shifts_m),
-        **chain_settings(config, preset),
+    jobs = {
+        f"{name} {split}": SplitJob(out / name, scene, SPLITS[split], tuple(of), rows, config, overwrite)
+        for name, scene in scenes.items()
+        for split, of in own.items()
     }
-
+    how = {"shown_cameras": list(config.shown), "resolution": config.resolution, "frames": config.frames}
+    how |= {"virtual_shifts_m": list(config.synthesize.shifts_m)}
+    settings = settings_of(config, preset, {"protocols": list(config.protocols)}, how)
     methods = [{"name": r.name, "title": r.title, "fit": "" if r.fit is None else r.method} for r in rows]
 
     def filled(measured: list[dict[str, Any]]) -> dict[str, Any]:
-        pairs = list(zip(jobs, measured, strict=True))
+        pairs = list(zip(jobs.values(), measured, strict=True))
         of = lambda name: [result for job, result in pairs if job.out.name == name]
-        entries = [_entry(name, scenes[name], of(name)) for name in scenes]
+        entries = [_entry(name, scene, of(name)) for name, scene in scenes.items()]
         return document(entries, methods, protocols, settings)
 
-    work = {f"{job.out.name} {job.split.name}": job.measure for job in jobs}
-    return compare(out, work, config, filled, markdown)
+    return compare(out, {title: job.measure for title, job in jobs.items()}, config, filled, markdown)
 
 
 # ---- one log under one way of hiding ----
@@ -150,26 +128,25 @@ class SplitJob:
             return {"split": self.split.name, "held_out": {}, "protocols": left_out}
         self.write_seen(whole, held)
         chain, cameras = self.chain(), self.cameras(whole, held)
-        truths, result = {}, {}
+        truths, result = [], {}
         for protocol in self.protocols:
             step = {"log": self.source, "shown": chain.scene, "protocol": protocol, "held": tuple(held.frames)}
             truth = chain.run(MakeTargets(**step, cameras=cameras, out=self.out / "truth" / protocol.name))
             targets = read_targets(truth)
             result[protocol.name] = {"facts": targets.facts, "values": {}}
-            if len(targets):
-                truths[protocol.name] = truth
+            if targets.records:
+                truths.append((protocol, truth))
             else:
                 result[protocol.name]["left_out"] = targets.reason
         if truths:
             chain.fuse()
         for row in self.rows if truths else ():
             views = self.views(row, chain, cameras)
-            for name, truth in truths.items():
-                protocol = next(protocol for protocol in self.protocols if protocol.name == name)
+            for protocol, truth in truths:
                 step = {"log": self.source, "truth": truth, "views": views, "protocol": protocol}
-                out = self.out / "score" / name / row.name
+                out = self.out / "score" / protocol.name / row.name
                 scored = chain.run(ScoreTargets(**step, device=self.config.device, out=out))
-                result[name]["values"][row.name] = store.read_json(scored / "metrics.json")
+                result[protocol.name]["values"][row.name] = store.read_json(scored / "metrics.json")
         return {"split": self.split.name, "held_out": dict(held.facts), "protocols": result}
 
     def write_seen(self, whole: Scene, held: HeldOut) -> None:

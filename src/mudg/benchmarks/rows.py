@@ -3,7 +3,7 @@ which methods, with what settings of their fits."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -25,6 +25,8 @@ from mudg.steps.pipeline import WITHOUT_DIFFUSION, refuse_missing
 from mudg.steps.settings import PresetName
 from mudg.steps.step import flag_name
 
+Facts = Mapping[str, Any]
+"""What was measured, by name, as in JSON."""
 FILE: Final = Path(__file__).with_name("papers.yaml")
 RECORDED: Final = "0"
 """Name of the place that is the recorded path."""
@@ -177,6 +179,8 @@ LONGER_TITLE: Final = title_of(BASE) + ", as many iterations"
 MIXED: Final = "mudg_f"
 """Renders of ``mudg_s``, each mixed with what the diffusion model makes of it (``mudg render --repair``)."""
 REPAIRED: Final = "difix"
+OTHER_METHODS: Final = {FILL: "", LONGER: BASE, MIXED: FULL}
+"""Method of the rows that are not named by it."""
 PLACES: Final = ("cameras", "shifts_m", "paths", "condition", "processes")
 """Settings of generated views that are the benchmark's matter, not the user's."""
 SCENES: Final = (FILL, "gs3d", BASE, LONGER, *PUBLISHED, DIFFUSION, FULL)
@@ -234,10 +238,15 @@ def method_fit(usual: FitConfig, method: str, preset: PresetName) -> FitConfig:
     return settings
 
 
-def chain_settings(config: BenchConfig, preset: PresetName) -> dict[str, Any]:
-    """What the chain of a benchmark runs with, for ``bench.json``."""
+def settings_of(config: BenchConfig, preset: PresetName, which: Facts, how: Facts) -> dict[str, Any]:
+    """What a benchmark runs with, for ``bench.json``: its own ``which`` logs and ``how``, and that of the chain."""
     generator = configuration.result_settings(generator_of(config))
     return {
+        **which,
+        "iterations": config.iterations,
+        "seed": config.seed,
+        "model": model_files.digest(config.model),
+        **how,
         "preset": preset,
         "guided_share": config.guided_share,
         "fuse": configuration.result_settings(config.fuse),
@@ -246,26 +255,20 @@ def chain_settings(config: BenchConfig, preset: PresetName) -> dict[str, Any]:
     }
 
 
-def model_settings(config: BenchConfig) -> dict[str, Any]:
-    """Iterations, seed and model of a benchmark of complete methods, for ``bench.json``."""
-    return {"iterations": config.iterations, "seed": config.seed, "model": model_files.digest(config.model)}
-
-
 def changed_settings(config: BenchConfig, usual: BenchConfig) -> list[str]:
     """Dotted names of the settings in which a configuration differs from another."""
     lines = configuration.differences(configuration.to_dict(usual), configuration.to_dict(config))
     return [line.partition(":")[0] for line in lines]
 
 
-def refuse_unfit(
-    config: BenchConfig, preset: PresetName, rows: Sequence[Row], generators: Sequence[SynthesizeConfig]
-) -> None:
-    """Refuse, before anything is written, what the rows of a benchmark cannot follow or do not use. ``generators``:
-    settings behind all views that are generated for a row itself. UsageError: a setting that no row uses (beyond the
-    preset), weights that are asked for and not given, or a method that the model cannot serve. InputError: there is no
-    such model."""
+def refuse_unfit(config: BenchConfig, preset: PresetName, rows: Sequence[Row]) -> None:
+    """Refuse, before anything is written, what the rows of a benchmark cannot follow or do not use. UsageError: a
+    setting that no row uses (beyond the preset), weights that are asked for and not given, or a method that the model
+    cannot serve. InputError: there is no such model."""
     fits = [row.fit for row in rows if row.fit is not None]
     virtual = [fit for fit in fits if METHODS[fit.method].learns_virtual]
+    generated = [row.changes for row in rows if row.method and METHODS[row.method].made_by == "synthesize"]
+    generators = [replace(generator_of(config), **changes) for changes in generated]
     repairs = next((row.name for row in rows if row.fit and (row.name == MIXED or row.fit.method == REPAIRED)), "")
     if repairs and not model_files.uses_renders(config.model):
         what, remedy = "repairs renders, and this diffusion model uses none", f"leave {repairs} out, or choose"
@@ -300,11 +303,9 @@ def method_rows(
     _refuse_unknown(config.methods, known)
     usual, rows = usual_fit(config), list[Row]()
     for name in (name for name in known if name in config.methods):
-        if name in (FILL, DIFFUSION):
-            rows.append(Row(name, title_of(name), "" if name == FILL else name))
-            continue
-        method, title = {LONGER: BASE, MIXED: FULL}.get(name, name), LONGER_TITLE if name == LONGER else title_of(name)
-        rows.append(Row(name, title, method, method_fit(usual, method, preset)))
+        title, method = LONGER_TITLE if name == LONGER else title_of(name), OTHER_METHODS.get(name, name)
+        fit = None if name in (FILL, DIFFUSION) else method_fit(usual, method, preset)
+        rows.append(Row(name, title, method, fit))
     return tuple(rows)
 
 
@@ -326,10 +327,8 @@ def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "def
         _refuse_unknown(methods, known, some=False)
         changes = {} if model_files.uses_renders(config.model) else {REPAIRED: {"model": ""}}
         titles = {LONGER: LONGER_TITLE, **{name: method.title for name, method in METHODS.items()}}
-        rows = [
-            Row(name, f"{titles[name]} ({name})", BASE if name == LONGER else name, changes=changes.get(name, {}))
-            for name in methods
-        ]
+        method = lambda name: OTHER_METHODS.get(name, name)
+        rows = [Row(n, f"{titles[n]} ({n})", method(n), changes=changes.get(n, {})) for n in methods]
     complete = []
     for row in rows:
         if METHODS[row.method].made_by == "render" and not row.left_out:
@@ -339,7 +338,7 @@ def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "def
     return tuple(complete)
 
 
-def _refuse_unknown(names: Iterable[str], known: Sequence[str], some: bool = True) -> None:
+def _refuse_unknown(names: Sequence[str], known: Sequence[str], some: bool = True) -> None:
     unknown = sorted(set(names) - set(known))
     if unknown or (some and not names):
         raise UsageError("unknown method", where="--methods", expected=", ".join(known), got=", ".join(unknown))

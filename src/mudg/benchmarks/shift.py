@@ -3,17 +3,13 @@ Methods are fitted, rendered and scored by the ordinary verbs, so that whatever 
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from mudg.base import config as configuration
 from mudg.base.html import markdown_table
-from mudg.base.run_folder import refuse_overlap
-from mudg.benchmarks.chain import Facts, compare, refuse_foreign, seconds_of
+from mudg.benchmarks.chain import compare, mean, refuse, seconds_of, standard_error, virtual_fits_of
 from mudg.benchmarks.places import Views, listed_cities, score_settings
 from mudg.benchmarks.rows import (
     BASE,
@@ -21,18 +17,16 @@ from mudg.benchmarks.rows import (
     FILL,
     FULL,
     RECORDED,
+    Facts,
     PaperPlace,
     PaperTable,
-    chain_settings,
-    generator_of,
     method_rows,
-    model_settings,
-    refuse_unfit,
+    settings_of,
 )
 from mudg.benchmarks.settings import BenchConfig
 from mudg.city import logs as city_logs
-from mudg.city.logs import STANDARD, LogRules
-from mudg.diffusion import model_files as mdm_files
+from mudg.city.config import CityConfig
+from mudg.city.logs import STANDARD
 from mudg.steps.settings import PresetName
 
 SHIFTED: Final = "shifted"
@@ -65,7 +59,6 @@ SHOWN: Final = (FILL, "gs3d", BASE, DIFFUSION, FULL)
 """Methods in the videos."""
 
 
-@dataclass(frozen=True)
 class ShiftLog(Views):
     """One log of the list."""
 
@@ -76,7 +69,7 @@ class ShiftLog(Views):
             (metrics,) = self.scores(name, folders).values()
             values[name] = {f"{entry['distance_m']:g}": entry["values"] for entry in metrics["by_distance"]}
         self.film({name: folders for name, folders in views.items() if name in SHOWN})
-        facts = {"log": self.log.seed, **city_logs.facts(self.log.seed, self.log.rules)}
+        facts = {"log": int(self.log.name), **city_logs.facts(self.city)}
         return {**facts, "values": values, "seconds": seconds_of(self.out)}
 
 
@@ -86,7 +79,7 @@ def run(
     *,
     preset: PresetName = "default",
     overwrite: bool = False,
-    rules: LogRules = STANDARD,
+    rules: CityConfig = STANDARD,
     distances_m: Sequence[float] = (2.0, 3.0, 4.0),
 ) -> Path:
     """Compare methods on the logs of a list; returns ``out`` with ``bench.json``, ``bench.md`` and ``page.html``; what
@@ -95,24 +88,16 @@ def run(
     logs. ``distances_m``: lateral distances, each to both sides. UsageError: an unknown method, a setting
     that no row uses, or ``out`` holds logs of other settings. Whatever a verb raises."""
     rows, out = method_rows(config, preset), Path(out)
-    refuse_overlap(out, {"model": mdm_files.folder_of(config.model)})
-    refuse_foreign(out, "shift", may_be=lambda entry: entry.name.isdigit())
+    refuse("shift", config, preset, rows, out)
     shifts = {RECORDED: [0.0], **{f"{d:g}": [d, -d] for d in distances_m}}
     places = [PaperPlace(name=name, title="", shifts_m=shifts_m) for name, shifts_m in shifts.items()]
     table = PaperTable(name="shift", places=places, columns=[])
     last = (config, score_settings(config, table), overwrite, "synthesize")
     logs = listed_cities(config.list, config.logs, rules)
     jobs = {log.name: ShiftLog(log, out / log.name, table, rows, *last, on_path=False).measure for log in logs}
-    refuse_unfit(config, preset, rows, [generator_of(config)] * any(row.method == DIFFUSION for row in rows))
-    settings = {
-        "list": config.list,
-        **model_settings(config),
-        "frames": rules.frames,
-        "size_px": [rules.width, rules.height],
-        "cameras": list(rules.cameras),
-        "held_out_every": table.held_out_every,
-        **chain_settings(config, preset),
-    }
+    how = {"frames": rules.n_frames, "size_px": [rules.width, rules.height], "cameras": list(rules.cameras)}
+    how |= {"held_out_every": table.held_out_every}
+    settings = settings_of(config, preset, {"list": config.list}, how)
     fits = [None if row.fit is None else configuration.result_settings(row.fit) for row in rows]
     values = [{"name": row.name, "title": row.title, "fit": of} for row, of in zip(rows, fits, strict=True)]
     filled = lambda logs: document(logs, values, list(distances_m), settings)
@@ -143,12 +128,12 @@ def document(
 
 def with_mean(of: Mapping[str, Facts], shifted: Sequence[str]) -> dict[str, dict[str, Any]]:
     """The values of one method and log by distance, with the mean over the distances off the recorded path."""
-    mean: dict[str, Any] = {}
+    means: dict[str, Any] = {}
     for metric in COLUMNS:
-        values = [of.get(place, {}).get(metric, "not produced") for place in shifted]
+        values = [of.get(place, {}).get(metric, "not produced") for place in shifted] or ["not produced"]
         reasons = [value for value in values if isinstance(value, str)]
-        mean[metric] = reasons[0] if reasons else sum(values) / len(values) if values else "not produced"
-    return {**{place: dict(values) for place, values in of.items()}, SHIFTED: mean}
+        means[metric] = reasons[0] if reasons else mean(values)
+    return {**{place: dict(values) for place, values in of.items()}, SHIFTED: means}
 
 
 def _pooled(values: Sequence[Any]) -> Any:
@@ -156,7 +141,7 @@ def _pooled(values: Sequence[Any]) -> Any:
     numbers = [float(value) for value in values if not isinstance(value, str)]
     if not numbers:
         return str(values[0])
-    return {"mean": _mean(numbers), "standard_error": standard_error(_mean, numbers), "logs": len(numbers)}
+    return {"mean": mean(numbers), "standard_error": standard_error(mean, numbers), "logs": len(numbers)}
 
 
 def against(logs: Sequence[Facts], a: str, b: str, place: str, metrics: str) -> list[dict[str, Any]]:
@@ -167,7 +152,14 @@ def against(logs: Sequence[Facts], a: str, b: str, place: str, metrics: str) -> 
     for metric in metrics.split():
         pairs = [tuple(entry["values"].get(m, {}).get(place, {}).get(metric, "") for m in (a, b)) for entry in logs]
         known = [None if any(isinstance(value, str) for value in pair) else tuple(map(float, pair)) for pair in pairs]
-        both, of = [pair for pair in known if pair is not None], partial(_compared_means, ratio=metric in RATIOS)
+        both = [pair for pair in known if pair is not None]
+
+        def of(pairs: Sequence[tuple[float, float]], ratio: bool = metric in RATIOS) -> float | None:
+            first, second = (mean(side) for side in zip(*pairs, strict=True))
+            if not ratio:
+                return first - second
+            return first / second if second else None
+
         per_log = [None if pair is None else of([pair]) for pair in known]
         where = "recorded path" if place == RECORDED else "off the recorded path"
         kind, title = "ratio" if metric in RATIOS else "difference", f"{a} against {b}, {where}: {COLUMNS[metric][0]}"
@@ -178,32 +170,7 @@ def against(logs: Sequence[Facts], a: str, b: str, place: str, metrics: str) -> 
     return comparisons
 
 
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values)
-
-
-def _compared_means(pairs: Sequence[tuple[float, float]], *, ratio: bool) -> float | None:
-    a, b = (_mean(side) for side in zip(*pairs, strict=True))
-    return a - b if not ratio else a / b if b else None
-
-
-def standard_error(of: Callable[[Sequence[Any]], float | None], items: Sequence[Any]) -> float | None:
-    """Standard error of a statistic of independent items by leaving out each in turn; None for fewer than two items."""
-    count = len(items)
-    values = [of([*items[:i], *items[i + 1 :]]) for i in range(count)] if count > 1 else [None]
-    known = [value for value in values if value is not None]
-    if len(known) < len(values):
-        return None
-    center = _mean(known)
-    return math.sqrt((count - 1) / count * sum((value - center) ** 2 for value in known))
-
-
 # ---- text ----
-
-
-def virtual_fits_of(settings: Facts) -> str:
-    """How many iterations fits under virtual views have, as part of a sentence."""
-    return f"{settings['guided_share']:g} times as many under virtual views"
 
 
 def markdown(doc: Facts) -> str:

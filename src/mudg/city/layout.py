@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -38,11 +39,13 @@ class Centreline:
         """The same for one point, without array overhead; ``s`` is clamped to the street."""
         at = min(max((s - float(self.s[0])) / STEP_M, 0.0), len(self.s) - 1.001)
         i = int(at)
-        f = at - i
-        heading = float(self.heading[i] + f * (self.heading[i + 1] - self.heading[i]))
-        x = float(self.x[i] + f * (self.x[i + 1] - self.x[i]))
-        y = float(self.y[i] + f * (self.y[i + 1] - self.y[i]))
+        x, y, heading = (float(of[i] + (at - i) * (of[i + 1] - of[i])) for of in (self.x, self.y, self.heading))
         return x - np.sin(heading) * u, y + np.cos(heading) * u, heading
+
+    def line(self, s: Array, u: Array) -> Array:
+        """World places f64[N, 3] of street coordinates on the ground."""
+        x, y, _ = self.to_world(s, u)
+        return np.stack([x, y, np.zeros(len(s))], 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,6 +70,12 @@ class Crossing:
         """World x, y of crossing coordinates."""
         c, n = np.cos(self.yaw), np.sin(self.yaw)
         return self.x + c * a - n * b, self.y + n * a + c * b
+
+    def of_world(self, xy: Array) -> tuple[Array, Array]:
+        """Crossing coordinates of places f64[N, 2] in the world."""
+        c, n = np.cos(self.yaw), np.sin(self.yaw)
+        dx, dy = xy[:, 0] - self.x, xy[:, 1] - self.y
+        return c * dx + n * dy, -n * dx + c * dy
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,12 +104,16 @@ class StreetPlan:
     drive_length: float
 
     def kerb(self, side: int) -> float:
-        """Lateral position of the kerb; side +1 left, -1 right."""
-        return self.left if side > 0 else self.right
+        """Distance of the kerb from the centreline; side +1 left, -1 right."""
+        return abs(self.left if side > 0 else self.right)
 
     def sidewalk(self, side: int) -> float:
         """Width of the sidewalk."""
         return self.sidewalk_left if side > 0 else self.sidewalk_right
+
+    def front(self, side: int) -> float:
+        """Distance of the sidewalk's far edge from the centreline."""
+        return self.kerb(side) + self.sidewalk(side)
 
     def ego_s(self, times_s: Array | float) -> Array:
         """Street position of the recording vehicle."""
@@ -194,17 +207,11 @@ def _crossing(
         return None
     s = drive_length + float(rng.uniform(20, 42)) if rng.random() < 0.7 else float(rng.uniform(15, 15 + drive_length))
     x, y, heading = line.point(s, 0.0)
-    half = float(rng.uniform(3.4, 5.6))
-    start, end = -160.0, 160.0
-    arms = rng.random()
-    if arms < 0.2:
-        start = 0.0
-    elif arms < 0.4:
-        end = 0.0
-    yaw = heading + np.pi / 2 + rng.uniform(-0.12, 0.12)
-    return Crossing(
-        s, float(x), float(y), float(yaw), half, float(rng.uniform(1.8, 3.2)), float(rng.uniform(3, 6)), start, end
-    )
+    half, arms = float(rng.uniform(3.4, 5.6)), rng.random()
+    start, end = 0.0 if arms < 0.2 else -160.0, 0.0 if 0.2 <= arms < 0.4 else 160.0
+    yaw = float(heading + np.pi / 2 + rng.uniform(-0.12, 0.12))
+    walk, corner = float(rng.uniform(1.8, 3.2)), float(rng.uniform(3, 6))
+    return Crossing(s, float(x), float(y), yaw, half, walk, corner, start, end)
 
 
 def _paint(rng: np.random.Generator, lanes: _Lanes, width: float, kerbs: tuple[float, float]) -> Array:
@@ -220,8 +227,7 @@ def _paint(rng: np.random.Generator, lanes: _Lanes, width: float, kerbs: tuple[f
         if rng.random() < 0.7:
             rows.append([0.0, median / 2 - 0.15, 3.2, 0.55, MARK_HATCHED, yellow])
     elif lanes.backward:
-        kind = rng.choice([MARK_DOUBLE, MARK_DASHED, MARK_SOLID])
-        rows.append([0.0, half, period, dash, float(kind), yellow])
+        rows.append([0.0, half, period, dash, float(rng.choice([MARK_DOUBLE, MARK_DASHED, MARK_SOLID])), yellow])
     edge = rng.random() < 0.6
     for kerb, park in zip(kerbs, (lanes.park_left, lanes.park_right), strict=True):
         inner = abs(kerb) - park
@@ -235,20 +241,16 @@ def _paint(rng: np.random.Generator, lanes: _Lanes, width: float, kerbs: tuple[f
 def _crosswalks(rng: np.random.Generator, kerbs: tuple[float, float], crossing: Crossing | None) -> Array:
     """f64[c, 3]; see ``StreetPlan.crosswalks``."""
     left, right = kerbs
-    walks: list[list[float]] = []
     length = float(rng.uniform(2.8, 4.0))
-    if crossing is not None:
-        clear = crossing.corner * 0.6 + 1.0
-        gap = crossing.half_width + crossing.corner * 0.6 + 1.0
-        walks.append([crossing.s - gap - length, length, 0.0])
-        walks.append([crossing.s + gap, length, 0.0])
-        if crossing.has_arm(1):
-            walks.append([left + clear, length, 1.0])
-        if crossing.has_arm(-1):
-            walks.append([right - clear - length, length, 1.0])
-    elif rng.random() < 0.6:
-        walks.append([float(rng.uniform(14, 55)), length, 0.0])
-    return np.array(walks, np.float64).reshape(-1, 3)
+    if crossing is None:
+        walks = [[float(rng.uniform(14, 55)), length, 0.0]] if rng.random() < 0.6 else []
+        return np.array(walks, np.float64).reshape(-1, 3)
+    clear = crossing.corner * 0.6 + 1.0
+    gap = crossing.half_width + crossing.corner * 0.6 + 1.0
+    walks = [[crossing.s - gap - length, length, 0.0], [crossing.s + gap, length, 0.0]]
+    walks += [[left + clear, length, 1.0]] * crossing.has_arm(1)
+    walks += [[right - clear - length, length, 1.0]] * crossing.has_arm(-1)
+    return np.array(walks, np.float64)
 
 
 # paint --------------------------------------------------------------------------------------------
@@ -262,22 +264,18 @@ _BAR_HALF_M: Final = 0.27
 _STOP_M: Final = 1.5
 _STOP_HALF_M: Final = 0.2
 _DOUBLE_M: Final = 0.15
-_STEP_M: Final = 0.5
 
 
 def painted(plan: StreetPlan, street: Array, xy: Array) -> NDArray[np.bool_]:
     """Whether points of the road carry paint, bool[N]. ``street``: s, u and distance to the kerb f64[N, 3] of the
     points (``CityHandle.street``). ``xy``: the points f64[N, 2] in the world."""
     s, u = street[:, 0], street[:, 1]
-    crossing = plan.crossing
-    a = b = np.zeros(len(xy))
+    crossing, a, b = plan.crossing, u, u
+    paint = in_cross = cut = np.zeros(len(xy), bool)
     if crossing is not None:
-        c, n = np.cos(crossing.yaw), np.sin(crossing.yaw)
-        dx, dy = xy[:, 0] - crossing.x, xy[:, 1] - crossing.y
-        a, b = c * dx + n * dy, -n * dx + c * dy
-    in_cross = np.zeros(len(xy), bool) if crossing is None else (u > plan.left) | (u < plan.right)
-    cut = in_cross if crossing is None else in_cross | (np.abs(b) < crossing.half_width + 0.6)
-    paint = np.zeros(len(xy), bool)
+        a, b = crossing.of_world(xy)
+        in_cross = (u > plan.left) | (u < plan.right)
+        cut = in_cross | (np.abs(b) < crossing.half_width + 0.6)
     for start, length, on_cross in plan.crosswalks:
         here = in_cross if on_cross and crossing is not None else np.ones(len(xy), bool)
         along, across = (a if on_cross else s) - start, b if on_cross else u
@@ -285,25 +283,22 @@ def painted(plan: StreetPlan, street: Array, xy: Array) -> NDArray[np.bool_]:
         if not on_cross:
             cut = cut | near
         bars = np.abs((across / _BAR_PERIOD_M) % 1.0 * _BAR_PERIOD_M - _BAR_MIDDLE_M) < _BAR_HALF_M
-        paint |= near & (along > 0) & (along < length) & bars
-        paint |= near & _stop_line(plan, along, across, length, bool(on_cross))
-    paint |= ~cut & _marks(plan, s, u)
+        bars &= (along > 0) & (along < length)
+        paint = paint | (near & (bars | _stop_line(plan, along, across, length, bool(on_cross))))
+    paint = paint | (~cut & _marks(plan, s, u))
     if crossing is not None:
         to_edge = np.where(a > 0, a - plan.left, -a + plan.right)
-        dashes = np.abs((a / 6.0) % 1.0 * 6.0 - 1.5) < 1.5
-        paint |= in_cross & (to_edge > 7.0) & (np.abs(b) < 0.07) & dashes
+        paint |= in_cross & (to_edge > 7.0) & (np.abs(b) < 0.07) & _dashed(a, 6.0, 3.0)
     return paint & (street[:, 2] < 0)
 
 
 def _stop_line(plan: StreetPlan, along: Array, across: Array, length: float, on_cross: bool) -> NDArray[np.bool_]:
     """Stop lines for traffic that comes towards a crossing."""
     right = across < 0
-    line = np.where(right, -_STOP_M, length + _STOP_M)
-    if on_cross:
-        line = np.where(right, -99.0, length + _STOP_M)
-    half = (
-        plan.crossing.half_width if on_cross and plan.crossing is not None else np.where(right, -plan.right, plan.left)
-    )
+    line = np.where(right, -99.0 if on_cross else -_STOP_M, length + _STOP_M)
+    half = np.where(right, -plan.right, plan.left)
+    if on_cross and plan.crossing is not None:
+        half = plan.crossing.half_width
     return (np.abs(across) < half - 0.4) & (np.abs(along - line) < _STOP_HALF_M)
 
 
@@ -312,14 +307,9 @@ def _marks(plan: StreetPlan, s: Array, u: Array) -> NDArray[np.bool_]:
     paint = np.zeros(len(s), bool)
     for place, half, period, dash, kind, _ in plan.marks:
         off = u - place
-        if kind == MARK_DOUBLE:
-            found = np.abs(np.abs(off) - _DOUBLE_M) < half
-        elif kind == MARK_HATCHED:
-            found = (np.abs(off) < half) & _dashed(s + 0.7 * off, period, dash)
-        else:
-            found = np.abs(off) < half
-            if kind == MARK_DASHED:
-                found &= _dashed(s, period, dash)
+        found = np.abs(np.abs(off) - _DOUBLE_M if kind == MARK_DOUBLE else off) < half
+        if kind in (MARK_HATCHED, MARK_DASHED):
+            found &= _dashed(s + 0.7 * off if kind == MARK_HATCHED else s, period, dash)
         paint |= found
     return paint
 
@@ -332,28 +322,20 @@ def _dashed(along: Array, period: float, dash: float) -> NDArray[np.bool_]:
 
 
 def lane_lines(plan: StreetPlan) -> list[Array]:
-    """Road lines, road edges and the long sides of crosswalks as lines f64[N, 3] on the road, metres in the world.
-
-    As in a map, a dashed line is one line, and nothing is left out where a crossing street begins.
-    """
-    along = np.arange(plan.line.s[0], plan.line.s[-1], _STEP_M)
-    lines = [_street_line(plan.line, along, np.full(len(along), u)) for u in (*plan.marks[:, 0], plan.left, plan.right)]
+    """Road lines, road edges and the long sides of crosswalks as lines f64[N, 3] on the road, metres in the world. As
+    in a map, a dashed line is one line, and nothing is left out where a crossing street begins."""
+    along = np.arange(plan.line.s[0], plan.line.s[-1], STEP_M)
+    lines = [plan.line.line(along, np.full(len(along), u)) for u in (*plan.marks[:, 0], plan.left, plan.right)]
     for start, length, on_cross in plan.crosswalks:
         for edge in (start, start + length):
             if on_cross and plan.crossing is not None:
-                across = np.arange(-plan.crossing.half_width, plan.crossing.half_width, _STEP_M)
+                across = np.arange(-plan.crossing.half_width, plan.crossing.half_width, STEP_M)
                 places = np.array([plan.crossing.to_world(edge, b) for b in across])
                 lines.append(np.c_[places, np.zeros(len(places))])
             elif not on_cross:
-                across = np.arange(plan.right, plan.left, _STEP_M)
-                lines.append(_street_line(plan.line, np.full(len(across), edge), across))
+                across = np.arange(plan.right, plan.left, STEP_M)
+                lines.append(plan.line.line(np.full(len(across), edge), across))
     return lines
-
-
-def _street_line(line: Centreline, s: Array, u: Array) -> Array:
-    """World places f64[N, 3] of street coordinates."""
-    x, y, _ = line.to_world(s, u)
-    return np.stack([x, y, np.zeros(len(s))], 1)
 
 
 # records ------------------------------------------------------------------------------------------
@@ -374,22 +356,18 @@ LABELS: Final = dict(
 
 Color = tuple[float, float, float]
 Size = tuple[float, float, float]
+Place = tuple[float, float]
+Form = tuple[float, ...]
+GREY: Final = (0.5, 0.5, 0.5)
 
 
-def record(
-    kind: int,
-    xyz: Size,
-    yaw: float,
-    size: Size,
-    seed: int,
-    rgb: Color = (0.5, 0.5, 0.5),
-    rgb2: Color = (0.5, 0.5, 0.5),
-    parameters: tuple[float, ...] = (),
-) -> list[float]:
-    """One row: position (metres, world), heading (radians), size (length, width, height in metres), linear colours,
-    up to 12 parameters whose meaning depends on the kind (see native/city_build.cpp), public instance id (0 = none)."""
-    padded = (*parameters, *(0.0,) * (12 - len(parameters)))
-    return [float(kind), *xyz, yaw, *size, float(seed), *rgb, *rgb2, *padded, 0.0]
+def record(kind: int, xyz: Size, yaw: float, size: Size, seed: int, *rgb: Color, form: Form = ()) -> list[float]:
+    """One row: position (metres, world), heading (radians), size (length, width, height in metres), up to two linear
+    colours, up to 12 parameters whose meaning depends on the kind (see native/city_build.cpp), public instance id (0 =
+    none)."""
+    first, second = (*rgb, GREY, GREY)[:2]
+    padded = (*form, *(0.0,) * (12 - len(form)))
+    return [float(kind), *xyz, yaw, *size, float(seed), *first, *second, *padded, 0.0]
 
 
 class Draws:
@@ -410,6 +388,16 @@ class Draws:
         """True with this probability."""
         return float(self.rng.random()) < probability
 
+    def side(self, left: float = 0.5) -> int:
+        """Left (+1), with this probability, or right (-1)."""
+        return 1 if self.chance(left) else -1
+
+    def along(self, start: float, end: float, step: Callable[[], float]) -> Iterator[float]:
+        """Places from ``start`` to before ``end``; each step is drawn after what its place draws."""
+        while start < end:
+            yield start
+            start += step()
+
 
 # furnisher ----------------------------------------------------------------------------------------
 
@@ -428,6 +416,7 @@ RENDER_COLORS = colors(
 )
 BRICK_COLORS: tuple[Color, ...] = ((0.30, 0.13, 0.085), (0.36, 0.19, 0.12), (0.24, 0.12, 0.09), (0.42, 0.30, 0.20))
 LEAF_COLORS = colors("0.085 0.15 0.035, 0.11 0.17 0.04, 0.06 0.115 0.03, 0.15 0.17 0.045, 0.20 0.13 0.03")
+TRUNK: Final = (0.13, 0.10, 0.075)
 CLEARANCE_M = 1.0
 
 
@@ -464,34 +453,12 @@ class Furnisher(Draws):
         crossing = self.plan.crossing
         return crossing is not None and abs(s - crossing.s) < crossing.half_width + margin
 
-    def add(
-        self,
-        kind: int,
-        xyz: Size,
-        yaw: float,
-        size: Size,
-        seed: int,
-        rgb: Color,
-        rgb2: Color = (0.5, 0.5, 0.5),
-        parameters: tuple[float, ...] = (),
-    ) -> None:
-        """Add a record."""
-        self.rows.append(record(kind, xyz, yaw, size, seed, rgb, rgb2, parameters))
-
     def place(
-        self,
-        kind: int,
-        place: tuple[float, float],
-        turn: float,
-        size: Size,
-        rgb: Color,
-        rgb2: Color = (0.5, 0.5, 0.5),
-        parameters: tuple[float, ...] = (),
-        z: float = KERB_M,
+        self, kind: int, place: Place, turn: float, size: Size, *rgb: Color, form: Form = (), z: float = KERB_M
     ) -> None:
         """Add an object at street coordinates (s, u); ``turn`` is its heading relative to the street."""
         x, y, heading = self.plan.line.point(*place)
-        self.add(kind, (x, y, z), heading + turn, size, self.seed(), rgb, rgb2, parameters)
+        self.rows.append(record(kind, (x, y, z), heading + turn, size, self.seed(), *rgb, form=form))
 
 
 def plant_tree(f: Furnisher, s: float, u: float, garden: bool = False) -> None:
@@ -502,4 +469,5 @@ def plant_tree(f: Furnisher, s: float, u: float, garden: bool = False) -> None:
     radius = height * f.uniform(0.24, 0.32) if habit == 0 else f.uniform(1.0, 1.7)
     cell = f.uniform(0.20, 0.27) * (1 + 0.05 * max(0.0, height - 7))
     turn, leaves, crown = f.uniform(0, 6.28), f.pick(LEAF_COLORS), (radius, f.uniform(0.45, 0.72), habit, cell)
-    f.place(TREE, (s, u), turn, (1.0, 1.0, height), leaves, (0.13, 0.10, 0.075), (*crown, f.uniform(0.11, 0.2)))
+    form = (*crown, f.uniform(0.11, 0.2))
+    f.place(TREE, (s, u), turn, (1.0, 1.0, height), leaves, TRUNK, form=form)

@@ -66,15 +66,9 @@ def _other_sky(rng: np.random.Generator, plain: Sky) -> Sky:
         return replace(plain, horizon=white * 1.2, zenith=blue, cloud=white, cloudiness=rng.uniform(0.1, 0.6))
     if kind == 5:  # low sun
         glow = np.array([1.5, rng.uniform(0.7, 1.1), rng.uniform(0.35, 0.8)]) * rng.uniform(0.8, 1.6)
-        sun, zenith, ambient, clouds = (
-            np.array(rgb) * rng.uniform(*span)
-            for rgb, span in (
-                ([2.8, 1.7, 0.9], (0.4, 1.0)),
-                ([0.25, 0.35, 0.6], (0.8, 1.5)),
-                ([0.55, 0.52, 0.6], (0.9, 1.4)),
-                (glow, (0.5, 0.9)),
-            )
-        )
+        sun = np.array([2.8, 1.7, 0.9]) * rng.uniform(0.4, 1.0)
+        zenith, ambient = np.array([0.25, 0.35, 0.6]) * rng.uniform(0.8, 1.5), np.array([0.55, 0.52, 0.6])
+        ambient, clouds = ambient * rng.uniform(0.9, 1.4), glow * rng.uniform(0.5, 0.9)
         return Sky(sun, zenith, glow, ambient, clouds, rng.uniform(0.2, 0.9), float(np.deg2rad(rng.uniform(3, 12))))
     dark = np.array([0.42, 0.46, 0.52]) * rng.uniform(0.6, 1.2)  # before a storm
     horizon, ambient = dark * rng.uniform(1.0, 1.8), np.array([0.75, 0.8, 0.9]) * rng.uniform(0.6, 1.0)
@@ -154,13 +148,13 @@ def lamp_places(rows: Sequence[Sequence[float]]) -> NDArray[np.float64]:
 
 
 # photos --------------------------------------------------------------------------------------------
+#
 # Photographic surfaces and skies for a city, from a folder of the user's: `textures/*.jpg` or `.png` and `sky/*.hdr`.
 #
 # A surface's photograph multiplies its drawn colour, so only its variation around its own mean is used. Which surface a
 # file is for follows from words in its name (`SURFACES`); files that fit none are not used. Panoramas are Radiance HDR;
 # what lies below `HORIZON_DEG` in them (trees, houses) is left out and the rest is stretched down to the horizon. The
 # same folder and seed give the same city.
-
 
 Pixels = NDArray[np.float32]
 
@@ -187,11 +181,7 @@ SKY_PX: Final = (512, 96)
 
 def draw_photos(folder: Path, seed: int) -> list[tuple[int, Pixels, float]]:
     """Slot, pixels f32[H, W, 3] and size in metres of the photographs that a city uses; half of the cities also get a
-    panorama.
-
-    Raises:
-        InputError: no such folder, or a file in it cannot be read.
-    """
+    panorama. InputError: no such folder, or a file in it cannot be read."""
     if not folder.is_dir():
         what = "there is no such folder of textures"
         raise InputError(what, where=str(folder), expected="textures/*.jpg and sky/*.hdr")
@@ -244,11 +234,8 @@ def panorama(path: Path) -> Pixels:
 
 
 def radiance(content: bytes, path: Path) -> Pixels:
-    """Pixels f32[H, W, 3] of a Radiance HDR file with run-length coded RGBE rows, top row first.
-
-    Raises:
-        InputError: another format, or the file is cut off.
-    """
+    """Pixels f32[H, W, 3] of a Radiance HDR file with run-length coded RGBE rows, top row first. InputError: another
+    format, or the file is cut off."""
     problem = functools.partial(InputError, "not a Radiance HDR image", where=str(path))
     head, _, rest = content.partition(b"\n\n")
     size, _, data = rest.partition(b"\n")

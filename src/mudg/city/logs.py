@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Container
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -52,14 +51,14 @@ def write_world(world: CityWorld, out_dir: Path | str, test_every: int = 4) -> S
         views = {name: world.frame_views(name) for name in config.cameras}
         with log.task("recording the city", config.n_frames * (len(views) + 1)) as progress:
             for index in range(config.n_frames):
-                held_out = test_every > 0 and index > 0 and index % test_every == 0
+                part = "test" if test_every > 0 and index > 0 and index % test_every == 0 else "train"
                 for name in config.cameras:
                     frame_id, view = f"{name}/{index:06d}", views[name][index]
                     truth = world.render(view, sensor_noise=config.sensor_noise)
                     labels = {"depth": truth.depth, "semantics": truth.semantics, "sky": truth.sky}
                     labels |= {"dynamic": moving[truth.instance], "instance": truth.instance}
                     writer.add_frame(frame_id, view, truth.rgb_u8, labels)
-                    split[frame_id] = "test" if held_out else "train"
+                    split[frame_id] = part
                     progress.advance()
                 sweep = world.lidar_sweep(index)
                 writer.add_sweep(f"{SENSOR}/{index:06d}", SENSOR, sweep.time_s, sweep.world_from_lidar, sweep.points)
@@ -71,18 +70,8 @@ def write_world(world: CityWorld, out_dir: Path | str, test_every: int = 4) -> S
 # logs ---------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class LogRules:
-    """What a log is recorded with: frames at 10 Hz, image size in pixels, and the cameras; the LiDAR is the standard
-    one."""
-
-    frames: int = 24
-    width: int = 384
-    height: int = 256
-    cameras: tuple[str, ...] = ("front", "front_left", "front_right")
-
-
-STANDARD: Final = LogRules()
+STANDARD: Final = CityConfig(n_frames=24, width=384, height=256)
+"""What a log is recorded with, whatever its seed."""
 MOVING, SMALLEST_SHARE, FRAMES_SHARE, CURVED_DEG = 2, 1e-3, 0.25, 5.0
 """A log enters a list with so many moving vehicles in view of the front camera: they cover this share of the image, in
 this share of the frames. Half of the list turns by at least this angle."""
@@ -95,10 +84,9 @@ REPORTED: tuple[int, ...] = (2100100, 2100101, 2100102, 2100103, 2100151, 210015
 LISTS: dict[str, tuple[int, ...]] = {"development": DEVELOPMENT, "reported": REPORTED}
 
 
-def log_config(seed: int, rules: LogRules = STANDARD) -> CityConfig:
-    """The generator's configuration of a log."""
-    plain = CityConfig(seed=seed, n_frames=rules.frames, width=rules.width, height=rules.height)
-    return dataclasses.replace(plain, cameras=rules.cameras)
+def log_config(seed: int, rules: CityConfig = STANDARD) -> CityConfig:
+    """The generator's configuration of a log. ``rules``: what it is recorded with."""
+    return dataclasses.replace(rules, seed=seed)
 
 
 def moving_instances(world: CityWorld, labels: Container[str] | None = None) -> tuple[int, ...]:
@@ -109,11 +97,10 @@ def moving_instances(world: CityWorld, labels: Container[str] | None = None) -> 
     return tuple(world.instance_of(track.id) for track in moving)
 
 
-def facts(seed: int, rules: LogRules = STANDARD) -> dict[str, float | str]:
-    """What the log of a seed holds, from small images of every fourth frame: its turn in degrees (range of headings)
-    and length in metres, moving vehicles in view of the front camera, the share of the image that they cover together
-    on average, and the generator's line about the city."""
-    world = CityWorld(log_config(seed, rules))
+def facts(world: CityWorld) -> dict[str, float | str]:
+    """What a log holds, from small images of every fourth frame: its turn in degrees (range of headings) and length in
+    metres, moving vehicles in view of the front camera, the share of the image that they cover together on average, and
+    the generator's line about the city."""
     views = [view.resized(96, 64) for view in world.frame_views("front")[::4]]
     seen = np.stack([world.render(view, supersample=1).instance for view in views])
     moving = moving_instances(world, VEHICLES)

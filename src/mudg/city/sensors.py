@@ -22,8 +22,6 @@ from mudg.core.weather.light import srgb_decode, srgb_encode
 
 # three cameras and a spinning LiDAR on the roof ---------------------------------------------------
 
-SIDE_YAW_DEG = 50.0
-
 
 def cameras(config: CityConfig) -> dict[str, Camera]:
     """All three cameras, whether recorded or not."""
@@ -39,13 +37,15 @@ def ego_from_camera(config: CityConfig) -> dict[str, NDArray[np.float64]]:
     rng = seeds.numpy_rng(config.seed, 1, "city rig")
     height = 1.6 + config.rig_variation * rng.uniform(-0.25, 0.45)
     pitch = math.radians(0.5 + config.rig_variation * rng.uniform(-2.0, 3.0))
-    x = 1.4
-    places = {"front": (0.0, 0.0), "front_left": (SIDE_YAW_DEG, 0.35), "front_right": (-SIDE_YAW_DEG, -0.35)}
     # camera axes in a body frame that looks along x: right = -y, down = -z, forward = x
     body_from_camera = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     poses = {}
-    for name, (yaw_deg, y) in places.items():
-        pose = geometry.yaw_matrix(math.radians(yaw_deg), (x - (0.15 if y else 0.0), y, height))
+    for name, yaw_deg, x, y in (
+        ("front", 0.0, 1.4, 0.0),
+        ("front_left", 50.0, 1.25, 0.35),
+        ("front_right", -50.0, 1.25, -0.35),
+    ):
+        pose = geometry.yaw_matrix(math.radians(yaw_deg), (x, y, height))
         pose[:3, :3] = pose[:3, :3] @ pitch_rotation(pitch) @ body_from_camera
         poses[name] = pose
     return poses
@@ -59,9 +59,7 @@ def pitch_rotation(angle_rad: float) -> NDArray[np.float64]:
 
 def ego_from_lidar() -> NDArray[np.float64]:
     """The LiDAR sits on the roof, its x axis forward."""
-    pose = np.eye(4)
-    pose[:3, 3] = (0.9, 0.0, 1.95)
-    return pose
+    return geometry.from_rotation_translation(np.eye(3), (0.9, 0.0, 1.95))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,17 +146,6 @@ class CameraFaults:
 
 
 @dataclass(frozen=True)
-class LidarMount:
-    """A LiDAR: place on the vehicle in metres (x forward, y left, z up from the ground), beams and their elevation
-    range in degrees."""
-
-    place: Triple
-    beams: int
-    lower_deg: float
-    upper_deg: float
-
-
-@dataclass(frozen=True)
 class LidarFaults:
     """Errors of a LiDAR against the cameras, and what it does not return. The default changes nothing. ``turn_deg``,
     ``shift_m``: between the assumed and the true mounting, in x, y and z of the sensor. ``delay_s``: the sweep was
@@ -188,6 +175,16 @@ class PoseFaults:
     drift_m: float = 0.0
     drift_deg: float = 0.0
 
+    def errors(self, count: int, key: int) -> Array:
+        """Errors f64[count, 4, 4] of the vehicle's pose at each frame, in its own frame: recorded pose = true pose @
+        error. The drift starts at none and grows evenly to the stated amount at the last frame."""
+        rng = seeds.numpy_rng(key, 0, "pose errors")
+        jitter, drift = rng.standard_normal((count, 6)), rng.standard_normal(6)
+        grown = np.linspace(0, 1, count)[:, None]
+        meters = self.jitter_m * jitter[:, :3] + self.drift_m * drift[:3] * grown
+        degrees = self.jitter_deg * jitter[:, 3:] + self.drift_deg * drift[3:] * grown
+        return np.stack([_small_motion(turn, shift) for turn, shift in zip(degrees, meters, strict=True)])
+
 
 @dataclass(frozen=True)
 class BoxFaults:
@@ -208,7 +205,7 @@ class SensorFaults:
     lidar: LidarFaults = field(default_factory=LidarFaults)
     poses: PoseFaults = field(default_factory=PoseFaults)
     boxes: BoxFaults = field(default_factory=BoxFaults)
-    second_lidar: LidarMount | None = None
+    second_lidar: LidarScan | None = None
 
 
 # --- images ---------------------------------------------------------------------------------------
@@ -216,9 +213,9 @@ class SensorFaults:
 
 def with_look(rgb: Rgb, look: CameraLook, time_s: float) -> Rgb:
     """Display values f32[H, W, 3] in [0, 1] as a camera with this look shows them."""
-    height, width = rgb.shape[:2]
     factors = np.broadcast_to(look.gains(time_s).astype(np.float32), rgb.shape)
     if look.vignette:
+        height, width = rgb.shape[:2]
         y, x = np.mgrid[0:height, 0:width].astype(np.float32) + 0.5
         r2 = ((2 * x / width - 1) ** 2 * width**2 + (2 * y / height - 1) ** 2 * height**2) / (width**2 + height**2)
         factors = factors * (1 - look.vignette * r2)[..., None].astype(np.float32)
@@ -229,12 +226,14 @@ def with_look(rgb: Rgb, look: CameraLook, time_s: float) -> Rgb:
 def recorded(rgb: Rgb, faults: CameraFaults, key: int) -> NDArray[np.uint8]:
     """A recorded image u8[H, W, 3]: bloom and blur in linear light, then noise and compression of display values."""
     light = srgb_decode(rgb)
+    blurred = lambda values, sigma: ndimage.gaussian_filter(values, (sigma, sigma, 0))
     if faults.bloom or faults.veil:
         bright = np.clip(light.max(-1, keepdims=True) - 0.75, 0, None) * 4 * light
-        spread = np.stack([ndimage.gaussian_filter(bright[..., c], faults.bloom_px) for c in range(3)], -1)
-        light = light + faults.bloom * spread + faults.veil * (light.mean((0, 1)) - 0.5 * light)
+        light = (
+            light + faults.bloom * blurred(bright, faults.bloom_px) + faults.veil * (light.mean((0, 1)) - 0.5 * light)
+        )
     if faults.defocus_px > 0.05:
-        light = np.stack([ndimage.gaussian_filter(light[..., c], faults.defocus_px) for c in range(3)], -1)
+        light = blurred(light, faults.defocus_px)
     if faults.motion_px > 0.3:
         steps = max(2, math.ceil(faults.motion_px) + 1)
         along = np.linspace(-0.5, 0.5, steps) * faults.motion_px
@@ -245,7 +244,7 @@ def recorded(rgb: Rgb, faults: CameraFaults, key: int) -> NDArray[np.uint8]:
         rng = seeds.numpy_rng(key, 0, "image noise")
         grain = rng.standard_normal(out.shape).astype(np.float32)
         if faults.grain_px > 0.2:
-            grain = ndimage.gaussian_filter(grain, (faults.grain_px, faults.grain_px, 0))
+            grain = blurred(grain, faults.grain_px)
             grain /= max(float(grain.std()), 1e-6)
         out = out + faults.noise * (0.6 + 0.8 * np.sqrt(np.clip(out, 0, 1))) * grain
     image = (np.clip(out, 0, 1) * 255 + 0.5).astype(np.uint8)
@@ -259,8 +258,8 @@ def recorded(rgb: Rgb, faults: CameraFaults, key: int) -> NDArray[np.uint8]:
 # --- LiDAR, poses, boxes --------------------------------------------------------------------------
 
 
-def kept_points(points: SweepPoints, faults: LidarFaults, key: int) -> NDArray[np.bool_]:
-    """Which points of a sweep come back, bool[N]; ``points`` in the frame of the sensor, x forward."""
+def thinned(points: SweepPoints, faults: LidarFaults, key: int) -> SweepPoints:
+    """The points of a sweep that come back; in the frame of the sensor, x forward."""
     rng = seeds.numpy_rng(key, 0, "lost points")
     azimuth = np.degrees(np.arctan2(points.xyz[:, 1], points.xyz[:, 0]))
     keep = np.abs(azimuth) <= faults.cut_deg
@@ -269,26 +268,7 @@ def kept_points(points: SweepPoints, faults: LidarFaults, key: int) -> NDArray[n
         keep &= (azimuth - start) % 360 >= span
     if faults.dropout:
         keep &= rng.random(len(azimuth)) >= faults.dropout
-    return keep
-
-
-def thinned(points: SweepPoints, faults: LidarFaults, key: int) -> SweepPoints:
-    """The points of a sweep that come back."""
-    keep = kept_points(points, faults, key)
     return SweepPoints(points.xyz[keep], points.intensity[keep], points.dt_s[keep])
-
-
-def pose_errors(faults: PoseFaults, count: int, key: int) -> Array:
-    """Errors f64[count, 4, 4] of the vehicle's pose at each frame, in its own frame: recorded pose = true pose @ error.
-
-    The drift starts at none and grows evenly to the stated amount at the last frame.
-    """
-    rng = seeds.numpy_rng(key, 0, "pose errors")
-    jitter, drift = rng.standard_normal((count, 6)), rng.standard_normal(6)
-    grown = np.linspace(0, 1, count)[:, None]
-    meters = faults.jitter_m * jitter[:, :3] + faults.drift_m * drift[:3] * grown
-    degrees = faults.jitter_deg * jitter[:, 3:] + faults.drift_deg * drift[3:] * grown
-    return np.stack([_small_motion(turn, shift) for turn, shift in zip(degrees, meters, strict=True)])
 
 
 def noisy_tracks(tracks: Sequence[Track], faults: BoxFaults, key: int) -> tuple[Track, ...]:
@@ -296,15 +276,13 @@ def noisy_tracks(tracks: Sequence[Track], faults: BoxFaults, key: int) -> tuple[
     found = []
     for track in tracks:
         rng = seeds.numpy_rng(key, 0, f"box {track.id}")
-        count = len(track.times_s)
-        own, each = rng.standard_normal(4), rng.standard_normal((count, 4))
-        smooth = ndimage.uniform_filter1d(each, 3, axis=0, mode="nearest")  # annotators interpolate
-        error = own + 0.5 * smooth
+        own, each = rng.standard_normal(4), rng.standard_normal((len(track.times_s), 4))
+        error = own + 0.5 * ndimage.uniform_filter1d(each, 3, axis=0, mode="nearest")  # annotators interpolate
         poses = track.world_from_object.copy()
-        for index in range(count):
-            along, across, up = error[index, :3] * faults.position_m
-            turn = math.radians(float(error[index, 3]) * faults.yaw_deg)
-            poses[index] = poses[index] @ geometry.yaw_matrix(turn, (along, across, up / 3))
+        for pose, (along, across, up, turn) in zip(
+            poses, error * [*[faults.position_m] * 3, faults.yaw_deg], strict=True
+        ):
+            pose[:] = pose @ geometry.yaw_matrix(math.radians(float(turn)), (along, across, up / 3))
         size = track.size_m * np.exp(faults.size_share * rng.standard_normal(3))
         found.append(replace(track, size_m=size, world_from_object=poses))
     return tuple(found)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mudg.base import geometry, seeds
 from mudg.city import layout as rec
 from mudg.city.config import CityConfig
-from mudg.city.layout import KERB_M, Color, Draws, StreetPlan, colors, record
+from mudg.city.layout import KERB_M, Color, Crossing, Draws, Size, StreetPlan, colors, record
 from mudg.city.sensors import pitch_rotation
 
 Array = NDArray[np.float64]
@@ -22,6 +22,9 @@ PAINTS = colors(
     "0.50 0.42 0.05",
 )
 BUS_COLORS = colors("0.45 0.03 0.03, 0.55 0.42 0.03, 0.6 0.6 0.58, 0.03 0.16 0.30, 0.05 0.25 0.12")
+BUS_TRIM = (0.6, 0.6, 0.58)
+CARS = (((4.4, 4.9), (1.40, 1.48)), ((3.7, 4.3), (1.45, 1.55)), ((4.3, 4.8), (1.62, 1.78)), ((4.5, 4.9), (1.45, 1.53)))
+"""Lengths and heights of each style, metres."""
 PAINT_WEIGHTS = np.array([4, 4, 3, 3, 3, 3, 2, 1.5, 1.5, 1, 0.7, 0.5, 0.3])
 KEY_MARGIN_S = 0.5
 RIG_BOX = (-1.2, 3.2)  # where cameras may sit along the vehicle, with clearance, metres
@@ -86,9 +89,9 @@ class TrafficPlanner(Draws):
         self._ego_xy = ego_poses[at_frames, :2, 3]
         self._ego_yaw = np.arctan2(ego_poses[at_frames, 1, 0], ego_poses[at_frames, 0, 0])
         self._frame_key = int(np.rint(-self.times[0] * config.rate_hz)) + np.arange(config.n_frames)
-        self._rects: list[Array] = []
         self._paths = np.zeros((0, len(self.times), 2))  # of all kept objects
         self._radii = np.zeros(0)
+        self.duration_s = (config.n_frames - 1) / config.rate_hz
 
     def add(self, row: list[float], keys: Array, gait: float = 0.0, moving: bool = True) -> bool:
         """Keep the object unless it collides; returns whether it was kept."""
@@ -97,7 +100,6 @@ class TrafficPlanner(Draws):
             return False
         row = row[:-1] + [float(len(self.objects) + 1)]
         self.objects.append(PosedObject(row, keys, gait, moving))
-        self._rects.append(np.array([half_l, half_w]))
         self._paths = np.concatenate([self._paths, keys[None, :, :2]])
         self._radii = np.append(self._radii, math.hypot(half_l, half_w))
         return True
@@ -118,7 +120,7 @@ class TrafficPlanner(Draws):
         gap = keys[None, :, :2] - self._paths
         all_near = gap[..., 0] ** 2 + gap[..., 1] ** 2 < (radius + self._radii[:, None]) ** 2
         for index in np.flatnonzero(all_near.any(1)):
-            other, rect, near = self.objects[index], self._rects[index], all_near[index]
+            other, near = self.objects[index], all_near[index]
             a, b = keys[near], other.keys[near]
             # separating axes of both rectangles
             separated = np.zeros(len(a), bool)
@@ -127,7 +129,7 @@ class TrafficPlanner(Draws):
                     ax, ay = np.cos(yaw + turn), np.sin(yaw + turn)
                     distance = np.abs(ax * (b[:, 0] - a[:, 0]) + ay * (b[:, 1] - a[:, 1]))
                     reach = 0.25
-                    for keys_k, hl, hw in ((a, half_l, half_w), (b, rect[0], rect[1])):
+                    for keys_k, hl, hw in ((a, half_l, half_w), (b, other.size[0] / 2, other.size[1] / 2)):
                         cos, sin = np.cos(keys_k[:, 3]), np.sin(keys_k[:, 3])
                         reach = reach + hl * np.abs(ax * cos + ay * sin) + hw * np.abs(-ax * sin + ay * cos)
                     separated |= distance > reach
@@ -139,43 +141,38 @@ class TrafficPlanner(Draws):
         """Record of a random vehicle."""
         paint = PAINTS[int(self.rng.choice(len(PAINTS), p=PAINT_WEIGHTS / PAINT_WEIGHTS.sum()))]
         seed = self.seed()
-        origin = (0.0, 0.0, 0.0)
         if self.config.overhead > 0 and self.chance((0.3 if allow_big else 0.08) * self.config.overhead):
             return self.tall_vehicle(seed, paint)
         draw = float(self.rng.random())
         if draw < 0.10:
             size = (self.uniform(5.0, 6.2), self.uniform(1.95, 2.1), self.uniform(2.1, 2.6))
-            white = PAINTS[1] if self.chance(0.6) else paint
-            return record(rec.VAN, origin, 0, size, seed, white)
+            return posed(rec.VAN, size, seed, PAINTS[1] if self.chance(0.6) else paint)
         if allow_big and draw < 0.17:
             size = (self.uniform(6.5, 9.0), 2.45, self.uniform(3.0, 3.7))
-            box = PAINTS[1] if self.chance(0.6) else self.box_color()
-            return record(rec.TRUCK, origin, 0, size, seed, paint, box)
+            return posed(rec.TRUCK, size, seed, paint, self.box_color(0.6))
         if allow_big and draw < 0.21:
             body = BUS_COLORS[int(self.rng.integers(5))]
-            return record(rec.BUS, origin, 0, (self.uniform(10.5, 12), 2.5, 3.1), seed, body, (0.6, 0.6, 0.58))
+            return posed(rec.BUS, (self.uniform(10.5, 12), 2.5, 3.1), seed, body, BUS_TRIM)
         style = int(self.rng.choice(4, p=[0.3, 0.32, 0.24, 0.14]))
-        length = (self.uniform(4.4, 4.9), self.uniform(3.7, 4.3), self.uniform(4.3, 4.8), self.uniform(4.5, 4.9))[style]
-        height = tuple(self.uniform(*span) for span in ((1.40, 1.48), (1.45, 1.55), (1.62, 1.78), (1.45, 1.53)))[style]
-        size = (length, self.uniform(1.74, 1.88), height)
-        return record(rec.CAR, origin, 0, size, seed, paint, parameters=(float(style),))
+        length, height = ([self.uniform(*spans[axis]) for spans in CARS][style] for axis in (0, 1))
+        return posed(rec.CAR, (length, self.uniform(1.74, 1.88), height), seed, paint, form=(float(style),))
 
     def tall_vehicle(self, seed: int, paint: Color) -> list[float]:
         """Record of a lorry, tanker or bus of full height."""
-        kind, origin = float(self.rng.random()), (0.0, 0.0, 0.0)
-        box = PAINTS[1] if self.chance(0.5) else self.box_color()
+        kind, box = float(self.rng.random()), self.box_color(0.5)
         if kind < 0.5:
-            size = (self.uniform(7.0, 15.0), 2.5, self.uniform(3.6, 4.0))
-            return record(rec.TRUCK, origin, 0, size, seed, paint, box)
+            return posed(rec.TRUCK, (self.uniform(7.0, 15.0), 2.5, self.uniform(3.6, 4.0)), seed, paint, box)
         if kind < 0.65:
             steel, size = self.uniform(0.3, 0.6), (self.uniform(8.0, 13.0), 2.5, self.uniform(3.3, 3.7))
-            return record(rec.TANKER, origin, 0, size, seed, paint, (steel,) * 3 if self.chance(0.6) else box)
+            return posed(rec.TANKER, size, seed, paint, (steel,) * 3 if self.chance(0.6) else box)
         body = BUS_COLORS[int(self.rng.integers(5))]
         height = self.uniform(4.1, 4.4) if self.chance(0.35) else self.uniform(3.1, 3.5)
-        return record(rec.BUS, origin, 0, (self.uniform(10.5, 12), 2.5, height), seed, body, (0.6, 0.6, 0.58))
+        return posed(rec.BUS, (self.uniform(10.5, 12), 2.5, height), seed, body, BUS_TRIM)
 
-    def box_color(self) -> Color:
-        """A colour of a lorry's box."""
+    def box_color(self, white: float) -> Color:
+        """A colour of a lorry's box; ``white``: with this probability."""
+        if self.chance(white):
+            return PAINTS[1]
         return (self.uniform(0.05, 0.5), self.uniform(0.05, 0.4), self.uniform(0.05, 0.5))
 
     def cloth(self) -> Color:
@@ -188,7 +185,11 @@ class TrafficPlanner(Draws):
         """Record of a random pedestrian."""
         coat, (r, g, b), height, seed = self.cloth(), self.cloth(), self.uniform(1.55, 1.9), self.seed()
         gait, legs = (min(0.5, 0.33 * speed), float(self.chance(0.3))), (0.4 * r, 0.4 * g, 0.4 * b)
-        return record(rec.PEDESTRIAN, (0, 0, 0), 0, (0.85, 0.65, height), seed, coat, legs, gait)
+        return posed(rec.PEDESTRIAN, (0.85, 0.65, height), seed, coat, legs, form=gait)
+
+    def stand(self, row: list[float], x: float, y: float, yaw: float) -> None:
+        """Keep an object that stands on the road, unless it collides."""
+        self.add(row, np.tile([x, y, 0.0, yaw], (len(self.times), 1)), moving=False)
 
     def along_street(self, s: Array, u: Array | float, direction: int, z: float = 0.0) -> Array:
         """Keys of an object that follows the main street; direction -1 = against it."""
@@ -196,15 +197,22 @@ class TrafficPlanner(Draws):
         return np.stack([x, y, np.full(len(s), z), heading + (0.0 if direction > 0 else math.pi)], 1)
 
 
+def posed(kind: int, size: Size, seed: int, *rgb: Color, form: rec.Form = ()) -> list[float]:
+    """Record of an object whose pose comes from its keys."""
+    return record(kind, (0, 0, 0), 0, size, seed, *rgb, form=form)
+
+
 def plan_traffic(config: CityConfig, plan: StreetPlan, ego_times: Array, ego_poses: Array) -> list[PosedObject]:
     """All posed objects of a world; their public id is their position + 1."""
     t = TrafficPlanner(config, plan, ego_times, ego_poses)
     if config.traffic <= 0:
         return []
-    _turning(t)
+    if plan.crossing is not None:
+        _turning(t, plan.crossing)
     _lead(t)
     _lanes(t)
-    _crossing_traffic(t)
+    if plan.crossing is not None:
+        _crossing_traffic(t, plan.crossing)
     _cyclists(t)
     _parked(t)
     _pedestrians(t)
@@ -228,23 +236,19 @@ def _lead(t: TrafficPlanner) -> None:
 
 def _lanes(t: TrafficPlanner) -> None:
     ego_s = t.plan.ego_s(t.times)
+    density = max(0.5, t.config.traffic)
     for u in t.plan.forward_lanes:
         if u == t.plan.ego_u:
             continue
-        s0 = t.uniform(-25, 8)
-        drift = t.uniform(-1.2, 1.2)
-        while s0 < 80:
+        start, drift = t.uniform(-25, 8), t.uniform(-1.2, 1.2)
+        for s in t.along(start, 80, lambda: t.uniform(10, 24) / density):
             if t.chance(0.6 * min(1.0, t.config.traffic)):
-                t.add(t.vehicle(), t.along_street(ego_s + s0 + drift * t.times, u + t.uniform(-0.2, 0.2), 1))
-            s0 += t.uniform(10, 24) / max(0.5, t.config.traffic)
-    end = t.plan.drive_length + 170
+                t.add(t.vehicle(), t.along_street(ego_s + s + drift * t.times, u + t.uniform(-0.2, 0.2), 1))
     for u in t.plan.backward_lanes:
-        speed = t.uniform(6, 12)
-        s0 = t.uniform(-30, 10)
-        while s0 < end:
+        speed, start = t.uniform(6, 12), t.uniform(-30, 10)
+        for s in t.along(start, t.plan.drive_length + 170, lambda: t.uniform(9, 38) / density):
             if t.chance(0.7):
-                t.add(t.vehicle(), t.along_street(s0 - speed * t.times, u + t.uniform(-0.25, 0.25), -1))
-            s0 += t.uniform(9, 38) / max(0.5, t.config.traffic)
+                t.add(t.vehicle(), t.along_street(s - speed * t.times, u + t.uniform(-0.25, 0.25), -1))
 
 
 def _follow(points: Array, start: float, speed: float, times: Array) -> Array:
@@ -252,62 +256,47 @@ def _follow(points: Array, start: float, speed: float, times: Array) -> Array:
     step = np.hypot(*np.diff(points, axis=0).T)
     length = np.concatenate([[0.0], np.cumsum(step)])
     at = np.clip(start + speed * times, 0.0, length[-1] - 1e-3)
-    xy = np.stack([np.interp(at, length, points[:, k]) for k in range(2)], 1)
-    ahead = np.stack([np.interp(np.minimum(at + 0.8, length[-1]), length, points[:, k]) for k in range(2)], 1)
-    back = np.stack([np.interp(np.maximum(at - 0.8, 0.0), length, points[:, k]) for k in range(2)], 1)
+    ways = (at, np.minimum(at + 0.8, length[-1]), np.maximum(at - 0.8, 0.0))
+    xy, ahead, back = (np.stack([np.interp(way, length, points[:, k]) for k in range(2)], 1) for way in ways)
     direction = ahead - back
     return np.column_stack([xy, np.zeros(len(times)), np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))])
 
 
-def _turning(t: TrafficPlanner) -> None:
+def _turning(t: TrafficPlanner, crossing: Crossing) -> None:
     """A car that turns from the crossing street into the main street, under way in the middle of the log."""
-    plan, crossing = t.plan, t.plan.crossing
-    if crossing is None:
-        return
-    duration = (t.config.n_frames - 1) / t.config.rate_hz
+    plan = t.plan
     for _ in range(2):
         arm = 1 if crossing.end > 0 and (crossing.start >= 0 or t.chance(0.5)) else -1
         towards_ego = t.chance(0.55) and bool(plan.backward_lanes)
         u = plan.backward_lanes[-1] if towards_ego else plan.forward_lanes[-1]
         b = arm * crossing.half_width * 0.5  # inbound traffic keeps right
-        start = np.array([crossing.to_world(arm * 60.0, b)])
-        corner = np.array(crossing.to_world(u, b))
-        inbound = np.array(crossing.to_world(u + arm * 7.0, b))
-        sign = -1 if towards_ego else 1
-        s_out = crossing.s + sign * np.arange(7.0, 90.0, 1.0)
-        x, y, _ = plan.line.to_world(s_out, u)
-        out = np.stack([x, y], 1)
+        start, corner, inbound = (np.array(crossing.to_world(a, b)) for a in (arm * 60.0, u, u + arm * 7.0))
+        s_out = crossing.s + (-1 if towards_ego else 1) * np.arange(7.0, 90.0, 1.0)
+        out = plan.line.line(s_out, np.full(len(s_out), u))[:, :2]
         f = np.linspace(0, 1, 24)[:, None]  # a quadratic curve with both tangents through the corner
         bend = (1 - f) ** 2 * inbound + 2 * f * (1 - f) * corner + f**2 * out[0]
-        path = np.concatenate([start, bend, out[1:]])
-        to_bend = float(np.hypot(*(inbound - start[0])))
+        path = np.concatenate([start[None], bend, out[1:]])
         speed = t.uniform(4.0, 6.0)
-        at_middle = to_bend + t.uniform(0, 10)
-        if t.add(t.vehicle(allow_big=False), _follow(path, at_middle - speed * duration / 2, speed, t.times)):
+        at_middle = float(np.hypot(*(inbound - start))) + t.uniform(0, 10)
+        if t.add(t.vehicle(allow_big=False), _follow(path, at_middle - speed * t.duration_s / 2, speed, t.times)):
             return
 
 
-def _crossing_traffic(t: TrafficPlanner) -> None:
-    plan, crossing = t.plan, t.plan.crossing
-    if crossing is None:
-        return
+def _crossing_traffic(t: TrafficPlanner, crossing: Crossing) -> None:
     for arm in (-1, 1):
         if not crossing.has_arm(arm):
             continue
-        a = abs(plan.kerb(arm)) + crossing.corner * 0.6 + 7.5
+        kerb, lane = t.plan.kerb(arm), arm * crossing.half_width * 0.5
+        a = kerb + crossing.corner * 0.6 + 7.5
         for _ in range(2):
             if t.chance(0.6):  # waiting at the line
                 row = t.vehicle(allow_big=False)
-                x, y = crossing.to_world(arm * (a + row[5] / 2), arm * crossing.half_width * 0.5)
-                yaw = crossing.yaw + (math.pi if arm > 0 else 0.0)
-                t.add(row, np.tile([x, y, 0.0, yaw], (len(t.times), 1)), moving=False)
+                t.stand(row, *crossing.to_world(arm * (a + row[5] / 2), lane), crossing.yaw + math.pi * (arm > 0))
             a += t.uniform(6, 8)
-        speed = t.uniform(4, 8)
-        offset = t.uniform(10, 40)
-        a_out = arm * (offset + speed * t.times)
-        xy = np.array([crossing.to_world(float(v), -arm * crossing.half_width * 0.5) for v in a_out])
-        yaw = crossing.yaw + (0.0 if arm > 0 else math.pi)
-        if offset + speed * t.times[0] > abs(plan.kerb(arm)):
+        speed, offset = t.uniform(4, 8), t.uniform(10, 40)
+        xy = np.array([crossing.to_world(float(v), -lane) for v in arm * (offset + speed * t.times)])
+        yaw = crossing.yaw + math.pi * (arm < 0)
+        if offset + speed * t.times[0] > kerb:
             t.add(t.vehicle(), np.column_stack([xy, np.zeros(len(xy)), np.full(len(xy), yaw)]))
 
 
@@ -315,10 +304,9 @@ def _cyclists(t: TrafficPlanner) -> None:
     ego_s = t.plan.ego_s(t.times)
     for _ in range(int(2 + t.config.traffic)):
         clothes = t.cloth()
-        row = record(rec.CYCLIST, (0, 0, 0), 0, (1.8, 0.62, 1.78), t.seed(), clothes, (0.03, 0.03, 0.05))
+        row = posed(rec.CYCLIST, (1.8, 0.62, 1.78), t.seed(), clothes, (0.03, 0.03, 0.05))
         speed = t.uniform(3.5, 6.0)
-        side = -1 if t.chance(0.6) else 1
-        if side < 0 or not t.plan.backward_lanes:
+        if t.chance(0.6) or not t.plan.backward_lanes:
             u = t.plan.right + t.plan.park_right + 0.6
             s = t.uniform(8, 40) + speed * t.times
             if t.chance(0.5):
@@ -331,46 +319,38 @@ def _cyclists(t: TrafficPlanner) -> None:
 
 
 def _parked(t: TrafficPlanner) -> None:
-    plan = t.plan
-    end = plan.drive_length + 110
+    plan, crossing = t.plan, t.plan.crossing
+    walks = [(start, length) for start, length, on_cross in plan.crosswalks if on_cross < 0.5]
     for side, band in ((1, plan.park_left), (-1, plan.park_right)):
         if band <= 0:
             continue
         s = -30 + t.uniform(0, 6)
-        while s < end:
+        while s < plan.drive_length + 110:
             row = t.vehicle(allow_big=False)
             half = row[5] / 2
-            crossing = plan.crossing
             clear = crossing is None or abs(s + half - crossing.s) > crossing.half_width + crossing.corner + 6
-            walks = [(start, length) for start, length, on_cross in plan.crosswalks if on_cross < 0.5]
             walk = any(start - 5 < s + half < start + length + 5 for start, length in walks)
             if clear and not walk and t.chance(0.72 * min(1.0, t.config.traffic)):
-                u = side * (abs(plan.kerb(side)) - 0.18 - row[6] / 2 - t.uniform(0, 0.15))
-                direction = -1 if side > 0 and plan.backward_lanes else 1
+                u = side * (plan.kerb(side) - 0.18 - row[6] / 2 - t.uniform(0, 0.15))
+                against = bool(side > 0 and plan.backward_lanes)
                 x, y, heading = plan.line.point(s + half, u)
-                yaw = heading + (math.pi if direction < 0 else 0.0) + t.uniform(-0.02, 0.02)
-                t.add(row, np.tile([x, y, 0.0, yaw], (len(t.times), 1)), moving=False)
+                t.stand(row, x, y, heading + math.pi * against + t.uniform(-0.02, 0.02))
             s += row[5] + t.uniform(0.7, 1.6)
 
 
 def _pedestrians(t: TrafficPlanner) -> None:
-    plan = t.plan
-    count = int(round((10 if plan.urban else 5) * t.config.traffic))
-    for _ in range(count):
+    plan, crossing = t.plan, t.plan.crossing
+    for _ in range(int(round((10 if plan.urban else 5) * t.config.traffic))):
         speed = t.uniform(0.9, 1.6) if t.chance(0.85) else 0.0
-        direction = 1 if t.chance(0.5) else -1
-        side = 1 if t.chance(0.5) else -1
-        s0 = t.uniform(4, plan.drive_length + 45)
-        off = t.uniform(0.5, max(0.7, plan.sidewalk(side) - 0.6))
-        u = side * (abs(plan.kerb(side)) + off)
-        s = s0 + direction * speed * t.times
-        crossing = plan.crossing
+        direction, side = t.side(), t.side()
+        s = t.uniform(4, plan.drive_length + 45) + direction * speed * t.times
+        u = side * (plan.kerb(side) + t.uniform(0.5, max(0.7, plan.sidewalk(side) - 0.6)))
         if crossing is not None and (np.abs(s - crossing.s) < crossing.half_width + crossing.corner).any():
             continue
         reach = t.config.shift_margin_m + 1.1
         if abs(u - plan.ego_u) < reach:  # walk further out where the shifted cameras pass
             u = plan.ego_u + side * reach
-            if abs(u) > abs(plan.kerb(side)) + plan.sidewalk(side) - 0.4:
+            if abs(u) > plan.front(side) - 0.4:
                 continue
         keys = t.along_street(s, u, direction, z=KERB_M)
         if speed == 0.0:
@@ -379,10 +359,9 @@ def _pedestrians(t: TrafficPlanner) -> None:
     for start, length, on_cross in plan.crosswalks:  # somebody crosses the street
         if on_cross > 0.5 or not t.chance(0.7):
             continue
-        duration = (t.config.n_frames - 1) / t.config.rate_hz
         for _ in range(2):
-            speed, side = t.uniform(1.1, 1.5), 1 if t.chance(0.5) else -1
-            u = t.uniform(-1, 1) * 4.0 + side * speed * (t.times - duration / 2)
+            speed, side = t.uniform(1.1, 1.5), t.side()
+            u = t.uniform(-1, 1) * 4.0 + side * speed * (t.times - t.duration_s / 2)
             s = np.full(len(t.times), start + t.uniform(0.3, length - 0.3))
             x, y, heading = plan.line.to_world(s, u)
             on_walk = (u > plan.left) | (u < plan.right)

@@ -8,7 +8,7 @@ import ctypes
 import functools
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +61,9 @@ def _f64(array: Any) -> Array:
     return np.ascontiguousarray(array, np.float64)
 
 
+Truth = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]
+
+
 class CityHandle:
     """Owns one native world."""
 
@@ -82,14 +85,15 @@ class CityHandle:
     def set_texture(self, slot: int, rgb: NDArray[np.float32], metres: float) -> None:
         """Give a surface or the sky a photograph f32[H, W, 3]; before anything is rendered."""
         pixels = np.ascontiguousarray(rgb, np.float32)
-        if self._lib.mudg_city_set_texture(self._handle, slot, pixels, pixels.shape[1], pixels.shape[0], metres):
-            raise ResourceError("not enough memory for a texture of the city")
+        self._call("set_texture", "for a texture of", slot, pixels, pixels.shape[1], pixels.shape[0], metres)
 
     def set_weather(self, numbers: Array, lamps: Array) -> None:
         """Wet ground, snow and lamps f64[N, 3]; before anything is rendered. Numbers as in native/city_weather.cpp."""
-        values, places = _f64(numbers), _f64(lamps).reshape(-1, 3)
-        if self._lib.mudg_city_set_weather(self._handle, values, places, len(places)):
-            raise ResourceError("not enough memory for the lamps of the city")
+        self._call("set_weather", "for the lamps of", _f64(numbers), _f64(lamps), len(lamps))
+
+    def _call(self, name: str, purpose: str, *arguments: Any) -> None:
+        if getattr(self._lib, f"mudg_city_{name}")(self._handle, *arguments):
+            raise ResourceError(f"not enough memory {purpose} the city")
 
     def __del__(self) -> None:
         if getattr(self, "_handle", None):
@@ -97,48 +101,31 @@ class CityHandle:
             self._handle = None
 
     def render(
-        self,
-        poses: Array,
-        phases: Array,
-        intrinsics: tuple[float, float, float, float],
-        width: int,
-        height: int,
-        world_from_cam: Array,
-        supersample: int,
-        noise_key: int,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]:
-        """rgb f32[H, W, 3] in [0, 1], depth f32[H, W] (+inf in the sky), semantics u8[H, W], instance i32[H, W]."""
-        rgb, depth = np.empty((height, width, 3), np.float32), np.empty((height, width), np.float32)
-        semantics, instance = np.empty((height, width), np.uint8), np.empty((height, width), np.int32)
-        poses, phases, camera, pose = map(_f64, (poses, phases, intrinsics, world_from_cam))
-        view, key = (camera, width, height, pose), noise_key & 0xFFFFFFFF
-        truth = (rgb, depth, semantics, instance)
-        if self._lib.mudg_city_render(self._handle, poses, phases, *view, supersample, key, *truth):
-            raise ResourceError("not enough memory to render the city")
+        self, objects: tuple[Array, Array], camera: Camera, world_from_cam: Array, supersample: int, noise_key: int
+    ) -> Truth:
+        """rgb f32[H, W, 3] in [0, 1], depth f32[H, W] (+inf in the sky), semantics u8[H, W], instance i32[H, W].
+        ``objects``: poses f64[objects, 4] and phases."""
+        truth, intrinsics = _empty(camera.height, camera.width), _f64(camera.intrinsics)
+        view = (*map(_f64, objects), intrinsics, camera.width, camera.height, _f64(world_from_cam))
+        self._call("render", "to render", *view, supersample, noise_key & 0xFFFFFFFF, *truth)
         return truth
 
     def sweep(
         self,
-        poses: Array,
-        phases: Array,
-        elevations: Array,
-        azimuths: Array,
+        objects: tuple[Array, Array],
+        beams: tuple[Array, Array],
         world_from_lidar: Array,
         fractions: Array,
         settings: tuple[float, float, float, float],
         key: int,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]:
+    ) -> Truth:
         """World points f32[C, B, 3], intensity f32[C, B] (negative: no return), semantics u8[C, B], instance i32[C, B]
-        for C columns and B beams; ``poses`` f64[knots, objects, 4], ``world_from_lidar`` f64[C, 3, 4]."""
-        columns, beams = len(azimuths), len(elevations)
-        xyz, intensity = np.empty((columns, beams, 3), np.float32), np.empty((columns, beams), np.float32)
-        semantics, instance = np.empty((columns, beams), np.uint8), np.empty((columns, beams), np.int32)
-        poses, phases, rows, numbers = map(_f64, (poses, phases, world_from_lidar, settings))
-        elevations, azimuths, fractions = map(_f64, (elevations, azimuths, fractions))
-        scan = (elevations, beams, azimuths, columns, rows, fractions, numbers, key & 0xFFFFFFFF)
-        points = (xyz, intensity, semantics, instance)
-        if self._lib.mudg_city_sweep(self._handle, poses, len(poses), phases, *scan, *points):
-            raise ResourceError("not enough memory to scan the city")
+        for C columns and B beams. ``objects``: poses f64[knots, objects, 4] and phases. ``beams``: elevations and
+        azimuths. ``world_from_lidar``: f64[C, 3, 4]."""
+        (poses, phases), (elevations, azimuths) = map(_f64, objects), map(_f64, beams)
+        points, rest = _empty(len(azimuths), len(elevations)), map(_f64, (world_from_lidar, fractions, settings))
+        scan = (elevations, len(elevations), azimuths, len(azimuths), *rest, key & 0xFFFFFFFF)
+        self._call("sweep", "to scan", poses, len(poses), phases, *scan, *points)
         return points
 
     def street(self, xy: Array) -> Array:
@@ -147,6 +134,12 @@ class CityHandle:
         out = np.empty((len(xy), 3), np.float64)
         self._lib.mudg_city_street(self._handle, xy, len(xy), out)
         return out
+
+
+def _empty(*shape: int) -> Truth:
+    """Arrays for the native library to fill."""
+    first, second = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
+    return first, second, np.empty(shape, np.uint8), np.empty(shape, np.int32)
 
 
 # world ---------------------------------------------------------------------------------------------
@@ -199,35 +192,27 @@ class CityWorld:
     def __init__(self, config: CityConfig) -> None:
         self.config = config
         self.plan: StreetPlan = plan_streets(config)
-        self.light_name, self._light = light_numbers(config)
+        self.light_name, light = light_numbers(config)
         self._ego_times, self._ego_poses = ego_keys(config, self.plan)
         self.objects: tuple[PosedObject, ...] = tuple(plan_traffic(config, self.plan, self._ego_times, self._ego_poses))
         self.key_times_s = key_times(config)
         """Times f64[K] of the keys of all objects."""
-        self._furniture = furnish(config, self.plan)
-        self.lamps: Array = lamp_places(self._furniture + [m.row for m in self.objects])
+        rows = furnish(config, self.plan) + [m.row for m in self.objects]
+        self.lamps: Array = lamp_places(rows)
         no_keys = np.zeros((len(self.key_times_s), 0, 4))
         self._keys = np.stack([m.keys for m in self.objects], 1) if self.objects else no_keys
         self._gaits = np.array([m.gait_rad_per_s for m in self.objects], np.float64)
         self._gait_starts = seeds.numpy_rng(config.seed, 0, "city gait").uniform(0, 2 * np.pi, len(self.objects))
-        self._handle = self._native_world()
+        road, seed = _road_numbers(config, self.plan), seeds.key(config.seed, 0, "city surfaces")
+        self._handle = CityHandle(np.array(rows, np.float64), self.plan, road, light, seed)
+        for slot, rgb, metres in draw_photos(Path(config.textures), config.seed) if config.textures else ():
+            self._handle.set_texture(slot, rgb, metres)
+        numbers = weather_numbers(config)
+        if numbers is not None:
+            self._handle.set_weather(numbers, self.lamps)
         self._cameras = sensors.cameras(config)
         self._mounts = sensors.ego_from_camera(config)
         self._ego_path = EgoPath(self._ego_times, self._ego_poses)
-
-    def _native_world(self) -> CityHandle:
-        """The native world of all shapes, in its light and weather."""
-        config = self.config
-        records = np.array(self._furniture + [m.row for m in self.objects], np.float64).reshape(-1, rec.COLUMNS)
-        handle = CityHandle(
-            records, self.plan, _road_numbers(config, self.plan), self._light, _seed31(config, "city surfaces")
-        )
-        for slot, rgb, metres in draw_photos(Path(config.textures), config.seed) if config.textures else ():
-            handle.set_texture(slot, rgb, metres)
-        numbers = weather_numbers(config)
-        if numbers is not None:
-            handle.set_weather(numbers, self.lamps)
-        return handle
 
     @classmethod
     def from_source(cls, source: Source) -> CityWorld:
@@ -274,14 +259,12 @@ class CityWorld:
 
     def describe(self) -> str:
         """One line about what was drawn."""
-        plan = self.plan
-        lanes = f"{len(plan.forward_lanes)}+{len(plan.backward_lanes)} lanes"
-        quarter = "urban" if plan.urban else "suburban"
-        crossing = "a crossing" if plan.crossing is not None else "no crossing"
-        moving = sum(m.moving for m in self.objects)
+        plan, moving = self.plan, sum(m.moving for m in self.objects)
         return (
-            f"{quarter}, {self.light_name}, {lanes}, {crossing}, {plan.drive_length:.0f} m of drive, {moving} moving"
-            f" and {len(self.objects) - moving} standing objects, {self._handle.shape_count} shapes"
+            f"{'urban' if plan.urban else 'suburban'}, {self.light_name}, {len(plan.forward_lanes)}+"
+            f"{len(plan.backward_lanes)} lanes, {'no' if plan.crossing is None else 'a'} crossing,"
+            f" {plan.drive_length:.0f} m of drive, {moving} moving and {len(self.objects) - moving} standing objects,"
+            f" {self._handle.shape_count} shapes"
         )
 
     @property
@@ -306,11 +289,10 @@ class CityWorld:
         """Boxes of all vehicles and people, parked ones with a constant pose. The number in the id is the instance id.
         Truth between keys is exactly ``Track.pose_at``."""
         tracks = []
-        for index, posed in enumerate(self.objects):
-            label = rec.LABELS[int(posed.row[0])]
-            half = posed.size[2] / 2
+        for number, posed in enumerate(self.objects, 1):
+            label, half = rec.LABELS[int(posed.row[0])], posed.size[2] / 2
             poses = np.stack([geometry.yaw_matrix(float(yaw), (x, y, z + half)) for x, y, z, yaw in posed.keys])
-            tracks.append(Track(f"{label}-{index + 1:03d}", label, np.array(posed.size), self.key_times_s, poses))
+            tracks.append(Track(f"{label}-{number:03d}", label, np.array(posed.size), self.key_times_s, poses))
         return tuple(tracks)
 
     def instance_of(self, track_id: str) -> int:
@@ -321,36 +303,30 @@ class CityWorld:
         """The recorded views of a camera, one per frame."""
         if camera not in self._cameras:
             raise UsageError("the city has no such camera", expected=", ".join(self._cameras), got=camera)
-        views = []
-        for index in range(self.config.n_frames):
-            time_s = self.frame_time(index)
-            views.append(View(self._cameras[camera], self.frame_pose(time_s) @ self._mounts[camera], time_s))
-        return tuple(views)
+        recorded, mount, times = self._cameras[camera], self._mounts[camera], range(self.config.n_frames)
+        return tuple(View(recorded, self.frame_pose(t) @ mount, t) for t in map(self.frame_time, times))
 
     def frame_pose(self, time_s: float) -> Array:
         """world_from_ego f64[4, 4] of the recording vehicle; UsageError outside the log."""
         pose = self._ego_path.pose_at(time_s)
         if pose is None:
-            what = "time lies outside the log"
-            raise UsageError(what, expected=f"{self._ego_times[0]:.3f}..{self._ego_times[-1]:.3f} s", got=f"{time_s} s")
+            raise _outside(self._ego_times, f"{time_s}")
         return pose
 
-    def _object_keys_at(self, times_s: Array) -> Array:
-        """x, y, z, yaw f64[T, objects, 4] between the keys, as Track.pose_at interpolates."""
-        times, keys = self.key_times_s, self._keys
+    def _objects_at(self, *times_s: float, phase_s: float | None = None) -> tuple[Array, Array]:
+        """x, y, z, yaw f64[T, objects, 4] between the keys, as Track.pose_at interpolates; and the phases of their
+        gaits, at the first time unless another is given."""
+        times, keys, wanted = self.key_times_s, self._keys, np.array(times_s)
         first, last = self.span_s
-        if times_s.min() < first - 1e-6 or times_s.max() > last + 1e-6:
-            what = "time lies outside the log"
-            raise UsageError(what, expected=f"{first:.3f}..{last:.3f} s", got=f"{times_s.min()}..{times_s.max()} s")
-        at = np.clip((times_s - first) * self.config.rate_hz, 0, len(times) - 1)
+        if wanted.min() < first - 1e-6 or wanted.max() > last + 1e-6:
+            raise _outside(times, f"{wanted.min()}..{wanted.max()}")
+        at = np.clip((wanted - first) * self.config.rate_hz, 0, len(times) - 1)
         nearest = np.rint(at)
         at = np.where(np.abs(at - nearest) < 1e-6 * self.config.rate_hz, nearest, at)
         before = np.minimum(at.astype(int), len(times) - 2)
         u = (at - before)[:, None, None]
-        return keys[before] + u * (keys[before + 1] - keys[before])
-
-    def _phases(self, time_s: float) -> Array:
-        return self._gait_starts + self._gaits * time_s
+        phases = self._gait_starts + self._gaits * (times_s[0] if phase_s is None else phase_s)
+        return keys[before] + u * (keys[before + 1] - keys[before]), phases
 
     def markings(self, view: View, truth: CityTruth) -> NDArray[np.bool_]:
         """Pixels bool[H, W] whose centre shows paint on the road, exactly: without the blur of a pixel and without
@@ -380,13 +356,11 @@ class CityWorld:
         noise_key = 0
         if sensor_noise:
             noise_key = seeds.key(self.config.seed, round(view.time_s * 1e4), f"city noise {camera.name}") | 1
-        intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
         per_axis = self.config.supersample if supersample is None else supersample
         if not 1 <= per_axis <= 8:
             raise UsageError("supersample must lie in 1..8", got=str(per_axis))
-        poses = self._object_keys_at(np.array([view.time_s]))[0]
-        frame = (intrinsics, camera.width, camera.height, view.world_from_cam)
-        return CityTruth(*self._handle.render(poses, self._phases(view.time_s), *frame, per_axis, noise_key))
+        objects = self._objects_at(view.time_s)
+        return CityTruth(*self._handle.render(objects, camera, view.world_from_cam, per_axis, noise_key))
 
     def observation(self, view: View, truth: CityTruth | None = None) -> Observation:
         """Noise-free truth as torch tensors; depth is 0 (= none) in the sky, everything may be used. ``truth``: what
@@ -410,12 +384,10 @@ class CityWorld:
         for top, bottom in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
             at = view.time_s + readout_s * ((top + bottom) / 2 / camera.height - 0.5)
             at = min(max(at, first), last)
-            intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy - top)
-            strip = (intrinsics, camera.width, bottom - top, self.frame_pose(at) @ mount)
-            objects = (self._object_keys_at(np.array([at]))[0], self._phases(at))
-            parts.append(self._handle.render(*objects, *strip, self.config.supersample, 0))
+            strip, pose = replace(camera, cy=camera.cy - top, height=bottom - top), self.frame_pose(at) @ mount
+            parts.append(self._handle.render(self._objects_at(at), strip, pose, self.config.supersample, 0))
         rgb, depth, semantics, instance = zip(*parts, strict=True)
-        return CityTruth(*(np.concatenate(column) for column in (rgb, depth, semantics, instance)))
+        return CityTruth(*map(np.concatenate, (rgb, depth, semantics, instance)))
 
     def ranges(self, places: Array, directions: Array, times_s: Array) -> tuple[Array, Array]:
         """Exact range f64[N] in metres and intensity f64[N] of single beams without noise; NaN: nothing returns (glass
@@ -434,10 +406,12 @@ class CityWorld:
         left /= np.linalg.norm(left, axis=1, keepdims=True)
         axes = np.stack([directions, left, np.cross(directions, left)], 2)
         poses = np.concatenate([axes @ back, places[:, :, None]], 2)
-        objects = (self._object_keys_at(np.array([first, middle, last])), self._phases(middle))
-        settings = (self.config.lidar_range_m, 0.0, 0.0, 0.55)
+        objects, settings = (
+            self._objects_at(first, middle, last, phase_s=middle),
+            (self.config.lidar_range_m, 0, 0, 0.55),
+        )
         key = seeds.key(self.config.seed, round(middle * 1e6), "exact beams")
-        xyz, intensity, _, _ = self._handle.sweep(*objects, np.zeros(1), turns, poses, share, settings, key)
+        xyz, intensity, _, _ = self._handle.sweep(objects, (np.zeros(1), turns), poses, share, settings, key)
         returned = intensity[:, 0] >= 0
         range_m, light = np.full(len(times_s), np.nan), np.full(len(times_s), np.nan)
         range_m[returned] = np.linalg.norm(xyz[returned, 0].astype(np.float64) - places[returned], axis=1)
@@ -451,23 +425,19 @@ class CityWorld:
         config = self.config
         if not 0 <= index < config.n_frames:
             raise UsageError("there is no such sweep", expected=f"0..{config.n_frames - 1}", got=str(index))
-        time_s = self.frame_time(index)
-        period = 1.0 / config.rate_hz
-        azimuths = sensors.lidar_azimuths(config)
+        time_s, period, azimuths = self.frame_time(index), 1.0 / config.rate_hz, sensors.lidar_azimuths(config)
         offsets = (np.arange(len(azimuths)) + 0.5) / len(azimuths) * period - period / 2
-        knots = np.array([time_s - period / 2, time_s, time_s + period / 2])
         scan = scan or sensors.LidarScan(sensors.ego_from_lidar(), sensors.lidar_elevations(config))
-        mount = scan.ego_from_lidar
+        mount, knots = scan.ego_from_lidar, np.array([time_s - period / 2, time_s, time_s + period / 2])
         time_s += scan.delay_s
         knots = np.clip(knots + scan.delay_s, *self.span_s)
         world_from_lidar = self.frame_pose(time_s) @ mount
         columns = _interpolated_poses(self._ego_times, self._ego_poses, time_s + offsets) @ mount
         settings = (config.lidar_range_m, config.lidar_noise_m, config.lidar_dropout, 0.55)
-        objects, beams = (self._object_keys_at(knots), self._phases(time_s)), (scan.elevations_rad, azimuths)
         fractions, key = (offsets + period / 2) / period, seeds.key(config.seed, index, f"city lidar{scan.name}")
-        xyz, intensity, semantics, instance = self._handle.sweep(
-            *objects, *beams, columns[:, :3], fractions, settings, key
-        )
+        objects, beams = self._objects_at(*knots, phase_s=time_s), (scan.elevations_rad, azimuths)
+        found = self._handle.sweep(objects, beams, columns[:, :3], fractions, settings, key)
+        xyz, intensity, semantics, instance = found
         hit = intensity >= 0
         lidar_from_world = geometry.invert(world_from_lidar)
         world = xyz[hit].astype(np.float64)
@@ -478,6 +448,11 @@ class CityWorld:
             time_s -= scan.delay_s
             world_from_lidar = self.frame_pose(time_s) @ mount
         return CitySweep(time_s, world_from_lidar, points, semantics[hit], instance[hit])
+
+
+def _outside(times: Array, got_s: str) -> UsageError:
+    expected = f"{times[0]:.3f}..{times[-1]:.3f} s"
+    return UsageError("time lies outside the log", expected=expected, got=f"{got_s} s")
 
 
 def _interpolated_poses(times: Array, poses: Array, at: Array) -> Array:
@@ -494,7 +469,6 @@ def _interpolated_poses(times: Array, poses: Array, at: Array) -> Array:
             q = q0 + u[:, None] * (q1 - q0)
         else:
             q = (np.sin((1 - u) * angle)[:, None] * q0 + np.sin(u * angle)[:, None] * q1) / math.sin(angle)
-        q /= np.linalg.norm(q, axis=1, keepdims=True)
         w, x, y, z = q.T
         turns = [
             *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -505,10 +479,6 @@ def _interpolated_poses(times: Array, poses: Array, at: Array) -> Array:
         out[rows, :3, 3] = (1 - u)[:, None] * poses[i][:3, 3] + u[:, None] * poses[i + 1][:3, 3]
         out[rows, 3] = (0, 0, 0, 1)
     return out
-
-
-def _seed31(config: CityConfig, purpose: str) -> int:
-    return seeds.key(config.seed, 0, purpose) & 0x7FFFFFFF
 
 
 def _road_numbers(config: CityConfig, plan: StreetPlan) -> Array:
@@ -530,6 +500,6 @@ def _road_numbers(config: CityConfig, plan: StreetPlan) -> Array:
     edges = ("left", "right", "sidewalk_left", "sidewalk_right", "paved_left", "paved_right", "park_left", "park_right")
     grounds = [*asphalt, *sidewalk, *(sidewalk * rng.uniform(0.9, 1.2)), *terrain]
     wear = [rng.uniform(0.5, 1.6), rng.uniform(0.0, 1.0), rng.uniform(0.0, 1.0), float(rng.random() < 0.3)]
-    texture = float(_seed31(config, "city ground texture") % 1_000_000)
+    texture = float((seeds.key(config.seed, 0, "city ground texture") & 0x7FFFFFFF) % 1_000_000)
     numbers = [*(getattr(plan, edge) for edge in edges), *cross, plan.lane_width, texture, *grounds, *wear]
     return np.array([*numbers, *np.floor(bounds)], np.float64)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mudg.base import palette
 from mudg.base.errors import InputError
@@ -109,7 +109,7 @@ def judge_track(track: Track, rules: FusionRules) -> TrackVerdict:
 
 
 def points_in_box(
-    xyz_object: NDArray[np.floating], size_m: Matrix, growth_m: float, floor_margin_m: float
+    xyz_object: NDArray[np.floating], size_m: ArrayLike, growth_m: float, floor_margin_m: float
 ) -> NDArray[np.bool_]:
     """Which points ``[N, 3]`` (object frame, origin in the box centre) lie in the grown box above its floor margin;
     bool[N]."""

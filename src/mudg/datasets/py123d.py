@@ -90,16 +90,10 @@ def _modalities(folder: Path, views: Sequence[Row]) -> Iterator[Any]:
     names = cameras_of({view["channel"] for view in views})
     for view in views:
         (fx, _, cx), (_, fy, cy), _ = view["mount"]["camera_intrinsic"]
-        camera = sensors.PinholeCameraMetadata(
-            camera_name=view["channel"],
-            camera_id=sensors.CameraID[names[view["channel"]]],
-            width=view["width"],
-            height=view["height"],
-            intrinsics=sensors.PinholeIntrinsics(fx=fx, fy=fy, cx=cx, cy=cy),
-            distortion=None,
-            camera_to_imu_se3=_pose(view["mount"]),
-            is_undistorted=True,
-        )
+        about = {"camera_name": view["channel"], "camera_id": sensors.CameraID[names[view["channel"]]]}
+        about |= {"width": view["width"], "height": view["height"], "camera_to_imu_se3": _pose(view["mount"])}
+        lens = sensors.PinholeIntrinsics(fx=fx, fy=fy, cx=cx, cy=cy)
+        camera = sensors.PinholeCameraMetadata(**about, intrinsics=lens, distortion=None, is_undistorted=True)
         image = store.read_bytes(folder / view["filename"])
         yield ParsedCamera(camera, _time(view), _pose(view["camera"]), byte_string=image)
         if "sweep" in view:

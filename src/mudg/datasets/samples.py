@@ -62,18 +62,12 @@ class ObjectBox:
 
     def record(self) -> dict[str, Any]:
         """As JSON values."""
-        return {
-            "id": self.track_id,
-            "label": self.label,
-            "position_world_m": self.world_from_box[:3, 3].tolist(),
-            "yaw_world_rad": geometry.yaw_of(self.world_from_box),
-            "size_m": list(self.size_m),
-            "pixels": self.pixels,
-            "occlusion": None if np.isnan(self.occlusion) else round(self.occlusion, 4),
-            "truncation": round(self.truncation, 4),
-            "seen_from_deg": round(self.seen_from_deg, 2),
-            "returns": self.returns,
-        }
+        place, yaw = self.world_from_box[:3, 3].tolist(), geometry.yaw_of(self.world_from_box)
+        found = {"id": self.track_id, "label": self.label, "position_world_m": place, "yaw_world_rad": yaw}
+        occlusion = None if np.isnan(self.occlusion) else round(self.occlusion, 4)
+        seen = {"occlusion": occlusion, "truncation": round(self.truncation, 4)}
+        seen |= {"seen_from_deg": round(self.seen_from_deg, 2), "returns": self.returns}
+        return {**found, "size_m": list(self.size_m), "pixels": self.pixels, **seen}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,37 +183,37 @@ class Labeller:
         free = (drawn == 0) & np.isin(reply.layers["classes"], DYNAMIC_IDS)
         poses = self.session.objects(view.time_s)
         for index, name in enumerate(self.names):
-            track = self._tracks.get(name)
-            pose = poses.get(name) if name in moving else None if track is None else track.pose_at(view.time_s)
-            size = self._size(name)
-            outline = None if pose is None or size is None else outline_mask(view, pose, size)
-            if pose is None or size is None or outline is None:
+            pose, size = self._placed(name, poses if name in moving else None, view.time_s)
+            within = None if pose is None or size is None else outline_mask(view, pose, size)
+            if pose is None or size is None or within is None:
                 continue
             if name in moving:
-                instances[outline & (drawn == moving[name])] = index + 1
+                instances[within & (drawn == moving[name])] = index + 1
                 continue
             z = geometry.transform_points(view.cam_from_world @ pose, geometry.box_corners(size))[:, 2]
             with np.errstate(invalid="ignore"):
                 fits = ~(depth < z.min() - SLACK_M[0]) & ~(depth > z.max() + SLACK_M[1])
-            own = outline & free & fits & (z.mean() < nearest)
+            own = within & free & fits & (z.mean() < nearest)
             instances[own], nearest[own] = index + 1, z.mean()
         return instances
 
-    def _size(self, name: str) -> tuple[float, ...] | None:
-        sizes, track = self.session.sizes_m(), self._tracks.get(name)
-        return sizes.get(name) or (None if track is None else tuple(track.size_m.tolist()))
+    def _placed(
+        self, name: str, drawn: Mapping[str, NDArray[np.float64]] | None, time_s: float
+    ) -> tuple[NDArray[np.float64] | None, tuple[float, ...] | None]:
+        """Pose and size of an object, by what is ``drawn`` or, if it is not, by its track; None where unknown."""
+        track, size = self._tracks.get(name), self.session.sizes_m().get(name)
+        if drawn is not None:
+            return drawn.get(name), size
+        return (None, size) if track is None else (track.pose_at(time_s), size or tuple(track.size_m.tolist()))
 
     def _boxes(
         self, view: View, now: Instant, drawn: Mapping[str, NDArray[Any]], sweep: ViewSweep | None
     ) -> Iterator[ObjectBox]:
         poses, sizes, instances = self.session.poses(now), self.session.sizes_m(), drawn["instances"]
         for index, name in enumerate(self.names):
-            track, size = self._tracks.get(name), self._size(name)
-            pose = poses.get(name) if name in sizes else None if track is None else track.pose_at(view.time_s)
-            if pose is None or size is None:
-                continue
-            amodal = outline(view, pose, size)
-            if amodal is None:
+            pose, size = self._placed(name, poses if name in sizes else None, view.time_s)
+            amodal = None if pose is None or size is None else outline(view, pose, size)
+            if pose is None or size is None or amodal is None:
                 continue
             mask = instances == index + 1
             pixels = int(mask.sum())
@@ -231,20 +225,11 @@ class Labeller:
                 within = outline_mask(view, pose, size)
                 hidden &= within if within is not None else False
                 occlusion = float(hidden.sum() / (hidden.sum() + pixels)) if pixels else 1.0
-            yield ObjectBox(
-                track_id=name,
-                label=self.labels[name],
-                number=index + 1,
-                world_from_box=pose,
-                size_m=size,
-                amodal_px=amodal,
-                visible_px=around(mask) if pixels else None,
-                pixels=pixels,
-                occlusion=occlusion,
-                truncation=outside(amodal, view.camera),
-                seen_from_deg=self._seen_from_deg(name, track, pose, view),
-                returns=0 if sweep is None else sweep.inside(pose, size),
-            )
+            visible, truncation = around(mask) if pixels else None, outside(amodal, view.camera)
+            seen_from_deg = self._seen_from_deg(name, self._tracks.get(name), pose, view)
+            shown = (amodal, visible, pixels, occlusion, truncation, seen_from_deg)
+            returns = 0 if sweep is None else sweep.inside(pose, size)
+            yield ObjectBox(name, self.labels[name], index + 1, pose, size, *shown, returns)
 
     def _seen_from_deg(self, name: str, track: Track | None, pose: NDArray[np.float64], view: View) -> float:
         """Angle to the nearest direction, in the frame of the object, from which a camera recorded it."""

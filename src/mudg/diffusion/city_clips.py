@@ -30,7 +30,6 @@ from mudg.city.sensors import (
     CameraFaults,
     CameraLook,
     LidarFaults,
-    LidarMount,
     LidarScan,
     PoseFaults,
     SensorFaults,
@@ -38,7 +37,6 @@ from mudg.city.sensors import (
     ego_from_lidar,
     lidar_elevations,
     noisy_tracks,
-    pose_errors,
     recorded,
     thinned,
     with_look,
@@ -145,7 +143,8 @@ def draw_sensors(seed: int, city: int, config: CityConfig) -> SensorFaults:
     second = None
     if rng.random() < 0.2:
         place = (float(rng.uniform(0.5, 2.0)), float(rng.uniform(-0.9, 0.9)), float(rng.uniform(0.8, 2.0)))
-        second = LidarMount(place, int(rng.choice([16, 32])), -20.0, float(rng.choice([2.0, 15.0])))
+        beams = beam_elevations(int(rng.choice([16, 32])), -20.0, float(rng.choice([2.0, 15.0])))
+        second = LidarScan(geometry.from_rotation_translation(np.eye(3), place), beams, name=" second")
     lidar, upto = _lidar_faults(rng), lambda most: float(rng.uniform(0, most))
     has = [float(rng.random() < 0.6) for _ in range(2)]
     poses = PoseFaults(has[0] * upto(0.03), has[0] * upto(0.08), has[1] * upto(0.05), has[1] * upto(0.15))
@@ -231,7 +230,7 @@ def record_with_faults(config: CityConfig, sensors: SensorFaults, used: Sequence
     """Record and fuse a city with faulty sensors; ``used``: the frames that have a sweep. Everything follows from
     ``key``."""
     world = CityWorld(config)
-    errors = pose_errors(sensors.poses, config.n_frames, key)
+    errors = sensors.poses.errors(config.n_frames, key)
     photos: dict[str, list[Photo]] = {}
     for name in config.cameras:
         faults, look = sensors.cameras.get(name, CameraFaults()), sensors.looks.get(name, CameraLook())
@@ -244,10 +243,7 @@ def record_with_faults(config: CityConfig, sensors: SensorFaults, used: Sequence
     delay_s, mounting = sensors.lidar.delay_s, sensors.lidar.mounting_error()
     scans = [LidarScan(ego_from_lidar(), lidar_elevations(config), delay_s)]
     if sensors.second_lidar is not None:
-        second, pose = sensors.second_lidar, np.eye(4)
-        pose[:3, 3] = second.place
-        elevations = beam_elevations(second.beams, second.lower_deg, second.upper_deg)
-        scans.append(LidarScan(pose, elevations, delay_s, " second"))
+        scans.append(replace(sensors.second_lidar, delay_s=delay_s))
     sweeps = []
     for index in used:
         shots = [photos[name][index] for name in config.cameras]

@@ -34,6 +34,7 @@ from mudg.base.types import EgoPath, FusedCloud, Observation, PointCloud, Scene,
 from mudg.base.weather_settings import Conditions
 from mudg.core import trajectory
 from mudg.core.edit import HeightMap, Motion
+from mudg.core.fusion import points_in_box
 from mudg.core.weather import ShownView, drive_facts, edited_view
 from mudg.diffusion.condition import InWeather
 from mudg.editing import model as edited
@@ -47,6 +48,7 @@ from mudg.gaussians.nodes import RigidNode, SkyNode
 from mudg.gaussians.rendering import raster_of, render_view
 from mudg.gaussians.start import SH_C0
 from mudg.gaussians.storage import load_model
+from mudg.gaussians.views import resized_view
 from mudg.scene.read import decode_image, read_scene
 
 EGO_FACT: Final = "edited_ego"
@@ -71,12 +73,12 @@ def street_left(model: SceneModel, plan: EditPlan, *, close: bool = True) -> Sce
     if closed and close:
         hidden, views = {name: hidden_by(plan.before.actors[name], plan.views) for name in closed}, spread(plan.views)
         log.info(f"edit: the street behind {_some(closed)} is closed from {len(views)} recorded views (close_street)")
-        model = edited.noted(model, views, raster_of(model)).without_nodes([name for name in removed if name in closed])
-        model = edited.without_traces(model, hidden, views, raster_of(model))
+        model = edited.noted(model, views).without_nodes([name for name in removed if name in closed])
+        model = edited.without_traces(model, hidden, views)
     sides = tuple(name for name in sides if close and name in model.node_names())
     if sides:
         seen_from = views_of([plan.before.actors[name] for name in sides], plan.views)
-        model = edited.with_closed_sides(model, sides, seen_from, raster_of(model))
+        model = edited.with_closed_sides(model, sides, seen_from)
     return model
 
 
@@ -223,10 +225,9 @@ def _cut_points(static: PointCloud, track: Track) -> tuple[PointCloud, PointClou
     """The static cloud without what stands in a box, and that, in the frame of the box."""
     pose = track.world_from_object[len(track.times_s) // 2]
     local = geometry.transform_points(geometry.invert(pose), static.xyz.astype(np.float64))
-    half = track.size_m / 2 + edited.CUT_MARGIN_M
     low = local[:, 2] < -track.size_m[2] / 2 + edited.CUT_FLOOR_M
     ground = low if static.semantics is None else np.isin(static.semantics, GROUND_CLASSES)
-    inside = (np.abs(local) <= half).all(1) & ~ground
+    inside = points_in_box(local, track.size_m, edited.CUT_MARGIN_M, -edited.CUT_MARGIN_M) & ~ground
     own = some_points(replace(static, xyz=local.astype(np.float32), frame="object"), inside)
     return some_points(static, ~inside), own
 
@@ -256,13 +257,10 @@ def ground_of(cloud: FusedCloud | None, model: SceneModel | None) -> HeightMap |
 def edited_scene(scene: Scene, plan: EditPlan) -> Scene:
     """A scene with other boxes, another path of the vehicle and other poses of its frames; its files stay what they
     are."""
-    tracks = tuple(_track(name, actor) for name, actor in plan.after.actors.items())
-    given = {track.id: track for track in scene.tracks}
-    tracks = tuple(given[t.id] if t.id in given and t.id not in {*plan.changes, *plan.inserted} else t for t in tracks)
-    scene = replace(scene, tracks=tracks)
-    if not plan.moves_ego or plan.after.ego is None:
-        return scene
-    return with_ego(scene, plan.after.ego)
+    same = {track.id: track for track in scene.tracks if track.id not in {*plan.changes, *plan.inserted}}
+    actors = plan.after.actors.items()
+    scene = replace(scene, tracks=tuple(same[name] if name in same else _track(name, one) for name, one in actors))
+    return scene if not plan.moves_ego or plan.after.ego is None else with_ego(scene, plan.after.ego)
 
 
 def with_ego(scene: Scene, ego: Motion) -> Scene:
@@ -397,7 +395,7 @@ def complete_asset(model: SceneModel, name: str, views: Sequence[View]) -> Asset
     (``editing/model.py``)."""
     node = model.dynamic_object(name)
     actor = Actor(node.label, (node.size_m[0], node.size_m[1], node.size_m[2]), edited.motion_of(node))
-    closed = edited.with_closed_sides(model, [name], views_of([actor], views), raster_of(model))
+    closed = edited.with_closed_sides(model, [name], views_of([actor], views))
     return edited.asset_of(closed, name, plans.sides_seen(actor, views).tolist(), light_rgb=surface_light(model, views))
 
 
@@ -412,7 +410,7 @@ def write_asset(path: Path, asset: Asset) -> None:
         "label": asset.label,
         "size_m": list(asset.size_m),
         "origin": asset.origin,
-        "light_rgb": None if asset.light_rgb is None else list(asset.light_rgb),
+        "light_rgb": None if asset.light_rgb is None else asset.light_rgb.tolist(),
         "seen_deg": [round(float(np.degrees(a)), 2) for a in asset.seen_rad],
     }
     store.write_safetensors(path, arrays, {HEADER: store.json_text(header, indent=None)})
@@ -445,7 +443,7 @@ def read_asset(path: Path) -> Asset:
         None if known is None or known.shape != (count,) else known.astype(np.float32),
         header.label,
         (length, width, height),
-        None if header.light_rgb is None else (header.light_rgb[0], header.light_rgb[1], header.light_rgb[2]),
+        None if header.light_rgb is None else np.array(header.light_rgb, np.float64),
         tuple(float(a) for a in np.radians(header.seen_deg)),
         header.origin,
     )
@@ -462,8 +460,7 @@ def surface_light(model: SceneModel, views: Sequence[View]) -> NDArray[np.float6
     views, drawn small. None without views, or where they show nothing."""
     total, count = np.zeros(3), 0
     for view in spread(views, LIGHT_VIEWS):
-        width = min(LIGHT_WIDTH_PX, view.camera.width)
-        small = view.resized(width, max(1, round(view.camera.height * width / view.camera.width)))
+        small = resized_view(view, min(LIGHT_WIDTH_PX, view.camera.width))
         seen = render_view(model, small, raster_of(model))
         if seen.depth is not None:
             surface = seen.rgb[:, seen.depth[0] > 0].numpy().astype(np.float64)

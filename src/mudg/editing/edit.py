@@ -25,6 +25,7 @@ from mudg.base.run_folder import RunDir
 from mudg.base.types import Frame, FusedCloud, Observation, Photo, PointCloud, Scene, Sweep, SweepPoints, View
 from mudg.core import lidar
 from mudg.core.edit import Motion
+from mudg.core.fusion import points_in_box
 from mudg.core.pictures import to_bytes
 from mudg.core.raster.rasterize import RasterConfig, drawing_device
 from mudg.diffusion.condition import DriveInputs, Vacated, VacatedAt, ray_directions
@@ -105,8 +106,8 @@ def _within(xyz: NDArray[np.float64], sweep: Sweep, actor: Actor) -> Rows:
     pose = _pose(actor.motion, sweep)
     if pose is None:
         return np.zeros(len(xyz), bool)
-    local, half = geometry.transform_points(geometry.invert(pose), xyz), np.array(actor.size_m) / 2
-    return (np.abs(local) <= half + BOX_MARGIN_M).all(1) & (local[:, 2] > BOX_MARGIN_M - half[2])
+    local = geometry.transform_points(geometry.invert(pose), xyz)
+    return points_in_box(local, actor.size_m, BOX_MARGIN_M, BOX_MARGIN_M)
 
 
 def _beyond(
@@ -202,16 +203,14 @@ FARTHEST_GROUND_M: Final = 80.0
 
 def photos_of_edited(photos: Iterable[Photo], plan: EditPlan) -> list[Photo]:
     """Recorded photographs with the pixels marked that do not show the edited drive."""
-    return [replace(photo, usable=_usable(photo, plan)) for photo in photos]
-
-
-def _usable(photo: Photo, plan: EditPlan) -> NDArray[np.bool_] | None:
-    height, width = photo.rgb.shape[:2]
-    view = photo.view if photo.view.camera.width == width else photo.view.resized(width, height)
-    touched = [box for when in ("before", "after") for box in touched_boxes(plan, photo.view.time_s, when)]
-    covered = _hidden_by(view, touched, plan)
-    usable = ~covered if photo.usable is None else photo.usable & ~covered
-    return None if usable.all() else usable
+    made = []
+    for photo in photos:
+        height, width = photo.rgb.shape[:2]
+        view = photo.view if photo.view.camera.width == width else photo.view.resized(width, height)
+        touched = [box for when in ("before", "after") for box in touched_boxes(plan, photo.view.time_s, when)]
+        usable = ~_hidden_by(view, touched, plan) & (True if photo.usable is None else photo.usable)
+        made.append(replace(photo, usable=None if usable.all() else usable))
+    return made
 
 
 def _hidden_by(view: View, boxes: Boxes, plan: EditPlan) -> NDArray[np.bool_]:
@@ -249,23 +248,19 @@ def vacated_at(plan: EditPlan) -> VacatedAt:
         shown = boxes_mask(view, after)
         mask = _hidden_by(view, before, plan) & ~shown
         ground = np.full(mask.shape, np.nan, np.float32)
+        rays = np.stack([axis.numpy() for axis in ray_directions(view)], -1).astype(np.float64)
         for pose, size in before:
             box = [(pose, size)]
-            under, depth = boxes_mask(view, box) | ground_mask(view, box), _plane_depth(view, pose, size)
-            ground = np.where(under, np.fmin(ground, depth), ground)
+            # depth of the plane below the box, where the ray meets it within `FARTHEST_GROUND_M`
+            normal, foot = pose[:3, 2], pose[:3, 3] - pose[:3, 2] * size[2] / 2
+            falls = rays @ normal
+            depth = np.where(falls < -1e-4, (foot - view.center_world) @ normal / np.minimum(falls, -1e-4), np.nan)
+            met = (depth > 0) & (depth < FARTHEST_GROUND_M) & (boxes_mask(view, box) | ground_mask(view, box))
+            ground = np.where(met, np.fmin(ground, depth), ground).astype(np.float32)
         stood = mask & boxes_mask(view, before)
         return Vacated(*(torch.from_numpy(plane) for plane in (mask, ground, shown, stood)))
 
     return found
-
-
-def _plane_depth(view: View, pose: NDArray[np.float64], size: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Depth f32[H, W] of the plane below a box, NaN where the ray does not meet it within `FARTHEST_GROUND_M`."""
-    rays = np.stack([axis.numpy() for axis in ray_directions(view)], -1).astype(np.float64)
-    normal, foot = pose[:3, 2], pose[:3, 3] - pose[:3, 2] * size[2] / 2
-    falls = rays @ normal
-    depth = np.where(falls < -1e-4, (foot - view.center_world) @ normal / np.minimum(falls, -1e-4), np.nan)
-    return np.where((depth > 0) & (depth < FARTHEST_GROUND_M), depth, np.nan).astype(np.float32)
 
 
 def cleared_cloud(cloud: FusedCloud, plan: EditPlan) -> FusedCloud:
@@ -278,9 +273,7 @@ def cleared_cloud(cloud: FusedCloud, plan: EditPlan) -> FusedCloud:
         actor = plan.before.actors[name]
         for pose in actor.motion.poses if actor.moves else ():
             local = geometry.transform_points(geometry.invert(pose), static.xyz.astype(np.float64))
-            half = np.asarray(actor.size_m) / 2
-            inside = (np.abs(local[:, :2]) <= half[:2] + STRAY_M).all(1) & (local[:, 2] <= half[2] + STRAY_M)
-            stray |= inside & (local[:, 2] > FLOOR_M - half[2])
+            stray |= points_in_box(local, actor.size_m, STRAY_M, FLOOR_M)
     return replace(cloud, static=some_points(static, ~(stray & ~low_of)))
 
 
@@ -297,12 +290,12 @@ def boxes_mask(view: View, boxes: Boxes) -> NDArray[np.bool_]:
     return outlines(view, [(pose, size + BOX_GROWTH_M) for pose, size in boxes])
 
 
-def ground_mask(view: View, boxes: Boxes, reach: float = SHADOW_REACH) -> NDArray[np.bool_]:
-    """Bool[H, W]: ground below and about a box, as far as `reach` times its height, where its shadow may lie; what
-    stands there is not told apart."""
+def ground_mask(view: View, boxes: Boxes) -> NDArray[np.bool_]:
+    """Bool[H, W]: ground below and about a box, as far as `SHADOW_REACH` times its height, where its shadow may
+    lie; what stands there is not told apart."""
     slabs = []
     for pose, size in boxes:
-        about_m = 2 * reach * size[2]
+        about_m = 2 * SHADOW_REACH * size[2]
         flat = pose @ geometry.yaw_matrix(0.0, (0.0, 0.0, -size[2] / 2))
         slabs.append((flat, np.array([size[0] + about_m, size[1] + about_m, SLAB_M])))
     return outlines(view, slabs)

@@ -26,12 +26,14 @@ from mudg.core.edit import Motion
 from mudg.core.fusion import points_in_box
 from mudg.core.harmonics import left_product_matrix
 from mudg.core.lidar import met_box
-from mudg.core.raster.rasterize import RasterConfig, rasterize
+from mudg.core.raster.rasterize import rasterize
 from mudg.core.table import Table
 from mudg.core.weather.light import LUMINANCE
 from mudg.gaussians.model import CERTAINTY, COLUMNS, SceneModel, compose
 from mudg.gaussians.nodes import SYMMETRIC_LABELS, NodeRows, RigidNode, SkyNode
+from mudg.gaussians.rendering import raster_of
 from mudg.gaussians.start import SH_C0
+from mudg.gaussians.views import resized_view
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
@@ -207,25 +209,18 @@ def cut_out(model: SceneModel, track: Track) -> SceneModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Asset:
-    """One object of a fitted scene by itself.
-
-    Args:
-        columns: raw columns as in ``SceneModel``, in the frame of the box, without ``semantics``; colours of degree 0
-            alone.
-        class_ids: train id of every Gaussian, i64[n]; -1 = unknown.
-        certainty: f32[n] in [0, 1] or None.
-        label, size_m: of its box.
-        light_rgb: mean light of the surfaces of its scene, linear, or None.
-        seen_rad: from which sides it was recorded: angles from its front, counter-clockwise.
-        origin: where it comes from, for people.
-    """
+    """One object of a fitted scene by itself. ``columns``: raw ones as in ``SceneModel``, in the frame of the box,
+    without ``semantics``; colours of degree 0 alone. ``class_ids``: train id of every Gaussian, i64[n]; -1 = unknown.
+    ``certainty``: f32[n] in [0, 1] or None. ``label``, ``size_m``: of its box. ``light_rgb``: mean light f64[3] of the
+    surfaces of its scene, linear, or None. ``seen_rad``: from which sides it was recorded: angles from its front,
+    counter-clockwise. ``origin``: where it comes from, for people."""
 
     columns: Mapping[str, Tensor]
     class_ids: NDArray[np.int64]
     certainty: NDArray[np.float32] | None
     label: str
     size_m: tuple[float, float, float]
-    light_rgb: tuple[float, float, float] | None
+    light_rgb: Array | None
     seen_rad: tuple[float, ...]
     origin: str
 
@@ -233,9 +228,7 @@ class Asset:
         return len(self.class_ids)
 
 
-def asset_of(
-    model: SceneModel, name: str, seen_rad: Sequence[float] = (), origin: str = "", light_rgb: Array | None = None
-) -> Asset:
+def asset_of(model: SceneModel, name: str, seen_rad: Sequence[float] = (), light_rgb: Array | None = None) -> Asset:
     """An object of a fitted scene. What deforms is taken as it is in the middle of its track. UsageError: no such
     object."""
     node = model.dynamic_object(name)
@@ -260,9 +253,9 @@ def asset_of(
         None if known is None else known[rows].float().cpu().numpy(),
         node.label,
         (length, width, height),
-        None if light_rgb is None else (float(light_rgb[0]), float(light_rgb[1]), float(light_rgb[2])),
+        light_rgb,
         tuple(float(a) for a in seen_rad),
-        origin or f"{model.facts.get('scene', 'a scene')}: {name}",
+        f"{model.facts.get('scene', 'a scene')}: {name}",
     )
 
 
@@ -273,10 +266,8 @@ def with_asset(model: SceneModel, asset: Asset, name: str, motion: Motion, label
         raise UsageError(what, got=name, remedy=remedy)
     count = len(asset)
     # harmonics of the view's direction, and what other kinds of node know, are zero
-    columns, labels = (
-        zeros_like(model.table.columns, count) | dict(asset.columns),
-        zeros_like(model.table.labels, count),
-    )
+    columns, labels = (zeros_like(own, count) for own in (model.table.columns, model.table.labels))
+    columns |= asset.columns
     if "semantics" in columns:
         channels = torch.full((count, len(model.classes)), ABSENT_LOGIT)
         for channel, train_id in enumerate(model.classes):
@@ -291,7 +282,7 @@ def with_asset(model: SceneModel, asset: Asset, name: str, motion: Motion, label
 
 def matched_light(asset: Asset, there: Array | None) -> Asset:
     """The asset in the light of a scene, of whose surfaces ``there`` f64[3] is the mean light (``light_gain``)."""
-    gain = light_gain(None if asset.light_rgb is None else np.asarray(asset.light_rgb), there)
+    gain = light_gain(asset.light_rgb, there)
     shown = 0.5 + SH_C0 * asset.columns["sh_dc"].double().numpy()
     lit = np.where(shown > 0, display_of(linear_of(shown) * gain), shown)  # what is below black stays
     relit = torch.from_numpy((lit - 0.5) / SH_C0).to(asset.columns["sh_dc"])
@@ -414,53 +405,39 @@ class Hidden:
         return np.array(found).reshape(-1, 4, 4)
 
 
-def shown_by(
-    model: SceneModel, view: View, raster: RasterConfig, absent: Collection[str] = ()
-) -> tuple[Tensor, Tensor | None]:
-    """What a view shows when some objects are absent: blending weights summed over pixels, of every Gaussian f32[N] and
-    of every texel of the sky f32[Hs, 2 Hs] (None without one)."""
+def most_shown(model: SceneModel, views: Sequence[View], absent: Collection[str] = ()) -> tuple[Tensor, Tensor | None]:
+    """What the view that shows most of it shows of every Gaussian f32[N], and of every texel of the sky f32[Hs, 2 Hs]
+    (None without one), when some objects are absent: blending weights summed over pixels."""
     nodes = [index for index, node in enumerate(model.nodes) if isinstance(node, RigidNode) and node.name in absent]
     there = ~torch.isin(model.table.labels["node"], torch.tensor(nodes, dtype=torch.int32, device=model.device))
-    camera, width = view.camera, min(WEIGHED_PX, view.camera.width)
-    small = view.resized(width, max(1, round(camera.height * width / camera.width)))
-    with torch.no_grad():
-        gaussians = compose(model, view.time_s, semantics=False)
-    mark = torch.zeros(len(model.table), 1, device=model.device, requires_grad=True)
-    drawn = rasterize(replace(gaussians, opacity=gaussians.opacity * there, extra=mark), small, raster)
-    if drawn.extra is None:
-        raise ValueError("the renderer returned no features")
-    weights = torch.autograd.grad(drawn.extra.sum(), [mark])[0][:, 0]
-    if model.sky is None:
-        return weights, None
-    blank = SkyNode(Table({"panorama": torch.zeros_like(model.sky.table["panorama"].detach())}))
-    above = native_ops.over(torch.zeros_like(drawn.rgb).detach(), drawn.alpha.detach(), blank.coarse_picture(small))
-    return weights, torch.autograd.grad(above[0].sum(), [blank.table["panorama"]])[0][0, 0]
-
-
-def most_shown(
-    model: SceneModel, views: Sequence[View], raster: RasterConfig, absent: Collection[str] = ()
-) -> tuple[Tensor, Tensor | None]:
-    """`shown_by`, of every Gaussian and texel by the view that shows most of it."""
     most = torch.zeros(len(model.table), device=model.device)
     above = None if model.sky is None else torch.zeros(model.sky.rows, 2 * model.sky.rows, device=model.device)
     for view in views:
-        weights, texels = shown_by(model, view, raster, absent)
-        most = torch.maximum(most, weights)
-        above = above if above is None or texels is None else torch.maximum(above, texels)
+        small = resized_view(view, min(WEIGHED_PX, view.camera.width))
+        with torch.no_grad():
+            gaussians = compose(model, view.time_s, semantics=False)
+        mark = torch.zeros(len(model.table), 1, device=model.device, requires_grad=True)
+        drawn = rasterize(replace(gaussians, opacity=gaussians.opacity * there, extra=mark), small, raster_of(model))
+        if drawn.extra is None:
+            raise ValueError("the renderer returned no features")
+        most = torch.maximum(most, torch.autograd.grad(drawn.extra.sum(), [mark])[0][:, 0])
+        if model.sky is not None and above is not None:
+            blank = SkyNode(Table({"panorama": torch.zeros_like(model.sky.table["panorama"].detach())}))
+            black = torch.zeros_like(drawn.rgb).detach()
+            over = native_ops.over(black, drawn.alpha.detach(), blank.coarse_picture(small))
+            above = torch.maximum(above, torch.autograd.grad(over[0].sum(), [blank.table["panorama"]])[0][0, 0])
     return most, above
 
 
-def noted(model: SceneModel, views: Sequence[View], raster: RasterConfig) -> SceneModel:
+def noted(model: SceneModel, views: Sequence[View]) -> SceneModel:
     """The scene with a note of what views show of each Gaussian, and of each texel of the sky (`SHOWN`)."""
-    (most, above), sky = most_shown(model, views, raster), model.sky
+    (most, above), sky = most_shown(model, views), model.sky
     if sky is not None and above is not None:
         sky = SkyNode(Table({"panorama": sky.table["panorama"]}, {SHOWN: above[None]}))
     return changed(model, labels={SHOWN: most}, sky=sky)
 
 
-def without_traces(
-    model: SceneModel, hidden: Mapping[str, Hidden], views: Sequence[View], raster: RasterConfig
-) -> SceneModel:
+def without_traces(model: SceneModel, hidden: Mapping[str, Hidden], views: Sequence[View]) -> SceneModel:
     """A copy in which the street shows no traces of objects that are gone from their places, without the note.
 
     A background that changes with time, and a scene that knows no ground, stay as they are. ``model``: `noted` when all
@@ -470,7 +447,7 @@ def without_traces(
     if model.nodes[0].kind == "static" and gone and ground_rows(model).sum() >= LEAST_GROUND:
         lost = [np.zeros((0, 3))]  # places of the ground that only shows because objects are absent
         for _ in range(ROUNDS):
-            shows, shown = most_shown(model, views, raster, absent)[0], model.table.labels[SHOWN]
+            shows, shown = most_shown(model, views, absent)[0], model.table.labels[SHOWN]
             unseen = ((model.table.labels["node"] == 0) & (shown < SEEN_SHARE * shows)).cpu().numpy()
             if not unseen.any():
                 break
@@ -483,7 +460,7 @@ def without_traces(
         for one in gone:
             model = _closed(model, one, np.concatenate(lost))
         model.sort_rows()
-        shows = most_shown(model, views, raster, absent)[1]
+        shows = most_shown(model, views, absent)[1]
         if sky is not None and shows is not None:  # its new directions take the colour of the nearest that was seen
             shown = sky.table.labels[SHOWN][0]
             unknown, seen = shown < SEEN_SHARE * shows, shown > SKY_SHARE * shown.max()
@@ -496,7 +473,7 @@ def without_traces(
 def _left_over(one: Hidden, model: SceneModel) -> Rows:
     """Rows of the background within the space that a moving box swept, above the ground, and of road users around the
     box."""
-    means, half, poses = means_of(model), np.array(one.size_m) / 2, one.poses
+    means, poses = means_of(model), one.poses
     users = np.isin(classes_of_rows(model), DYNAMIC_IDS)
     reach, at = float(np.linalg.norm(one.size_m)) / 2 + STRAY_M, poses[:, :2, 3]
     near = ((means[:, :2] >= at.min(0) - reach) & (means[:, :2] <= at.max(0) + reach)).all(1)
@@ -505,8 +482,8 @@ def _left_over(one: Hidden, model: SceneModel) -> Rows:
     for pose in poses:
         local = geometry.transform_points(geometry.invert(pose), means[rows])
         if one.moves:
-            inside |= (np.abs(local) <= half).all(1) & (local[:, 2] > FLOOR_M - half[2])
-        inside |= (np.abs(local) <= half + STRAY_M).all(1) & users[rows]
+            inside |= points_in_box(local, one.size_m, 0.0, FLOOR_M)
+        inside |= points_in_box(local, one.size_m, STRAY_M, -STRAY_M) & users[rows]
     found = np.zeros(len(means), bool)
     found[rows[inside]] = True
     return found
@@ -616,15 +593,9 @@ AROUND: Final = 40
 
 
 def continued(xy: Array, places: Array, colors: Array, weights: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Colours of ground continued smoothly to other places.
-
-    Args:
-        xy: f64[C, 2] where colours are asked for. places: f64[M, 2]; colors: f64[M, 3] of the ground that is known;
-            weights: how much of it is seen, f64[M].
-
-    Returns:
-        Colours f64[C, 3], and the nearest known place i64[C].
-    """
+    """Colours f64[C, 3] of ground continued smoothly to other places ``xy`` f64[C, 2], and the nearest known place
+    i64[C] of each. ``places`` f64[M, 2], ``colors`` f64[M, 3]: of the ground that is known. ``weights``: how much of it
+    is seen, f64[M]."""
     _, owner = np.unique(np.floor(places / SOURCE_M).astype(np.int64), axis=0, return_inverse=True)
     owner = owner.ravel()
     total = np.bincount(owner, weights)
@@ -641,45 +612,6 @@ def continued(xy: Array, places: Array, colors: Array, weights: Array) -> tuple[
     weight = 1 / (apart**2 + SOURCE_M**2) ** 1.5
     found = (weight[..., None] * middles[near]).sum(1) / weight.sum(1)[:, None]
     return found, np.asarray(KDTree(places).query(xy)[1], np.int64)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Cells:
-    """A grid of square cells of `SHADOW_CELL_M` on the ground: the place f64[2] of its first corner, and how many cells
-    it has."""
-
-    low: Array
-    shape: tuple[int, int]
-
-    def index(self, xy: Array) -> NDArray[np.int64]:
-        """Cells i64[N, 2] in which places f64[N, 2] lie, or would lie beyond the grid."""
-        return np.floor((xy - self.low) / SHADOW_CELL_M).astype(np.int64)
-
-    def below(self, size_m: Sequence[float], poses: Array) -> Rows:
-        """Cells bool[X, Y] below boxes."""
-        cells = np.stack(np.meshgrid(*map(np.arange, self.shape), indexing="ij"), -1).reshape(-1, 2)
-        centres, half = self.low + (cells + 0.5) * SHADOW_CELL_M, np.array(size_m[:2]) / 2
-        found = np.zeros(len(centres), bool)
-        for pose in poses:
-            yaw = geometry.yaw_of(pose)
-            turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-            found |= (np.abs((centres - pose[:2, 3]) @ turn) <= half).all(1)
-        return found.reshape(self.shape)
-
-    def at(self, xy: Array, cells: Rows) -> Rows:
-        """Which places f64[N, 2] lie in chosen cells."""
-        index = self.index(xy)
-        inside = ((index >= 0) & (index < self.shape)).all(1)
-        found = np.zeros(len(xy), bool)
-        found[inside] = cells[tuple(index[inside].T)]
-        return found
-
-    def light(self, xy: Array, luminance: Array, weights: Array) -> Array:
-        """Weighted mean luminance f64[X, Y] of the places near each cell; NaN where there are none."""
-        flat, count = np.ravel_multi_index(tuple(self.index(xy).T), self.shape), int(np.prod(self.shape))
-        sums = [np.bincount(flat, values, count).reshape(self.shape) for values in (weights, weights * luminance)]
-        total, shown = (ndimage.gaussian_filter(values, 0.7, truncate=2.0) for values in sums)
-        return np.where(total > LEAST_PX, shown / np.maximum(total, 1e-12), np.nan)
 
 
 def shaded_cells(light: Array, below: Rows, reach_m: float) -> Rows:
@@ -718,28 +650,44 @@ def _brightened(model: SceneModel, one: Hidden) -> SceneModel:
     reach = REACH * size_m[2]
     around = reach + AROUND_M + float(np.linalg.norm(size_m[:2])) / 2
     low = np.floor((poses[:, :2, 3].min(0) - around) / SHADOW_CELL_M) * SHADOW_CELL_M
-    count = np.ceil((poses[:, :2, 3].max(0) + around - low) / SHADOW_CELL_M).astype(int)
-    cells = _Cells(low, (int(count[0]), int(count[1])))
-    below, here = cells.below(size_m, poses), cells.at(means, np.ones(cells.shape, bool))
+    shape = tuple(np.ceil((poses[:, :2, 3].max(0) + around - low) / SHADOW_CELL_M).astype(int))
+    below = _below(size_m, poses, low, shape)
+    index = np.floor((means - low) / SHADOW_CELL_M).astype(np.int64)
+    here = still_rows(model) & ((index >= 0) & (index < shape)).all(1)
+    cell = np.ravel_multi_index(tuple(index.T), shape, mode="clip")
     colors = model.table["sh_dc"].detach().clone()
     for number in GROUND_CLASSES:
-        rows = still_rows(model) & (ids == number)
-        near = rows & here & (weights > 0)
+        rows = here & (ids == number)
+        near = rows & (weights > 0)
         if near.sum() < LEAST_ROWS:
             continue
-        light = cells.light(means[near], luminance[near], weights[near])
+        sums = [np.bincount(cell[near], values[near], below.size) for values in (weights, weights * luminance)]
+        total, seen = (ndimage.gaussian_filter(values.reshape(shape), 0.7, truncate=2.0) for values in sums)
+        light = np.where(total > LEAST_PX, seen / np.maximum(total, 1e-12), np.nan)
         wide = np.asarray(ndimage.binary_dilation(shaded_cells(light, below, reach), iterations=EDGE_CELLS), np.bool_)
-        shaded, lit = np.flatnonzero(rows & cells.at(means, wide)), near & ~cells.at(means, wide | below)
+        shaded, lit = np.flatnonzero(rows & wide.ravel()[cell]), near & ~(wide | below).ravel()[cell]
         if not len(shaded) or lit.sum() < LEAST_ROWS:
             continue
         target = linear_of(continued(means[shaded], means[lit], shown[lit], weights[lit])[0])
-        usual = light[tuple(cells.index(means[shaded]).T)]
+        usual = light.ravel()[cell[shaded]]
         usual = np.where(np.isfinite(usual), usual, luminance[shaded])  # what no view shows has no texture
         texture = (luminance[shaded] / np.maximum(usual, 1e-4)).clip(1 / TEXTURE, TEXTURE)
         darker = luminance[shaded] < target @ LUMINANCE / TEXTURE
         values = ((display_of(target * texture[:, None]) - 0.5) / SH_C0)[darker]
         colors[torch.from_numpy(shaded[darker]).to(model.device), 0] = torch.from_numpy(values).to(colors)
     return changed(model, {"sh_dc": colors})
+
+
+def _below(size_m: Sequence[float], poses: Array, low: Array, shape: tuple[int, ...]) -> Rows:
+    """Cells bool[X, Y] of `SHADOW_CELL_M` below boxes; ``low``: the place f64[2] of their first corner."""
+    cells = np.stack(np.indices(shape), -1).reshape(-1, 2)
+    centres, half = low + (cells + 0.5) * SHADOW_CELL_M, np.array(size_m[:2]) / 2
+    found = np.zeros(len(centres), bool)
+    for pose in poses:
+        yaw = geometry.yaw_of(pose)
+        turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+        found |= (np.abs((centres - pose[:2, 3]) @ turn) <= half).all(1)
+    return found.reshape(shape)
 
 
 # -- sides -----------------------------------------------------------------------------------------
@@ -774,9 +722,7 @@ SHOWN_PX: Final = 0.01
 """What a recorded view shows more of than this is not hidden."""
 
 
-def with_closed_sides(
-    model: SceneModel, names: Collection[str], views: Sequence[View], raster: RasterConfig
-) -> SceneModel:
+def with_closed_sides(model: SceneModel, names: Collection[str], views: Sequence[View]) -> SceneModel:
     """A copy in which some vehicles have flanks where the recording showed none; other objects stay as they are.
     ``model``: with the objects on their recorded paths. ``names``: of objects. ``views``: recorded ones, from which
     nothing new is to be seen."""
@@ -790,7 +736,7 @@ def with_closed_sides(
     order, ordered = torch.argsort(model.table.labels["node"], stable=True), changed(model)
     ordered.sort_rows()  # as the renderer wants them
     shown = torch.zeros(len(order), device=model.device)
-    shown[order] = most_shown(ordered, views, raster)[0]
+    shown[order] = most_shown(ordered, views)[0]
     seen = (torch.arange(len(order), device=model.device) >= first) & (shown > SHOWN_PX)
     model = without_rows(model, seen.cpu().numpy())
     model.sort_rows()
@@ -802,7 +748,7 @@ def _with_flanks(model: SceneModel, node: RigidNode) -> SceneModel:
     half = np.array(node.size_m) / 2
     own = (model.table.labels["node"] == model.nodes.index(node)).cpu().numpy() & solid_rows(model)
     own &= ~np.isin(classes_of_rows(model), GROUND_CLASSES)
-    own &= (np.abs(means_of(model)) <= half + SIDE_AROUND_M).all(1)
+    own &= points_in_box(means_of(model), node.size_m, SIDE_AROUND_M, -SIDE_AROUND_M)
     if own.sum() < SIDE_LEAST_ROWS:
         return model
     rows, places = np.flatnonzero(own), means_of(model)[own]

@@ -87,20 +87,14 @@ class Insertion:
 
 @dataclass(slots=True, eq=False)
 class EditPlan:
-    """What a script does.
-
-    Args:
-        before, after: the world, its actors and the vehicle, without and with the edits.
-        open_asset: reads the object that a script names.
-        close_street: whether the street is closed behind what leaves its place, where a script does not say.
-        changes: what is done to the path of an actor of the recording, in order.
-        removed: actors of the recording that are not there any more. inserted: new ones, by id.
-        sky: settings of the last `sky`, or None. erased: records of ``erase``: parts of the street that are taken away.
-        notes: what the reader should know, with numbers.
-        views: recorded ones, which say what nobody saw of the street; none where there is no scene.
-        closed: actors without whose traces the street is to be shown, if they were recorded (``editing/model.py``).
-        sides: actors whose sides that no view showed are closed (``shown_sides``).
-    """
+    """What a script does. ``before``, ``after``: the world without and with the edits. ``open_asset``: reads the object
+    that a script names. ``close_street``: whether the street is closed behind what leaves its place, where a script
+    does not say. ``changes``: what is done to the path of an actor of the recording, in order. ``removed``: actors of
+    the recording that are gone. ``inserted``: new ones, by id. ``sky``: settings of the last `sky`. ``erased``: what
+    parts of the street are taken away. ``notes``: what the reader should know, with numbers. ``views``: recorded ones,
+    which say what nobody saw of the street; none where there is no scene. ``closed``: actors without whose traces the
+    street is to be shown, if they were recorded (``editing/model.py``). ``sides``: actors whose sides that no view
+    showed are closed (``shown_sides``)."""
 
     before: EditWorld
     after: EditWorld
@@ -140,16 +134,12 @@ def plan_edits(script: EditScript, world: EditWorld, open_asset: OpenAsset, clos
         except (InputError, UsageError) as told:
             where = f"{edit.where}: {edit.verb}" + (f".{told.where}" if told.where else "")
             raise InputError(told.what, **{**told.fields, "where": where}) from told
-    plan.closed = {name for name in plan.closed if _left_its_place(plan, name)}
+    for name in plan.closed & world.actors.keys() & plan.after.actors.keys() - plan.inserted.keys():
+        old, new = (of.actors[name].motion.poses for of in (world, plan.after))
+        if old.shape == new.shape and np.allclose(old, new, atol=SAME_PLACE_M):
+            plan.closed.remove(name)  # it is where it was
+    plan.closed &= world.actors.keys()
     return plan
-
-
-def _left_its_place(plan: EditPlan, name: str) -> bool:
-    before, after = (world.actors.get(name) for world in (plan.before, plan.after))
-    if before is None or after is None or name in plan.inserted:
-        return before is not None
-    old, new = before.motion.poses, after.motion.poses
-    return old.shape != new.shape or not np.allclose(old, new, atol=SAME_PLACE_M)
 
 
 # -- verbs -----------------------------------------------------------------------------------------
@@ -234,16 +224,16 @@ def _lane_change(plan: EditPlan, fields: Any) -> None:
 
 def _path(plan: EditPlan, fields: Any) -> None:
     ground = plan.after.ground if fields.ground else None
-    _change(plan, fields.id, functools.partial(_other_path, points=_points(fields.points), ground=ground))
 
+    def through(motion: Motion) -> Motion:
+        """At the height above the ground that the object had at first."""
+        first = motion.poses[0, :3, 3]
+        under = float("nan") if ground is None else float(ground.height(first[None, :2])[0])
+        floor = first[2] if np.isnan(under) else under
+        made = paths.along_points(_points(fields.points), float(first[2] - floor), ground, float(floor))
+        return replace(made, source_s=np.clip(made.times_s, motion.times_s[0], motion.times_s[-1]))
 
-def _other_path(motion: Motion, points: np.ndarray, ground: HeightMap | None) -> Motion:
-    """A path through points, at the height above the ground that the object had at first."""
-    first = motion.poses[0, :3, 3]
-    under = float("nan") if ground is None else float(ground.height(first[None, :2])[0])
-    floor = first[2] if np.isnan(under) else under
-    made = paths.along_points(points, float(first[2] - floor), ground, float(floor))
-    return replace(made, source_s=np.clip(made.times_s, motion.times_s[0], motion.times_s[-1]))
+    _change(plan, fields.id, through)
 
 
 def _points(points: list[list[float]]) -> np.ndarray:

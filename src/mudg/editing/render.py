@@ -130,8 +130,8 @@ def write_views(
         videos = list[Future[None]]()
         for path in paths:
             _render_trajectory(draw, threads, path, out / path.name, source, bar)
-            if config.video:
-                videos.append(encoder.submit(_write_video, out / path.name, out / f"{path.name}.mp4"))
+            if config.video and not (out / f"{path.name}.mp4").is_file():
+                videos.append(encoder.submit(_write_video, out / path.name))
         for video in videos:
             video.result()
     return {"trajectories": [path.name for path in paths], "views": sum(len(path) for path in paths)}
@@ -204,11 +204,11 @@ def _render_trajectory(
                 bar.advance()
 
 
-def _write_video(observations: Path, path: Path) -> None:
-    if path.is_file():
-        return
-    views = read_observations(observations)
-    write_mp4(path, (side_by_side(panels_of(views[index])) for index in range(len(views))), VIDEO_FPS)
+def _write_video(folder: Path) -> None:
+    """Of a folder of observations, beside it."""
+    views = read_observations(folder)
+    pictures = (side_by_side(panels_of(views[index])) for index in range(len(views)))
+    write_mp4(folder.with_name(f"{folder.name}.mp4"), pictures, VIDEO_FPS)
 
 
 # -- repairs ---
@@ -223,19 +223,13 @@ def check_as_recorded(fitted: SceneModel, where: str) -> None:
 
 
 class RenderMixer:
-    """Views of a fit, each mixed with what the diffusion model makes of it.
+    """Views of a fit, each mixed with what the diffusion model makes of it. UsageError: a published-type model, which
+    makes clips of many frames from noise, or one that uses no renders.
 
     The model makes the view once more, from the fused points, the photographs and the render, and says how sure it is.
     What it makes of a view does not depend on other views: in windows of a path they come out the same to 58 dB.
     Near the recorded path the render counts for more, since photographs of the same places made it; away from there
-    the generated view does (`SHARE_PER_M`).
-
-    Args:
-        inputs: folders of the scene, its clouds and the fit.
-
-    Raises:
-        UsageError: a published-type model, which makes clips of many frames from noise, or one that uses no renders.
-    """
+    the generated view does (`SHARE_PER_M`)."""
 
     def __init__(self, inputs: JobInputs, model: str = "embedded", device: str = "auto") -> None:
         if is_published(model):

@@ -110,13 +110,13 @@ def views_at(path: Path, name: str = "") -> Path:
     return next((folder for folder in folders if is_run and folder.is_dir()), path)
 
 
-_PLAIN: Final = {"fitted": plain_fit_at, "start_from": plain_fit_at}
-PARTS: Final = {"scene": scene_at, "fused": fused_at, "model": fit_at, **_PLAIN}
-"""Inputs of commands, and how each is found at a path."""
-_WORDS: Final = {
-    "fused": "point clouds made by `mudg fuse`",
-    **dict.fromkeys(("model", "fitted"), "a folder made by `mudg fit`"),
+PARTS: Final = {
+    "scene": scene_at,
+    "fused": fused_at,
+    "model": fit_at,
+    **dict.fromkeys(("fitted", "start_from"), plain_fit_at),
 }
+"""Inputs of commands, and how each is found at a path."""
 
 
 def parts_of(given: Mapping[str, Any], required: Sequence[str] = ()) -> dict[str, Any]:
@@ -129,7 +129,8 @@ def parts_of(given: Mapping[str, Any], required: Sequence[str] = ()) -> dict[str
     for name, path in given.items():
         if path is None and name in required:
             if not is_run:
-                expected = f"{_WORDS[name]}, or the folder of a run in the place of SCENE"
+                made = "point clouds made by `mudg fuse`" if name == "fused" else "a folder made by `mudg fit`"
+                expected = f"{made}, or the folder of a run in the place of SCENE"
                 raise UsageError(f"no --{name} was given", expected=expected)
             path = scene
         if path is not None and name in PARTS:

@@ -36,14 +36,14 @@ def _named(value: str) -> str:
 Name = Annotated[str, after(_named)]
 
 
-def _not_ego(value: str) -> str:
-    if value == EGO:
+def _of_actor(value: str) -> str:
+    if _named(value) == EGO:
         what, remedy = "the recording vehicle cannot be edited so", "ego takes lane_change, speed, stop, move and path"
         raise InputError(what, expected="the id of a track", got=EGO, remedy=remedy)
     return value
 
 
-ActorName = Annotated[str, after(_named), after(_not_ego)]
+ActorName = Annotated[str, after(_of_actor)]
 
 
 class AssetSource(StrictRecord):
@@ -242,13 +242,6 @@ CONDITIONS: Final = ("weather", "light")
 """Verbs that change no geometry."""
 
 
-def files_of(edit: Any) -> list[str]:
-    """Paths that an edit names, as written."""
-    source = getattr(edit, "asset", None) or getattr(edit, "by", None)
-    named = [source.run or source.file] if source is not None else []
-    return named + [value for name in ("run", "image") if isinstance(value := getattr(edit, name, None), str)]
-
-
 @dataclass(frozen=True, slots=True)
 class ScriptEdit:
     """One entry of a script: its verb, its settings (the record of `VERBS`), and where it stands."""
@@ -256,6 +249,36 @@ class ScriptEdit:
     verb: str
     settings: Any
     where: str
+
+    @classmethod
+    def parsed(cls, index: int, value: Any, lines: Lines, where: str) -> Self:
+        """An entry of the list as YAML gives it."""
+        at = f"{where}, line {lines[(index,)]}"
+        if not isinstance(value, dict) or len(value) != 1:
+            expected = "e.g. `- remove: {ids: [car-003]}`"
+            raise InputError("an edit is one verb with its settings", where=at, expected=expected, got=short(value, 80))
+        ((verb, settings),) = value.items()
+        if verb not in VERBS:
+            near = nearest(verb, VERBS)
+            remedy, expected = f"did you mean {near!r}?" if near else "see docs/edit.md", f"one of {', '.join(VERBS)}"
+            raise InputError(f"there is no verb {verb!r}", where=at, expected=expected, remedy=remedy)
+        try:
+            return cls(verb, VERBS[verb].model_validate({} if settings is None else settings), at)
+        except ValidationError as error:
+            told = first_problem(error, place(verb))
+            steps = [int(step) if step.isdigit() else step for step in re.findall(r"[^.\[\]]+", told.where)]
+            path = (index, *steps)
+            while path not in lines:  # what is missing has no line: that of what should hold it
+                path = path[:-1]
+            inside = {inner: line for inner, line in lines.items() if inner[:-1] == path}
+            unknown = (line for inner, line in inside.items() if f"unknown field {inner[-1]!r}" in told.what)
+            raise told.located(f"{where}, line {next(unknown, lines[path])}: {told.where}") from error
+
+    def files(self) -> list[str]:
+        """Paths that it names, as written."""
+        source = getattr(self.settings, "asset", None) or getattr(self.settings, "by", None)
+        image = getattr(self.settings, "image", None)
+        return [name for name in (source and (source.run or source.file), image) if name is not None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,7 +295,7 @@ class EditScript:
 
     def files(self) -> dict[str, Path]:
         """Every file or folder that the script reads, by the name it has there."""
-        return {name: self.path_of(name) for edit in self.edits for name in files_of(edit.settings)}
+        return {name: self.path_of(name) for edit in self.edits for name in edit.files()}
 
     def canonical(self) -> list[dict[str, Any]]:
         """The script as JSON values with all defaults: two scripts that say the same are equal here."""
@@ -283,7 +306,7 @@ class EditScript:
         file or folder that it names does not exist. IntegrityError: one was altered."""
         contents = {}
         for edit in self.edits:
-            for name in files_of(edit.settings):
+            for name in edit.files():
                 try:
                     contents[name] = store.digest(self.path_of(name))
                 except InputError as problem:
@@ -330,31 +353,5 @@ def parse_edits(text: str | bytes, where: str, folder: Path = Path()) -> EditScr
         got = "nothing" if entries in (None, []) else type(entries).__name__
         expected = "lines such as `- remove: {ids: [car-003]}`"
         raise InputError("an edit script is a list of edits", where=where, expected=expected, got=got)
-    return EditScript(tuple(_one(index, value, lines, where) for index, value in enumerate(entries)), Path(folder))
-
-
-def _one(index: int, value: Any, lines: Lines, where: str) -> ScriptEdit:
-    at = f"{where}, line {lines[(index,)]}"
-    if not isinstance(value, dict) or len(value) != 1:
-        expected = "e.g. `- remove: {ids: [car-003]}`"
-        raise InputError("an edit is one verb with its settings", where=at, expected=expected, got=short(value, 80))
-    ((verb, settings),) = value.items()
-    if verb not in VERBS:
-        near = nearest(verb, VERBS)
-        remedy = f"did you mean {near!r}?" if near else "see docs/edit.md"
-        raise InputError(f"there is no verb {verb!r}", where=at, expected=f"one of {', '.join(VERBS)}", remedy=remedy)
-    try:
-        return ScriptEdit(verb, VERBS[verb].model_validate({} if settings is None else settings), at)
-    except ValidationError as error:
-        told = first_problem(error, place(verb))
-        steps = [int(step) if step.isdigit() else step for step in re.findall(r"[^.\[\]]+", told.where)]
-        line = _line_at((index, *steps), lines, told.what)
-        raise told.located(f"{where}, line {line}: {told.where}") from error
-
-
-def _line_at(path: tuple[str | int, ...], lines: Lines, said: str) -> int:
-    """The line of a field, of an unknown one that a message names, or of what should hold it."""
-    while path not in lines:
-        path = path[:-1]
-    unknown = (line for inner, line in lines.items() if inner[:-1] == path and f"unknown field {inner[-1]!r}" in said)
-    return next(unknown, lines[path])
+    edits = tuple(ScriptEdit.parsed(index, value, lines, where) for index, value in enumerate(entries))
+    return EditScript(edits, Path(folder))

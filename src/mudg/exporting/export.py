@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -62,8 +63,7 @@ def splat_scene(model: SceneModel, time_s: float, names: Sequence[str] = ()) -> 
     """A fitted scene in world axes. ``time_s``: at which a background that changes with time, which no file holds, is
     taken. ``names``: of nodes to keep (none: all). UsageError: a node that the scene does not have."""
     there = [node.name for node in model.nodes]
-    unknown = [name for name in names if name not in there]
-    if unknown:
+    if unknown := [name for name in names if name not in there]:
         raise UsageError(f"the fitted scene has no node {unknown[0]!r}", where="--nodes", expected=", ".join(there))
     classes, nodes = classes_of_rows(model), list[SplatNode]()
     for index, node in enumerate(model.nodes):
@@ -77,7 +77,7 @@ def splat_scene(model: SceneModel, time_s: float, names: Sequence[str] = ()) -> 
         parts = NodeRows(own["means"], own["quats"], torch.sigmoid(own["logits"]), own["sh_dc"], further)
         bands = torch.cat([own[name] for name in ("sh_dc", "sh_rest") if name in own], 1)
         sh = bands[:, : (model.sh_degree + 1) ** 2].cpu().numpy()
-        nodes.append(_node(node, parts, own["log_scales"], sh, known, time_s))
+        nodes.append(_node(node, parts, partial(_cloud, own["log_scales"], sh, known), time_s))
     facts = {key: model.facts[key] for key in ("method", "scene", "drawing") if key in model.facts}
     name, sky = str(model.facts.get("scene", "scene")), None
     if model.sky is not None:
@@ -87,19 +87,12 @@ def splat_scene(model: SceneModel, time_s: float, names: Sequence[str] = ()) -> 
 
 
 def _node(
-    node: StaticNode | RigidNode,
-    rows: NodeRows,
-    log_scales: Tensor,
-    sh: NDArray[np.float32],
-    classes: NDArray[np.uint8] | None,
-    time_s: float,
+    node: StaticNode | RigidNode, rows: NodeRows, cloud_of: Callable[[NodeRows], SplatCloud], time_s: float
 ) -> SplatNode:
     if not isinstance(node, RigidNode):
         now = rows if type(node) is StaticNode else node.at_time(rows, time_s)
-        now = replace(rows, opacity=rows.opacity * 0) if now is None else now
-        return SplatNode(node.name, _cloud(now, log_scales, sh, classes))
-    cloud, displacement = _cloud(rows, log_scales, sh, classes), None
-    keys = node.corrected_keys()
+        return SplatNode(node.name, cloud_of(replace(rows, opacity=rows.opacity * 0) if now is None else now))
+    cloud, displacement, keys = cloud_of(rows), None, node.corrected_keys()
     if type(node) is DeformableNode:
         displacement = np.stack([node.displacement(rows.means, float(t)).cpu().numpy() for t in node.times_s])
     elif type(node) is not RigidNode:  # what only the program itself can move: places at the keys, straight between
@@ -109,7 +102,7 @@ def _node(
 
 
 def _cloud(
-    rows: NodeRows, log_scales: Tensor, sh: NDArray[np.float32], classes: NDArray[np.uint8] | None
+    log_scales: Tensor, sh: NDArray[np.float32], classes: NDArray[np.uint8] | None, rows: NodeRows
 ) -> SplatCloud:
     parts = (rows.means, rows.quats, log_scales, rows.opacity, rows.sh_dc)
     means, quats, logs, opacity, first = (values.detach().cpu().numpy() for values in parts)

@@ -25,14 +25,8 @@ Rows = list[tuple[float | None, NDArray[np.float64], str]]
 
 
 def read_path(file: Path, scene: Scene, camera: Camera) -> Trajectory:
-    """The path in a file, seen by a camera.
-
-    Args:
-        scene: the log, whose clock and world the path is in.
-
-    Raises:
-        InputError: not such a file, a pose that is not rigid, or times that do not increase or lie outside the log.
-    """
+    """The path in a file, in the clock and world of the scene, seen by a camera. InputError: not such a file, a pose
+    that is not rigid, or times that do not increase or lie outside the log."""
     rows = _of_json(file) if file.suffix == ".json" else _of_text(file)
     if not 0 < len(rows) <= MOST_VIEWS:
         expected = f"1 to {MOST_VIEWS}"

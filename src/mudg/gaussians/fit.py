@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,6 @@ from mudg.gaussians.densify import DensifySettings, DensifyStats, densify_if_due
 from mudg.gaussians.model import CERTAINTY, SceneModel, compose_as_read, composite_sky, sky_lift
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.recipes import DrawnView, recipe_of
-from mudg.gaussians.rendering import NEAR_M as NEAR_M
 from mudg.gaussians.rendering import boxes_in_view, drawing_facts, objects_only, raster_of
 from mudg.gaussians.rendering import render_view as render_view
 from mudg.gaussians.schedule import (
@@ -53,7 +52,6 @@ from mudg.gaussians.schedule import (
 from mudg.gaussians.settings import METHODS, FitConfig, VirtualConfig
 from mudg.gaussians.start import FitStart
 from mudg.gaussians.storage import load_model as load_model
-from mudg.gaussians.storage import save_model as save_model
 from mudg.gaussians.trust import certainty_of, unseen_maps, unseen_rows
 from mudg.gaussians.views import TrainView, ViewSet, load_recorded
 from mudg.networks.featnets import FilterBank, LpipsFeatures
@@ -118,8 +116,15 @@ class FitState(Progress):
     views: ViewSet
     stats: DensifyStats
     schedule: DensifySettings | None
-    appearance: Appearance = field(default_factory=lambda: Appearance({}))
+    appearance: Appearance
     begun_at: int = 0
+
+    @classmethod
+    def begun(cls, config: FitConfig, model: SceneModel, shown: ViewSet, known: Appearance, step: int = 0) -> FitState:
+        """The state before the first step, on the CPU; ``known``: the corrections."""
+        model.facts |= {"method": config.method, "classes": [palette.CLASSES[i] for i in model.classes]}
+        schedule = densify_schedule(config, recipe_of(config.method).last_densified)
+        return cls(model, shown, DensifyStats.zeros(len(model.table)), schedule, known, step, step=step)
 
     @property
     def device(self) -> torch.device:
@@ -161,10 +166,10 @@ def _prepare(
         return continued_state(config, start, shown, classes)
     log.info(f"resuming at step {found.step} of {config.iterations}")
     model = SceneModel.from_state(found.state["model"], {name: found.tensors(name) for name in ("gaussians", "nodes")})
-    stats, corrections = DensifyStats.from_state(found.tensors("stats")), found.tensors("appearance")
-    appearance = Appearance.from_state(found.state["appearance"], corrections)
+    appearance = Appearance.from_state(found.state["appearance"], found.tensors("appearance"))
     begun_at = 0 if start is None else storage.begun_at(config.iterations)
-    state = FitState(model, shown, stats, _schedule_of(config), appearance, begun_at)
+    state = FitState.begun(config, model, shown, appearance, begun_at)
+    state.stats = DensifyStats.from_state(found.tensors("stats"))
     state.resume(found)
     return state
 
@@ -192,24 +197,16 @@ def start_state(
 ) -> FitState:
     """The state that a fit starts from, on the CPU: a model built from the fused cloud, nothing corrected yet."""
     model = recipe_of(config.method).start(FitStart(config, scene, cloud, shown.recorded, classes))
-    model.facts |= {"method": config.method, "scene": scene.id, "classes": [palette.CLASSES[i] for i in classes]}
-    model.facts |= drawing_facts(config.drawing)
-    stats = DensifyStats.zeros(len(model.table))
-    return FitState(model, shown, stats, _schedule_of(config), _nothing_corrected(config, shown))
-
-
-def _schedule_of(config: FitConfig) -> DensifySettings | None:
-    return densify_schedule(config, recipe_of(config.method).last_densified)
+    model.facts |= {"method": config.method, "scene": scene.id, "classes": [], **drawing_facts(config.drawing)}
+    return FitState.begun(config, model, shown, _nothing_corrected(config, shown))
 
 
 def continued_state(config: FitConfig, start: storage.StartFit, shown: ViewSet, classes: tuple[int, ...]) -> FitState:
     """The state of a fit that goes on with a finished one; ``config`` is that of the whole run."""
     model = storage.continued_model(start, classes, config)
-    model.facts |= {"method": config.method, "classes": [palette.CLASSES[i] for i in classes]}
     appearance = storage.continued_appearance(start, _nothing_corrected(config, shown))
     log.info(f"start: {len(model.table)} Gaussians of {start.folder}")
-    stats, step = DensifyStats.zeros(len(model.table)), storage.begun_at(config.iterations)
-    return FitState(model, shown, stats, _schedule_of(config), appearance, step, step=step)
+    return FitState.begun(config, model, shown, appearance, storage.begun_at(config.iterations))
 
 
 def _nothing_corrected(config: FitConfig, shown: ViewSet) -> Appearance:

@@ -311,7 +311,6 @@ class RigidNode(Node):
         return (self.world_from_object[:, :3, :3].transpose(0, 2, 1) @ path[..., None])[..., 0], turn
 
     def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
-        """See ``Node``."""
         placement = self._placement(time_s)
         if placement is None:
             return None
@@ -372,7 +371,7 @@ class RigidNode(Node):
         return type(self)(self.name, self.label, self.size_m, self.times_s, keys, Table(columns), self.learn_pose)
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """See ``StaticNode``."""
+        """What rebuilds the node: plain JSON values and tensors."""
         facts = {"name": self.name, "label": self.label, "size_m": list(self.size_m), "learn_pose": self.learn_pose}
         tensors = {name: torch.from_numpy(getattr(self, name).copy()) for name in ("times_s", "world_from_object")}
         return facts, tensors | {f"offsets.{key}": value for key, value in self.offsets.state().items()}
@@ -408,7 +407,6 @@ class DeformableNode(RigidNode):
         return {"deform": torch.zeros(keys, 3, up, across, along)}
 
     def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
-        """See ``Node``."""
         if self.keys_around(time_s) is None:
             return None
         return super().at_time(replace(rows, means=rows.means + self.displacement(rows.means, time_s)), time_s)

@@ -120,7 +120,6 @@ class RepairRecipe(Recipe):
     finished scene shows."""
 
     def used(self, config: FitConfig) -> FitConfig:
-        """See ``Recipe``."""
         return replace(config, virtual=replace(config.virtual, **REPAIRED))
 
 

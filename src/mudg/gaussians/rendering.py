@@ -28,8 +28,6 @@ NEAREST_CORNER_M = 0.3
 
 def objects_only(gaussians: Gaussians) -> Gaussians:
     """The rows of dynamic objects (node above 0), without class channels."""
-    if gaussians.node is None:
-        raise ValueError("the Gaussians have no node index")
     return rows_of(gaussians, gaussians.node > 0)
 
 
@@ -136,10 +134,8 @@ def render_condition(
     ``composed``: what ``compose`` made of the model at the view's time, if it is at hand."""
     gaussians, certainty = compose(model, view.time_s) if composed is None else composed, model.certainty
     if certainty is not None:
-        known = certainty.float()[:, None]
-        gaussians = replace(
-            gaussians, extra=known if gaussians.extra is None else torch.cat([gaussians.extra, known], 1)
-        )
+        known = [gaussians.extra, certainty.float()[:, None]]
+        gaussians = replace(gaussians, extra=torch.cat([part for part in known if part is not None], 1))
     render = rasterize(gaussians, view, raster or raster_of(model))
     blended = None
     if certainty is not None and render.extra is not None:
@@ -156,10 +152,8 @@ def render_condition(
 def _brought_back(result: Rendered) -> Rendered:
     """The same with its tensors on the CPU: the one place where pictures leave the device."""
     made: Any = result
-    tensors = {f.name: value for f in fields(made) if isinstance(value := getattr(made, f.name), Tensor)}
-    if all(value.device.type == "cpu" for value in tensors.values()):
-        return result
-    return replace(made, **{name: value.cpu() for name, value in tensors.items()})
+    tensors = {f.name: value.cpu() for f in fields(made) if isinstance(value := getattr(made, f.name), Tensor)}
+    return replace(made, **tensors)
 
 
 def _observed(model: SceneModel, render: Render, view: View, source: str = "") -> Observation:

@@ -99,13 +99,12 @@ class FiniteCheck:
 
     def __init__(self, step: int) -> None:
         self._step = step
-        self._numbers: list[Tensor] = []
-        self._facts: list[tuple[str, str, str, Tensor, Callable[[], None]]] = []
-        """Of each number: what it is, where, the remedy, what it is the sum of, and what drops that."""
+        self._facts: list[tuple[Tensor, str, str, str, Tensor, Callable[[], None]]] = []
+        """Of each number: itself, what it is, where, the remedy, what it is the sum of, and what drops that."""
 
     def _add(self, what: str, where: str, remedy: str, values: Tensor, drop: Callable[[], None]) -> None:
-        self._numbers.append(values.detach().sum())
-        self._facts.append((what, f"{where}, step {self._step}", remedy, values.detach(), drop))
+        number, where = values.detach().sum(), f"{where}, step {self._step}"
+        self._facts.append((number, what, where, remedy, values.detach(), drop))
 
     def terms(self, view: str, terms: Mapping[str, Tensor]) -> None:
         """Add the loss terms of a view."""
@@ -129,9 +128,9 @@ class FiniteCheck:
     def refuse(self) -> None:
         """NumericsError naming the first of the numbers that is not finite, if there is one; no parameter has been
         touched."""
-        numbers = torch.stack(self._numbers).tolist() if self._numbers else []
-        facts, self._numbers, self._facts = self._facts, [], []
-        for number, (what, where, remedy, values, drop) in zip(numbers, facts):
+        facts, self._facts = self._facts, []
+        numbers = torch.stack([fact[0] for fact in facts]).tolist() if facts else []
+        for number, (_, what, where, remedy, values, drop) in zip(numbers, facts):
             count = 0 if math.isfinite(number) else int((~torch.isfinite(values)).sum())
             if count:  # else at most the sum overflowed
                 drop()

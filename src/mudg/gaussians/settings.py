@@ -208,18 +208,11 @@ class FitConfig:
 
 @dataclass(frozen=True)
 class Method:
-    """One row.
-
-    Args:
-        title: for tables.
-        made_by: the verb that produces its views (``render`` after ``fit``, or ``synthesize``).
-        nodes: what its scene consists of (objects: one rigid or deformable node per dynamic track); empty for a method
-            without a scene.
-        supervision: what its scene learns from; virtual: the views of mudg_r; repaired: its own renders beside the
-            path, repaired.
-        scene: what its scene is made of: Gaussians, or a radiance field that is marched along rays.
-        boxes: whether it knows the tracked boxes, those of the scene and those that fusing used.
-    """
+    """One row. ``title``: for tables. ``made_by``: the verb that produces its views (``render`` after ``fit``, or
+    ``synthesize``). ``nodes``: what its scene consists of (objects: a node per dynamic track); empty for a method
+    without a scene. ``supervision``: what its scene learns from; virtual: the views of mudg_r; repaired: its own
+    renders beside the path, repaired. ``scene``: what its scene is made of: Gaussians, or a radiance field that is
+    marched along rays. ``boxes``: whether it knows the tracked boxes, of the scene and of the fused clouds."""
 
     title: str
     made_by: Literal["render", "synthesize"]

@@ -130,11 +130,6 @@ class StartPoints:
         return columns
 
 
-NO_POINTS: Final = StartPoints(
-    np.zeros((0, 3), np.float32), *(np.zeros(shape, np.uint8) for shape in ((0, 3), 0)), np.zeros(0, np.float32)
-)
-
-
 def _labels(cloud: PointCloud) -> NDArray[np.uint8]:
     return np.full(len(cloud), UNLABELLED, np.uint8) if cloud.semantics is None else cloud.semantics
 
@@ -187,7 +182,7 @@ class FitStart:
             raise InputError(what, where=self.scene.root, remedy=remedy)
         rows = self._thinned(cloud.xyz, config.start.gaussians)
         points = StartPoints(cloud.xyz[rows], cloud.rgb[rows], _labels(cloud)[rows], neighbour_scale(cloud.xyz[rows]))
-        points = StartPoints.joined([points, self._unreached(points.xyz)])
+        points = StartPoints.joined([points, *self._unreached(points.xyz)])
         blocks = [points.columns(self.classes, config.sh_degree)]
         nodes: list[StaticNode | RigidNode] = [StaticNode()]
         if "objects" in kinds:
@@ -254,12 +249,14 @@ class FitStart:
 
     # beyond LiDAR ---------------------------------------------------------------------------------
 
-    def _unreached(self, xyz: NDArray[np.float32]) -> StartPoints:
+    def _unreached(self, xyz: NDArray[np.float32]) -> list[StartPoints]:
         """Points for what is visible but has no LiDAR; see the module's text. Without labels there are none."""
         labelled = [stored for stored in self.views if stored.channels is not None] if self.classes else []
         chosen = labelled[:: max(1, len(labelled) // FILL_FRAMES)]
-        points = StartPoints.joined([NO_POINTS, *(self._fill_view(stored, xyz) for stored in chosen)])
-        return points[voxel_filter(points.xyz, np.maximum(points.scale_m * 2.0, 0.05))]
+        if not chosen:
+            return []
+        points = StartPoints.joined([self._fill_view(stored, xyz) for stored in chosen])
+        return [points[voxel_filter(points.xyz, np.maximum(points.scale_m * 2.0, 0.05))]]
 
     def _fill_view(self, stored: StoredView, xyz: NDArray[np.float32]) -> StartPoints:
         view, cell = stored.view, FILL_CELL_PX
@@ -309,8 +306,8 @@ class FitStart:
         chosen = [self._thinned(xyz, half), *self._by_moment(xyz, time_s, half)]
         parts = [StartPoints(xyz[rows], rgb[rows], semantics[rows], neighbour_scale(xyz[rows])) for rows in chosen]
         unreached = self._unreached(xyz)
-        times = [*(time_s[rows] for rows in chosen), np.full(len(unreached), np.nan)]
-        return StartPoints.joined([*parts, unreached]), np.concatenate(times)
+        times = [*(time_s[rows] for rows in chosen), *(np.full(len(part), np.nan) for part in unreached)]
+        return StartPoints.joined([*parts, *unreached]), np.concatenate(times)
 
     def _measured(self) -> Iterator[tuple[NDArray[Any], ...]]:
         """Points of the sweeps: places f32[N, 3], common colours u8[N, 3], train ids u8[N], times f64[N]."""

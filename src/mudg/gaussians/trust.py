@@ -19,7 +19,7 @@ from mudg.gaussians.corrections import UNCORRECTED, Appearance
 from mudg.gaussians.model import SceneModel, compose, compose_as_read, composite_sky
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.start import StartPoints, voxel_filter
-from mudg.gaussians.views import StoredView, TrainView
+from mudg.gaussians.views import StoredView, TrainView, resized_view
 
 # certainty ----------------------------------------------------------------------------------------
 #
@@ -54,6 +54,12 @@ def certainty(views: Tensor, pixels: Tensor, color: Tensor, lidar: Tensor, depth
     return views / (views + 1) * COLOR_ERROR / (COLOR_ERROR + color) * DEPTH_ERROR / (DEPTH_ERROR + depth)
 
 
+def spread(views: Sequence[StoredView], most: int) -> list[StoredView]:
+    """At most so many of the views, evenly chosen."""
+    chosen = np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int)
+    return [views[index] for index in np.unique(chosen).tolist()]
+
+
 def certainty_of(
     model: SceneModel,
     views: Sequence[StoredView],
@@ -63,11 +69,10 @@ def certainty_of(
 ) -> Tensor:
     """Certainty of every Gaussian of a model, f16[N], from recorded views, evenly chosen if there are more than
     ``most`` (0 = all); those that are left out count like the others."""
-    count = min(most or len(views), len(views))
-    chosen = np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))
+    chosen = spread(views, most or len(views))
     total = torch.zeros(5, len(model.table), device=model.device)
-    for index in chosen:
-        sums = weight_sums(model, TrainView.of(views[int(index)], model.device), raster, appearance)
+    for stored in chosen:
+        sums = weight_sums(model, TrainView.of(stored, model.device), raster, appearance)
         total += torch.cat([(sums[:1] / (sums[:1] + 1)), sums])
     total *= len(views) / len(chosen)
     return certainty(*total).half()
@@ -83,11 +88,8 @@ def weight_sums(
         pose = appearance.world_from_cam(view.view, view.name)
     features = torch.zeros(len(gaussians), 4, device=model.device, requires_grad=True)
     render = rasterize(replace(gaussians, extra=features), view.view, raster, world_from_cam=pose)
-    if render.extra is None:
-        raise ValueError("the renderer returned no features")
     images = difference_images(model, render, view, appearance)
-    (gradient,) = torch.autograd.grad(render.extra, [features], images)
-    return gradient.T
+    return torch.autograd.grad(render.extra, [features], images)[0].T
 
 
 @torch.no_grad()
@@ -130,6 +132,13 @@ MOST_SEEDS = 8_000_000
 
 _Witness = tuple[View, NDArray[np.float32]]
 """A recorded view and what it sees: depth f32[H, W], infinite in the sky."""
+_Placed = tuple[tuple[float, ...], Callable[[float], NDArray[np.float64] | None]]
+"""Size of an object's box, and its poses, which do not change meanwhile: each is worked out once."""
+
+
+def _placed(model: SceneModel) -> dict[int, _Placed]:
+    rigid = {index: node for index, node in enumerate(model.nodes) if isinstance(node, RigidNode)}
+    return {index: (node.size_m, cache(node.pose_matrix)) for index, node in rigid.items()}
 
 
 @torch.no_grad()
@@ -138,14 +147,12 @@ def unseen_maps(
 ) -> Iterator[tuple[StoredView, NDArray[np.bool_]]]:
     """Every virtual view with bool[H, W], True where no recorded view saw the surface it shows, by the geometry that
     the model has by now; one at a time. Pixels without depth count as sky, far away."""
-    chosen = np.unique(np.linspace(0, len(recorded) - 1, min(WITNESSES, len(recorded))).round().astype(int))
     witnesses = []
-    for view in (recorded[index].view for index in chosen):
-        width = min(WITNESS_WIDTH_PX, view.camera.width)
-        small = view.resized(width, max(1, round(view.camera.height * width / view.camera.width)))
+    for view in (stored.view for stored in spread(recorded, WITNESSES)):
+        small = resized_view(view, min(WITNESS_WIDTH_PX, view.camera.width))
         render = rasterize(compose(model, view.time_s, semantics=False), small, raster)
         witnesses.append((small, torch.where(render.alpha > 0.5, render.depth, torch.inf)[0].cpu().numpy()))
-    objects = [(node.size_m, cache(node.pose_matrix)) for node in model.nodes if isinstance(node, RigidNode)]
+    objects = list(_placed(model).values())
     for stored in log.progress(virtual, len(virtual), "finding unseen surfaces"):
         yield stored, _unseen(stored, witnesses, objects)
 
@@ -153,10 +160,6 @@ def unseen_maps(
 def block_centres(size_px: int) -> NDArray[np.intp]:
     """The pixel that stands for each block of ``STRIDE_PX``; the last block may be cut, so that any size is covered."""
     return np.minimum(np.arange(0, size_px, STRIDE_PX) + STRIDE_PX // 2, size_px - 1)
-
-
-_Placed = tuple[tuple[float, ...], Callable[[float], NDArray[np.float64] | None]]
-"""Size of an object's box, and its poses, which do not change meanwhile: each is worked out once."""
 
 
 def _unseen(stored: StoredView, witnesses: Sequence[_Witness], objects: Sequence[_Placed]) -> NDArray[np.bool_]:
@@ -198,8 +201,7 @@ def unseen_rows(
     """Table rows (columns, labels; on the CPU) at the surfaces that only virtual views show, thinned to one per place,
     at most ``most``; and the mean share of pixels that show them. A point in the box of a dynamic object belongs to it.
     Above ``MOST_SEEDS`` points, every second one goes on."""
-    rigid = {index: node for index, node in enumerate(model.nodes) if isinstance(node, RigidNode)}
-    objects = {index: (node.size_m, cache(node.pose_matrix)) for index, node in rigid.items()}
+    objects = _placed(model)
     found: dict[int, list[StartPoints]] = {index: [] for index in range(len(model.nodes))}
     shares, stride, total = [], 1, 0
     for stored, unseen_here in unseen:
@@ -219,10 +221,9 @@ def unseen_rows(
         kept = _spread(points, share, seeds.numpy_rng(run_seed, index, "unseen rows"))
         columns.append(kept.columns(model.classes, model.sh_degree))
         owners.append(torch.full((len(kept),), index, dtype=torch.int32))
-    share, none = float(np.mean(shares)), torch.zeros(0, dtype=torch.int32)
-    if not columns:
-        return {name: value.detach()[:0].cpu() for name, value in model.table.columns.items()}, {"node": none}, share
-    return {name: torch.cat([c[name] for c in columns]) for name in columns[0]}, {"node": torch.cat(owners)}, share
+    names = model.table.columns
+    joined = {name: torch.cat([names[name].detach()[:0].cpu(), *(c[name] for c in columns)]) for name in names}
+    return joined, {"node": torch.cat([torch.zeros(0, dtype=torch.int32), *owners])}, float(np.mean(shares))
 
 
 def _spread(points: StartPoints, most: int, rng: np.random.Generator) -> StartPoints:

@@ -23,12 +23,11 @@ from mudg.base.errors import UsageError
 from mudg.base.processes import one_torch_thread, run_in_processes
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Frame, Scene, Sweep
+from mudg.core.depth import MIN_POINTS
 from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, largest_beam_gap, separate
 from mudg.core.pictures import class_colors, depth_colors, gray, resize_area
-from mudg.core.project import RULES as HIDING_RULES
-from mudg.core.project import visible_depth
 from mudg.labels import street_net
-from mudg.labels.depth_networks import align_to_lidar, enough_returns, kind_of, load_depth_network
+from mudg.labels.depth_networks import align_to_lidar, kind_of, load_depth_network
 from mudg.labels.evidence import driven_path
 from mudg.labels.inputs import DepthInput, DepthNetwork, LabelInput, Labeller, Labels, label_by_network
 from mudg.labels.segmenters import Segmenter
@@ -101,10 +100,9 @@ def digests(config: AnnotateConfig) -> dict[str, str]:
 
 def with_network(network: DepthNetwork, inputs: LabelInput, labels: Labels, frame_id: str, staging: Path) -> Labels:
     """Labels with the network's depth, aligned to the frame's LiDAR, or as they are if it cannot be."""
-    measured = visible_depth(inputs.view, inputs.xyz_world, HIDING_RULES["sweep"], gap_deg=inputs.beam_gap_deg)
-    asked = DepthInput(inputs.rgb, measured, labels.depth, labels.sky)
+    asked = DepthInput(inputs.rgb, inputs.measured(), labels.depth, labels.sky)
     reason = "too few LiDAR returns"
-    if enough_returns(asked):
+    if asked.known.sum() >= MIN_POINTS:
         dense, fit = align_to_lidar(network(asked), asked)
         if dense is not None:
             return replace(labels, depth=dense.depth, depth_confidence=dense.confidence)
@@ -162,14 +160,8 @@ def find_ego(scene: Scene, camera: str) -> NDArray[np.bool_]:
 
 
 def steady_bottom(grey: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Pixels joined to the lower edge that vary much less over time than the rest of the lower half.
-
-    Args:
-        grey: [N, H, W] images over a drive, 0..255.
-
-    Returns:
-        bool[H, W].
-    """
+    """Pixels bool[H, W] joined to the lower edge that vary much less over time than the rest of the lower half, in
+    images [N, H, W] over a drive, 0..255."""
     middle = np.median(grey, axis=0)
     spread = ndimage.uniform_filter(np.median(np.abs(grey - middle), axis=0), 3)
     height, width = spread.shape
@@ -272,19 +264,18 @@ def picture(scene: Scene, frame: Frame) -> Image.Image:
     """Image, depth, classes and confidence beside each other; what a frame lacks is black."""
     rgb = read_image(scene, frame)
     panels = [rgb, np.zeros_like(rgb), np.zeros_like(rgb), np.zeros_like(rgb)]
-    if "depth" in frame.labels:
-        panels[1] = depth_colors(read_label(scene, frame, "depth"))
-    if "depth_confidence" in frame.labels:
-        sure = read_label(scene, frame, "depth_confidence")
-        panels[1] = (panels[1] * (0.35 + 0.65 * sure[..., None])).astype(np.uint8)
-    if "semantics" in frame.labels:
-        colors = class_colors(read_label(scene, frame, "semantics"))
-        panels[2] = (0.45 * rgb + 0.55 * colors).astype(np.uint8)
-    if "dynamic" in frame.labels:
-        mask = read_label(scene, frame, "dynamic").astype(bool)
+    found = {name: read_label(scene, frame, name) for name in frame.labels}
+    if "depth" in found:
+        panels[1] = depth_colors(found["depth"])
+    if "depth_confidence" in found:
+        panels[1] = (panels[1] * (0.35 + 0.65 * found["depth_confidence"][..., None])).astype(np.uint8)
+    if "semantics" in found:
+        panels[2] = (0.45 * rgb + 0.55 * class_colors(found["semantics"])).astype(np.uint8)
+    if "dynamic" in found:
+        mask = found["dynamic"].astype(bool)
         panels[2][mask & ~ndimage.binary_erosion(mask, iterations=max(1, rgb.shape[1] // 500))] = _OUTLINE
-    if "semantics_confidence" in frame.labels:
-        panels[3] = gray(read_label(scene, frame, "semantics_confidence"))
+    if "semantics_confidence" in found:
+        panels[3] = gray(found["semantics_confidence"])
     height = max(1, round(rgb.shape[0] * _WIDTH_PX / rgb.shape[1]))
     return Image.fromarray(np.concatenate([resize_area(panel, _WIDTH_PX, height) for panel in panels], 1))
 
@@ -387,23 +378,13 @@ def label_into_staging(config: AnnotateConfig, scene: Scene, ids: Sequence[str],
             labels = label(given)
             if network is not None and "depth" not in frame.labels:
                 labels = with_network(network, given, labels, frame_id, staging)
-        store.write_safetensors(staged_labels(staging, frame_id), label_arrays(config, labels))
+        store.write_safetensors(staged_labels(staging, frame_id), labels.arrays(config.depth, config.dynamic))
         yield frame_id
 
 
 def staged_labels(staging: Path, frame_id: str) -> Path:
     """Where the labels of a frame lie until the scene is written."""
     return staging / f"{frame_id}.safetensors"
-
-
-def label_arrays(config: AnnotateConfig, labels: Labels) -> dict[str, NDArray[Any]]:
-    """Labels under the names that a scene has for them; what was not asked for is left out."""
-    arrays = {"semantics": labels.semantics, "sky": labels.sky, "semantics_confidence": labels.confidence}
-    if config.depth:
-        arrays |= {"depth": labels.depth, "depth_confidence": labels.depth_confidence}
-    if config.dynamic:
-        arrays["dynamic"] = labels.dynamic
-    return arrays
 
 
 def _add_frames(

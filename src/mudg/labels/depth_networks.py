@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from mudg.base.errors import InputError, ResourceError
-from mudg.core.depth import FAR_M, MIN_POINTS, NEAR_M, SKY_M, AffineFit, DenseDepth, Space, fit_affine
+from mudg.core.depth import FAR_M, NEAR_M, SKY_M, AffineFit, DenseDepth, Space, fit_affine
 from mudg.core.pictures import resize_bicubic
 from mudg.labels.depthlab import DepthLab
 from mudg.labels.inputs import DepthInput, DepthNetwork, Prediction
@@ -93,11 +93,8 @@ class TransformersDepth:
 
 def lidar_cue(inputs: DepthInput, longest_px: int = CUE_PX) -> Tensor:
     """Small depth map f32[1, 1, h, w] metres without holes: returns filled along the image, the sky as far as the
-    farthest.
-
-    The network scales the map to 0..1 by its least and greatest value; the sky at its own distance would squeeze all
-    the rest. InputError: nothing was measured.
-    """
+    farthest. The network scales the map to 0..1 by its least and greatest value; the sky at its own distance would
+    squeeze all the rest. InputError: nothing was measured."""
     ground = np.isfinite(inputs.filled) & ~inputs.sky
     if not ground.any():
         raise InputError("no LiDAR return in the image", where="depth network", expected="at least one")
@@ -165,7 +162,7 @@ def align_to_lidar(prediction: Prediction, inputs: DepthInput) -> tuple[DenseDep
     if prediction.values.shape != inputs.measured.shape:
         what, where = "a network's depth and its image differ in size", "depth network"
         raise InputError(what, where=where, expected=str(inputs.measured.shape), got=str(prediction.values.shape))
-    known = np.isfinite(inputs.measured) & ~inputs.sky
+    known = inputs.known
     values, measured = prediction.values[known], inputs.measured[known]
     fit = fit_affine(torch.from_numpy(values), torch.from_numpy(measured), prediction.space)
     if not fit.used:
@@ -179,18 +176,10 @@ def align_to_lidar(prediction: Prediction, inputs: DepthInput) -> tuple[DenseDep
 def residual_confidence(
     depth: NDArray[np.float32], measured: NDArray[np.float32], sky: NDArray[np.bool_], sky_m: float
 ) -> NDArray[np.float32]:
-    """exp(-e / 0.05) of the relative error e to be expected, f32[H, W] in 0..1; the same scale as that of
-    ``core.complete``.
-
-    e is the mean error at the measurements around a pixel, within the distance that most pixels have to one. Away from
-    all of them it goes over to twice the frame's mean error: nothing was compared there. Steps of depth around the
-    pixel add to it.
-
-    Args:
-        depth, measured: f32[H, W] metres, the latter NaN where nothing was measured.
-        sky: bool[H, W].
-        sky_m: its distance.
-    """
+    """exp(-e / 0.05) of the relative error e to be expected of ``depth`` f32[H, W], in 0..1; the same scale as that of
+    ``core.depth.complete_depth``. e is the mean error at what was ``measured`` (NaN: nothing) around a pixel, within
+    the distance that most pixels have to one. Away from all of them it goes over to twice the frame's mean error:
+    nothing was compared there. Steps of depth around the pixel add to it. ``sky_m``: distance of the ``sky``."""
     known = np.isfinite(measured)
     off = np.zeros(depth.shape, np.float32)
     off[known] = np.minimum(np.abs(np.log(depth[known] / measured[known])), 1)
@@ -206,8 +195,3 @@ def residual_confidence(
     confidence = np.exp(-(0.002 + error + 0.05 * np.minimum(steps, 1)) / _ERROR_SCALE).astype(np.float32)
     confidence[sky] = _SKY_CONFIDENCE
     return confidence
-
-
-def enough_returns(inputs: DepthInput) -> bool:
-    """Whether the image has enough returns for an alignment."""
-    return int((np.isfinite(inputs.measured) & ~inputs.sky).sum()) >= MIN_POINTS

@@ -78,10 +78,8 @@ def _scheduler_of(folder: Path) -> Any:
 
 class _SharedAttention:
     """A processor of diffusers for one self-attention: the given one, with features passed from one U-Net to the other.
-
     Without a ``source`` it keeps the block's features [N, L, C]; with one, keys and values also come from the features
-    kept there.
-    """
+    kept there."""
 
     features: Tensor
 
@@ -123,16 +121,11 @@ def share_features(reference_unet: Any, denoising_unet: Any) -> None:
 
 
 class Prepared(NamedTuple):
-    """One image and its known depth at the size of the networks, padded to whole latent cells by the last row and
-    column.
-
-    Args:
-        image: f32[1, 3, H, W] in -1..1. crop: f32[1, 3, S, S], the middle of the image as CLIP wants it.
-        nearest, linear: f32[1, 1, H, W], known depth in -1..1, filled by the nearest known and by linear
-            interpolation (0 outside the triangles between the known).
-        missing: f32[1, 1, H, W], 1 where depth is not known. size: height and width without the padding.
-        low_m, high_m: least and greatest known depth.
-    """
+    """One image f32[1, 3, H, W] in -1..1 and its known depth at the size of the networks, padded to whole latent cells
+    by the last row and column (``size``: without). ``crop``: f32[1, 3, S, S], the middle of the image as CLIP wants it.
+    ``nearest``, ``linear``: f32[1, 1, H, W], known depth in -1..1, filled by the nearest known and by linear
+    interpolation (0 outside the triangles between the known). ``missing``: f32[1, 1, H, W], 1 where depth is not known.
+    ``low_m``, ``high_m``: least and greatest known depth."""
 
     image: Tensor
     crop: Tensor
@@ -149,7 +142,7 @@ def prepare(inputs: DepthInput, processing_px: int, cell: int, crop_px: int) -> 
     image. InputError: no depth is known."""
     height, width = inputs.rgb.shape[:2]
     size = tuple(max(1, side * processing_px // max(height, width)) for side in (height, width))
-    depth = known_depth(np.where(inputs.sky, np.float32(np.nan), inputs.measured), size)
+    depth = known_depth(np.where(inputs.known, inputs.measured, np.float32(np.nan)), size)
     known = np.isfinite(depth)
     if not known.any():
         raise InputError("no LiDAR return in the image", where="depth network", expected="at least one")
@@ -201,16 +194,10 @@ def clip_crop(rgb: NDArray[np.uint8], side_px: int) -> Tensor:
 
 
 class DepthLab:
-    """A DepthLab model ready for use.
-
-    Args:
-        folder: what ``mudg convert`` wrote; every file is checked against its SHA-256. steps: of denoising, 0 = as the
-            folder says.
-
-    Raises:
-        InputError: not such a folder, or not of this version. IntegrityError: a file is missing or altered.
-        ResourceError: a package is missing. UsageError: too few steps, or more than the noise schedule has.
-    """
+    """A DepthLab model ready for use, from what ``mudg convert`` wrote; every file is checked against its SHA-256.
+    ``steps``: of denoising, 0 = as the folder says. InputError: not such a folder, or not of this version.
+    IntegrityError: a file is missing or altered. ResourceError: a package is missing. UsageError: too few steps, or
+    more than the noise schedule has."""
 
     def __init__(self, folder: str | Path, device: torch.device = CPU, steps: int = 0) -> None:
         folder, self._device = Path(folder), device
@@ -322,15 +309,9 @@ def _filled(network: nn.Module, file: Path, spare: tuple[str, ...] = ()) -> Any:
 
 
 def convert_folder(folder: Path, to: Path, dtype: torch.dtype | None, shard_bytes: int) -> None:
-    """The conversion, in this process; ``to`` is complete or not there.
-
-    Args:
-        folder: what holds the sources. dtype: number format of the weights (None: as they are). shard_bytes: of one
-            file.
-
-    Raises:
-        InputError: something is missing or is not DepthLab. ResourceError: a package is missing, or the disk is full.
-    """
+    """The conversion of a folder of sources, in this process; ``to`` is complete or not there. ``dtype``: number format
+    of the weights (None: as they are). ``shard_bytes``: of one file. InputError: something is missing or is not
+    DepthLab. ResourceError: a package is missing, or the disk is full."""
     files, classes = source_files(folder), _network_classes()
     scheduler = _scheduler_of(folder / _BASE / "scheduler")
     whole: Any = folders.load_network(folders.member(folders.package("transformers"), "CLIPModel"), folder / _ENCODER)

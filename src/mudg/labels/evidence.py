@@ -14,27 +14,16 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from mudg.base.palette import ID
-from mudg.core.depth import beyond_reach, complete_depth, ray_elevation
-from mudg.core.project import RULES as HIDING_RULES
-from mudg.core.project import visible_depth
-from mudg.labels.inputs import LabelInput, far_to_near, surface_points
+from mudg.core.depth import complete_depth, ray_elevation
+from mudg.labels.inputs import LabelInput, surface_points
 
 BOX_GROUPS: Final = (("car",), ("truck",), ("bus", "train"), ("person",), ("rider", "motorcycle", "bicycle"))
 """Classes of boxes that share a plane."""
 GROUP_OF: Final[Mapping[int, int]] = {ID[name]: n for n, names in enumerate(BOX_GROUPS) for name in names}
 """Number of the group of each class that boxes have."""
 PLANES: Final = (
-    *(
-        "height, fine",
-        "height",
-        "log depth",
-        "distance to a return",
-        "upwards",
-        "beside the path",
-        "elevation",
-        "silent",
-    ),
-    *("roughness", "measured at all", "reachable from the path", "raised"),
+    *("height, fine", "height", "log depth", "distance to a return", "upwards", "beside the path", "elevation"),
+    *("silent", "roughness", "measured at all", "reachable from the path", "raised"),
 )
 """Planes that ``encode`` makes, before one for each of ``BOX_GROUPS``."""
 PLANE_COUNT: Final = len(PLANES) + len(BOX_GROUPS)
@@ -46,24 +35,15 @@ _OUTLINE: Final = 0.4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """Measured facts per pixel; where there are no returns at all, ``depth_m`` is NaN and what follows from it is 0.
-
-    Args:
-        height_m: above the ground plane f32[H, W] (0 where no plane was found).
-        depth_m: dense camera z f32[H, W].
-        away_deg: angle to the nearest return f32[H, W], at most 90.
-        upwards: upward part of the surface's normal f32[H, W], 0..1.
-        beside_m: horizontal distance to the driven path f32[H, W].
-        elevation_rad: of the pixel's ray above the horizontal f32[H, W].
-        reachable: bool[H, W], ground that is reached from the driven path without a step.
-        direct: bool[H, W], and that without much of a detour (not given to the network).
-        raised_m: above the lowest ground within 3 m f32[H, W], 0 where it is no ground.
-        silent: bool[H, W], the scanner looked, above the road, and nothing came back.
-        rough: spread of the logarithm of measured depth around a local plane f32[H, W].
-        box: u8[H, W], 1 + place in ``box_labels`` of the nearest box seen here, 0 = none.
-        in_box: bool[H, W], the surface lies in that box; else the pixel is only in its outline.
-        box_labels: i64[N] train ids of the boxes.
-    """
+    """Measured facts per pixel [H, W]; where there are no returns at all, ``depth_m`` is NaN and what follows from it
+    is 0. ``height_m``: above the ground plane (0 where no plane was found). ``depth_m``: dense camera z. ``away_deg``:
+    angle to the nearest return, at most 90. ``upwards``: upward part of the surface's normal, 0..1. ``beside_m``:
+    horizontal distance to the driven path. ``reachable``: ground that is reached from the path without a step;
+    ``direct``: and that without much of a detour (not given to the network). ``raised_m``: above the lowest ground
+    within 3 m, 0 where it is no ground. ``elevation_rad``: of the pixel's ray above the horizontal. ``silent``: the
+    scanner looked, above the road, and nothing came back. ``rough``: spread of the logarithm of measured depth around a
+    local plane. ``box``: 1 + place in ``box_labels`` (train ids i64[N]) of the nearest box seen here, 0 = none.
+    ``in_box``: the surface lies in that box; else the pixel is only in its outline."""
 
     height_m: NDArray[np.float32]
     depth_m: NDArray[np.float32]
@@ -83,26 +63,26 @@ class Evidence:
 
 def gather(inputs: LabelInput) -> Evidence:
     """Facts at every pixel of ``inputs.view``; works, with less, without returns, path or boxes."""
-    view, gap_deg = inputs.view, inputs.beam_gap_deg
-    measured = visible_depth(view, inputs.xyz_world, HIDING_RULES["sweep"], gap_deg=gap_deg)
-    known = np.isfinite(measured)
-    shape = measured.shape
+    view, measured = inputs.view, inputs.measured()
+    known, shape = np.isfinite(measured), measured.shape
     elevation = ray_elevation(view)
     zero, none = np.zeros(shape, np.float32), np.zeros(shape, bool)
     if not known.any():
         unknown, boxes = np.full(shape, np.nan, np.float32), _boxes(inputs, None, measured, known)
         return Evidence(zero, unknown, zero + 90, zero, zero, none, none, zero, elevation, none, zero, *boxes)
     away_px = np.asarray(ndimage.distance_transform_edt(~known), np.float32)
-    beyond = beyond_reach(view, measured, inputs.highest_rad, gap_deg=gap_deg)
+    beyond = inputs.beyond(measured)
     depth = complete_depth(inputs.rgb, measured, None, beyond).depth
     xyz = surface_points(view, depth)
+    normal = np.cross(np.gradient(xyz, axis=1), np.gradient(xyz, axis=0))
+    upwards = np.abs(normal[..., 2]) / np.maximum(np.linalg.norm(normal, axis=2), 1e-9)
     ground = map_ground(inputs.xyz_world, inputs.path_world, view.center_world)
     height = zero if ground is None else np.clip(above_plane(ground.plane, xyz), -60, 60).astype(np.float32)
     under = (none, none, zero) if ground is None else ground.under(xyz)
     beside = beside_path(xyz, inputs.path_world, 2) if len(inputs.path_world) else np.full(shape, NO_PATH_M, np.float32)
     away_deg = np.minimum(np.rad2deg(away_px / view.camera.fy), 90).astype(np.float32)
-    rough = _roughness(measured, gap_deg, view.camera.fy)
-    seen = (height, depth, away_deg, _upwards(xyz), beside, *under, elevation, beyond, rough)
+    rough = _roughness(measured, inputs.beam_gap_deg, view.camera.fy)
+    seen = (height, depth, away_deg, upwards.astype(np.float32), beside, *under, elevation, beyond, rough)
     return Evidence(*seen, *_boxes(inputs, xyz, depth, known))
 
 
@@ -135,12 +115,6 @@ def encode(evidence: Evidence) -> NDArray[np.float32]:
 # --- the facts ------------------------------------------------------------------------------------
 
 
-def _upwards(xyz: NDArray[np.float32]) -> NDArray[np.float32]:
-    right, down = np.gradient(xyz, axis=1), np.gradient(xyz, axis=0)
-    normal = np.cross(right, down)
-    return (np.abs(normal[..., 2]) / np.maximum(np.linalg.norm(normal, axis=2), 1e-9)).astype(np.float32)
-
-
 def _roughness(measured: NDArray[np.float32], gap_deg: float, fy_px: float) -> NDArray[np.float32]:
     """Spread of the logarithm of measurements around the plane that fits them best in a window of about four beams."""
     known = np.isfinite(measured)
@@ -164,14 +138,11 @@ def _boxes(
     inputs: LabelInput, xyz: NDArray[np.float32] | None, depth: NDArray[np.float32], known: NDArray[np.bool_]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.int64]]:
     """Nearest tracked box of each pixel, see ``Evidence``: where the surface lies in it, or, with nothing nearer, in
-    its outline.
-
-    A box without a return in it is left out where there are returns at all: it is hidden, or empty.
-    """
+    its outline. A box without a return in it is left out where there are returns at all: it is hidden, or empty."""
     view = inputs.view
     box, in_box = np.zeros(depth.shape, np.uint8), np.zeros(depth.shape, bool)
     labels: list[int] = []
-    for placed in far_to_near(inputs)[-_MAX_BOXES:]:
+    for placed in inputs.far_to_near()[-_MAX_BOXES:]:
         outline = placed.outline(view)
         if outline is None:
             continue
@@ -192,7 +163,6 @@ def _boxes(
 
 
 # the ground around a vehicle: its plane, and the part that is reached from the path without a step -
-
 
 Points = NDArray[np.floating]
 Places = NDArray[np.float64]
@@ -222,10 +192,8 @@ _STOOD_M: Final = 0.5
 
 def fit_ground(xyz_world: Points, path_world: Places) -> Places | None:
     """Ground plane z = a x + b y + c within 40 m of the path's middle, f64[3], or None with too few points to tell.
-
     Starts from the lowest returns of 2 m cells (their lower half by height), then least squares on what lies within
-    0.5, 0.3 and 0.2 m of the plane. A slope above 20 percent is not believed.
-    """
+    0.5, 0.3 and 0.2 m of the plane. A slope above 20 percent is not believed."""
     if len(xyz_world) < 50 or len(path_world) == 0:
         return None
     xyz = np.asarray(xyz_world, np.float64)
@@ -272,11 +240,8 @@ def driven_path(world_from_ego: Places) -> Places:
 
 def distance_to_path(xyz_world: Points, path_world: Places) -> Places:
     """Horizontal distance of points ``[N, 2 or 3]`` to the driven path, gone on straight for 80 m at both ends; metres
-    f64[N].
-
-    A path shorter than half a metre has no direction (``driven_path`` gives it one); then it is the distance to its
-    first place.
-    """
+    f64[N]. A path shorter than half a metre has no direction (``driven_path`` gives it one); then it is the distance to
+    its first place."""
     if len(path_world) == 0 or len(xyz_world) == 0:
         return np.zeros(len(xyz_world))
     far = np.flatnonzero(np.linalg.norm(path_world[:, :2] - path_world[0, :2], axis=1) > _STOOD_M)
@@ -305,15 +270,10 @@ def beside_path(xyz_world: NDArray[np.float32], path_world: Places, step: int) -
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroundMap:
-    """Ground around a camera from above: cell [i, j] is ``CELL_M`` wide and begins at ``corner_m + CELL_M * (i, j)``.
-
-    Args:
-        corner_m: world x and y, f64[2]. plane: of ``fit_ground``, f64[3].
-        reachable: bool[N, N], reached from the driven path over known ground without a step.
-        direct: bool[N, N], and that without much of a detour: one lowered kerb joins a whole sidewalk, but not
-            directly.
-        raised_m: f32[N, N], height above the lowest ground within 3 m, 0 where unknown.
-    """
+    """Ground around a camera from above: cell [i, j] is ``CELL_M`` wide and begins at ``corner_m + CELL_M * (i, j)``
+    (world x and y, f64[2]); ``plane`` of ``fit_ground``. Of each cell: whether it is ``reachable`` from the driven path
+    over known ground without a step, and that ``direct``, without much of a detour (one lowered kerb joins a whole
+    sidewalk, but not directly); and ``raised_m``, its height above the lowest ground within 3 m, 0 where unknown."""
 
     corner_m: Places
     plane: Places
@@ -331,11 +291,8 @@ class GroundMap:
 
 
 def map_ground(xyz_world: Points, path_world: Places, centre_world: Places) -> GroundMap | None:
-    """Map of the ground within ``REACH_M`` of a place; None without a ground plane.
-
-    Args:
-        xyz_world: returns ``[N, 3]``, metres. path_world: places of the vehicle f64[M, 3]. centre_world: f64[3].
-    """
+    """Map of the ground within ``REACH_M`` of a place f64[3], from returns ``[N, 3]`` and places of the vehicle f64[M,
+    3]; None without a ground plane."""
     plane = ground_near(xyz_world, path_world, centre_world)
     if plane is None:
         return None
@@ -359,9 +316,7 @@ def map_ground(xyz_world: Points, path_world: Places, centre_world: Places) -> G
 
 def _way(passable: Mask, beside_m: Places) -> Places:
     """Length of the way from the driven path to each cell over passable ones, metres, infinite where there is none.
-
-    Cells are reached in turns of four and of eight neighbours, which measures lengths to 8 percent.
-    """
+    Cells are reached in turns of four and of eight neighbours, which measures lengths to 8 percent."""
     reached = passable & (beside_m < _TRACK_M)
     way = np.where(reached, 0.0, np.inf)
     count = idle = 0

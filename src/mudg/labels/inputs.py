@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,19 +39,10 @@ GROWTH_M: Final = 0.15
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelInput:
-    """Input of a labeller for one image.
-
-    Args:
-        view: camera and pose.
-        rgb: u8[H, W, 3].
-        xyz_world: f32[N, 3] metres: LiDAR returns of the static scene, and of dynamic objects where they are at the
-            image's time.
-        tracks: tracked boxes.
-        path_world: f64[M, 3], places of the vehicle (``ground.driven_path``).
-        beam_gap_deg: largest angle between neighbouring beams of the LiDAR.
-        highest_rad: elevation of its highest beam above the horizontal.
-        moving: numbers of the tracks of dynamic objects: those that move at some time of the log.
-    """
+    """Input of a labeller for one image: ``rgb`` u8[H, W, 3]; LiDAR returns ``xyz_world`` f32[N, 3] of the static
+    scene, and of dynamic objects where they are at the image's time; places of the vehicle ``path_world`` f64[M, 3]
+    (``evidence.driven_path``); largest angle between neighbouring beams of the LiDAR, and elevation of its highest beam
+    above the horizontal; numbers of the tracks that are ``moving`` at some time of the log."""
 
     view: View
     rgb: NDArray[np.uint8]
@@ -61,6 +52,22 @@ class LabelInput:
     beam_gap_deg: float = GAP_DEG
     highest_rad: float = 0.0
     moving: frozenset[int] = frozenset()
+
+    def measured(self) -> NDArray[np.float32]:
+        """Visible returns f32[H, W], metres, NaN where there is none."""
+        return visible_depth(self.view, self.xyz_world, HIDING_RULES["sweep"], gap_deg=self.beam_gap_deg)
+
+    def beyond(self, measured: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Pixels bool[H, W] that are beyond the reach of the LiDAR (``core.depth.beyond_reach``)."""
+        return beyond_reach(self.view, measured, self.highest_rad, gap_deg=self.beam_gap_deg)
+
+    def far_to_near(self) -> list[PlacedBox]:
+        """Boxes that have a class and are present, the farthest first."""
+        poses = (track.pose_at(self.view.time_s) if track.label in TRAIN_ID_OF else None for track in self.tracks)
+        both = enumerate(zip(self.tracks, poses))
+        placed = [PlacedBox(number, track, pose) for number, (track, pose) in both if pose is not None]
+        here = self.view.center_world
+        return sorted(placed, key=lambda box: -float(np.linalg.norm(box.world_from_box[:3, 3] - here)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,6 +82,12 @@ class Labels:
     dynamic: NDArray[np.bool_]
     depth: NDArray[np.float32]
     depth_confidence: NDArray[np.float32]
+
+    def arrays(self, depth: bool, dynamic: bool) -> dict[str, NDArray[Any]]:
+        """Under the names that a scene has for them; ``depth``, ``dynamic``: whether these were asked for."""
+        arrays = {"semantics": self.semantics, "sky": self.sky, "semantics_confidence": self.confidence}
+        arrays |= {"depth": self.depth, "depth_confidence": self.depth_confidence} if depth else {}
+        return arrays | ({"dynamic": self.dynamic} if dynamic else {})
 
 
 Labeller = Callable[[LabelInput], Labels]
@@ -115,16 +128,6 @@ class PlacedBox:
         return points_in_box(local, self.track.size_m, GROWTH_M, FLOOR_M)
 
 
-def far_to_near(inputs: LabelInput) -> list[PlacedBox]:
-    """Boxes that have a class and are present, the farthest first."""
-    poses = (track.pose_at(inputs.view.time_s) if track.label in TRAIN_ID_OF else None for track in inputs.tracks)
-    placed = [
-        PlacedBox(n, track, pose) for n, (track, pose) in enumerate(zip(inputs.tracks, poses)) if pose is not None
-    ]
-    here = inputs.view.center_world
-    return sorted(placed, key=lambda box: -float(np.linalg.norm(box.world_from_box[:3, 3] - here)))
-
-
 def box_outline(
     view: View, world_from_box: NDArray[np.float64], size_m: NDArray[np.float64]
 ) -> NDArray[np.bool_] | None:
@@ -144,19 +147,19 @@ def box_outline(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthInput:
-    """Input of a depth network for one image.
-
-    Args:
-        rgb: u8[H, W, 3].
-        measured: f32[H, W] metres, visible LiDAR returns, NaN where there is none.
-        filled: f32[H, W] metres, the returns filled along the image (``core.complete``); NaN where unknown.
-        sky: bool[H, W].
-    """
+    """Input of a depth network for one image: ``rgb`` u8[H, W, 3]; ``measured`` f32[H, W] metres, visible LiDAR
+    returns, NaN where there is none; ``filled`` f32[H, W] metres, these filled along the image
+    (``core.depth.complete_depth``), NaN where unknown; ``sky`` bool[H, W]."""
 
     rgb: NDArray[np.uint8]
     measured: NDArray[np.float32]
     filled: NDArray[np.float32]
     sky: NDArray[np.bool_]
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Pixels bool[H, W] with a return, but those in the sky."""
+        return np.isfinite(self.measured) & ~self.sky
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,9 +197,14 @@ GRASS: Final = 6.0
 def label_by_network(inputs: LabelInput, semantics: Bytes, confidence: Floats) -> Labels:
     """Labels around given classes u8[H, W] and their confidence f32[H, W]: sky from the classes, the rest by rules.
     Works, with less, without LiDAR or boxes."""
-    measured = visible_depth(inputs.view, inputs.xyz_world, HIDING_RULES["sweep"], gap_deg=inputs.beam_gap_deg)
+    measured = inputs.measured()
     sky = (semantics == ID["sky"]) & ~np.isfinite(measured)
-    surface = _complete(inputs, measured, sky)
+    beyond = inputs.beyond(measured)
+    for box in inputs.far_to_near():  # the windows of vehicles return nothing, although they are near
+        outline = box.outline(inputs.view, 0.0)
+        if outline is not None:
+            beyond &= ~outline
+    surface = complete_depth(inputs.rgb, measured, sky, beyond)
     depth, depth_confidence = surface.depth.copy(), surface.confidence.copy()
     depth[sky] = SKY_M
     painted_over = ~sky & (depth == SKY_M)  # a box before the sky that nothing measured
@@ -204,24 +212,15 @@ def label_by_network(inputs: LabelInput, semantics: Bytes, confidence: Floats) -
     return Labels(semantics, confidence, sky, find_dynamic(inputs, semantics, surface), depth, depth_confidence)
 
 
-def _complete(inputs: LabelInput, measured: Floats, sky: Mask) -> DenseDepth:
-    """Dense depth of what is not sky."""
-    beyond = beyond_reach(inputs.view, measured, inputs.highest_rad, gap_deg=inputs.beam_gap_deg)
-    for box in far_to_near(inputs):  # the windows of vehicles return nothing, although they are near
-        outline = box.outline(inputs.view, 0.0)
-        if outline is not None:
-            beyond &= ~outline
-    return complete_depth(inputs.rgb, measured, sky, beyond)
-
-
 def find_dynamic(inputs: LabelInput, semantics: Bytes, surface: DenseDepth) -> Mask:
     """Pixels of dynamic objects, bool[H, W]: the surface lies in their box, or is uncertain and has their class."""
     dynamic, xyz_world = np.zeros(semantics.shape, bool), surface_points(inputs.view, surface.depth)
-    for box in far_to_near(inputs):
+    for box in inputs.far_to_near():
         outline = box.outline(inputs.view) if box.number in inputs.moving else None
         if outline is None:
             continue
-        window = (_span(outline.any(1), 1), _span(outline.any(0), 1))
+        rows, columns = map(np.flatnonzero, (outline.any(1), outline.any(0)))
+        window = tuple(slice(max(0, int(at[0]) - 1), int(at[-1]) + 2) for at in (rows, columns))
         outline = outline[window]
         known = outline & np.isfinite(surface.depth[window])
         inside = np.zeros(outline.shape, bool)
@@ -229,12 +228,6 @@ def find_dynamic(inputs: LabelInput, semantics: Bytes, surface: DenseDepth) -> M
         uncertain = outline & ~(surface.confidence[window] > 0.3)
         dynamic[window] |= inside | (uncertain & (semantics[window] == box.train_id))
     return dynamic
-
-
-def _span(present: Mask, margin: int) -> slice:
-    """From the first to the last true entry, and ``margin`` more on either side."""
-    at = np.flatnonzero(present)
-    return slice(max(0, int(at[0]) - margin), int(at[-1]) + margin + 1)
 
 
 def greenness_of(rgb: Bytes) -> Floats:
@@ -245,16 +238,10 @@ def greenness_of(rgb: Bytes) -> Floats:
 
 
 def find_sky(rgb: Bytes, elevation: Floats, away_px: Floats, gap_px: float) -> Mask:
-    """Sky mask bool[H, W]: above the horizon, without returns, bright or blue, smooth, connected to the top of the
-    image.
-
-    Args:
-        rgb: u8[H, W, 3].
-        elevation: of the rays, radians, f32[H, W].
-        away_px: distance to the nearest LiDAR return f32[H, W].
-        gap_px: sky is found farther from returns than this, and then extended up to them where the image looks the
-            same.
-    """
+    """Sky mask bool[H, W] of an image u8[H, W, 3]: above the horizon (``elevation`` of the rays, radians f32[H, W]),
+    without returns, bright or blue, smooth, connected to the top of the image. Sky is found farther than ``gap_px``
+    from returns (``away_px``: distance to the nearest, f32[H, W]), and then extended up to them where the image looks
+    the same."""
     candidates = (elevation > 0) & (away_px > gap_px)
     if not candidates.any():
         return candidates

@@ -105,7 +105,8 @@ class Segmenter:
         weight = torch.zeros(1, height, width)
         ours = torch.from_numpy(self._train_ids)
         known = ours != UNLABELLED
-        fade = _fade(tile)
+        rows, columns = (1 - torch.linspace(-1, 1, size).abs() * 0.95 for size in tile)
+        fade = rows[:, None] * columns[None]  # the weight of a tile's pixels falls towards its edges
         for first in range(0, len(corners), BATCH):
             chosen = corners[first : first + BATCH]
             tiles = torch.stack([image[:, y : y + tile[0], x : x + tile[1]] for y, x in chosen])
@@ -125,7 +126,7 @@ def match_classes(names: Mapping[str, str], where: str) -> NDArray[np.intp]:
     wanted = {name.replace(" ", "").lower(): index for index, name in enumerate(CLASSES)}
     ordered = [names[key] for key in sorted(names, key=int)]
     found = [wanted.get(str(name).replace(" ", "").replace("_", "").lower(), UNLABELLED) for name in ordered]
-    if not any(index != UNLABELLED for index in found):
+    if set(found) <= {UNLABELLED}:
         expected, got = ", ".join(CLASSES), ", ".join(map(str, ordered[:8])) or "no id2label"
         raise InputError("none of the network's classes is a Cityscapes class", where=where, expected=expected, got=got)
     return np.array(found, np.intp)
@@ -137,9 +138,3 @@ def tile_starts(length: int, tile: int) -> list[int]:
         return [0]
     count = 1 + int(np.ceil((length - tile) / (tile * (1 - OVERLAP))))
     return [round(at) for at in np.linspace(0, length - tile, count)]
-
-
-def _fade(tile: tuple[int, int]) -> Tensor:
-    """Weight of a tile's pixels [H, W], falling towards its edges."""
-    ramps = [1 - (torch.linspace(-1, 1, size).abs() * 0.95) for size in tile]
-    return ramps[0][:, None] * ramps[1][None]

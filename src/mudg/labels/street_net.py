@@ -57,14 +57,9 @@ Positive = Annotated[float, Field(gt=0, lt=1e5)]
 
 @dataclass(frozen=True, config=STRICT)
 class StreetNetConfig:
-    """Shape of the network, the largest focal length it was trained at, and what its scores are divided by.
-
-    Args:
-        widths: channels at strides 2, 4, 8, 16 and 32.
-        blocks: residual blocks there, on the way down.
-        focal_px: images of a longer focal length are made smaller first.
-        temperature: scores are divided by this, so that probabilities tell how often the class is right.
-    """
+    """Shape of the network: channels at strides 2, 4, 8, 16 and 32, and residual blocks there, on the way down; the
+    largest focal length it was trained at (images of a longer one are made smaller first); and what scores are divided
+    by, so that probabilities tell how often the class is right."""
 
     widths: tuple[Width, Width, Width, Width, Width] = (32, 64, 96, 144, 144)
     blocks: tuple[BlockCount, BlockCount, BlockCount, BlockCount, BlockCount] = (1, 2, 2, 2, 1)
@@ -231,13 +226,11 @@ def reduced(inputs: LabelInput, focal_px: float) -> LabelInput:
 
 
 def settled(probabilities: NDArray[np.float32], evidence: Evidence, boxes_known: bool = False) -> NDArray[np.float32]:
-    """Probabilities f32[19, H, W], with sum 1, without the classes that the evidence rules out.
-
-    No sky at returns and below the horizon; no road high above the ground; the ground that was driven on is road; where
-    the surface lies in a box, no classes but those of the box; where it lies beside or behind a box of a person or a
-    bicycle, no such class. Ground that the path reaches directly is road rather than sidewalk; where the log has boxes
-    (``boxes_known``), there is hardly anything outside them that boxes are drawn around.
-    """
+    """Probabilities f32[19, H, W], with sum 1, without the classes that the evidence rules out. No sky at returns and
+    below the horizon; no road high above the ground; the ground that was driven on is road; where the surface lies in a
+    box, no classes but those of the box; where it lies beside or behind a box of a person or a bicycle, no such class.
+    Ground that the path reaches directly is road rather than sidewalk; where the log has boxes (``boxes_known``), there
+    is hardly anything outside them that boxes are drawn around."""
     found = probabilities.copy()
     found[ID["sky"], (evidence.away_deg < RETURN_DEG) | (evidence.elevation_rad < BELOW_RAD)] *= _SMALL
     near = evidence.away_deg < 1
@@ -267,12 +260,8 @@ def settled_by_color(
     probabilities: NDArray[np.float32], rgb: NDArray[np.uint8], evidence: Evidence
 ) -> NDArray[np.float32]:
     """Probabilities f32[19, H, W], with sum 1, without the classes that the colours of the image u8[H, W, 3]
-    contradict.
-
-    Hardly any sky where the image does not look like it (``find_sky``: bright or blue, smooth), unless
-    nothing in it does, as at night. Ground that the path reaches directly and that is not green is road rather than
-    terrain.
-    """
+    contradict. Hardly any sky where the image does not look like it (``find_sky``), unless nothing in it does, as at
+    night. Ground that the path reaches directly and that is not green is road rather than terrain."""
     found = probabilities.copy()
     px_per_deg = 1 / max(1e-6, float(np.rad2deg(np.abs(np.diff(evidence.elevation_rad, axis=0)).max(initial=0))))
     away_px = np.where(np.isfinite(evidence.depth_m), evidence.away_deg * px_per_deg, np.inf).astype(np.float32)

@@ -228,14 +228,10 @@ def _check_ego(scene: Scene) -> Findings:
 
 def check_distance(scene: Scene) -> Findings:
     """Whether float32 numbers hold the places of a scene: vehicle, cameras, sensors, and boxes."""
-    places = np.concatenate(
-        [
-            scene.ego.world_from_ego[:, :3, 3],
-            *(frame.view.center_world[None] for frame in scene.frames),
-            *(sweep.world_from_lidar[None, :3, 3] for sweep in scene.sweeps),
-            *(track.world_from_object[:, :3, 3] for track in scene.tracks),
-        ]
-    )
+    paths = [scene.ego.world_from_ego, *(track.world_from_object for track in scene.tracks)]
+    paths += [frame.view.world_from_cam[None] for frame in scene.frames]
+    paths += [sweep.world_from_lidar[None] for sweep in scene.sweeps]
+    places = np.concatenate(paths)[:, :3, 3]
     spacing_m = float32_spacing_m(places)
     if spacing_m > FLOAT32_SPACING_M:
         reach = f"the log reaches {np.linalg.norm(places, axis=1).max():.0f} m from the origin"
@@ -267,8 +263,7 @@ def _check_keys(
         turn = f"{np.rad2deg(angle[key]):.0f} degrees within {times_s[key + 1] - times_s[key]:.2f} s"
         at = f"after {times_s[key]:.3f} s (key {key}; {len(fast)} such turns)"
         yield _warning(where, f"it turns by {turn} {at}; check headings and times")
-    jumps = motion.jumps(times_s, poses, _TRACK_JUMP_M if of_box else _JUMP_M)
-    if jumps:
+    if jumps := motion.jumps(times_s, poses, _TRACK_JUMP_M if of_box else _JUMP_M):
         key, off_m, acceleration = jumps[0]
         at = f"after {times_s[key]:.3f} s (key {key}, {acceleration:.0f} m/s^2; {len(jumps)} such steps)"
         yield _warning(where, f"it jumps by {off_m:.1f} m {at}; check poses, times and ids")
@@ -346,8 +341,7 @@ def _check_relations(scene: Scene) -> Findings:
     sweep_times = np.array([sweep.time_s for sweep in scene.sweeps])
     frame_times = np.array([frame.view.time_s for frame in scene.frames])
     if len(sweep_times):
-        alone = [f.id for f in scene.frames if np.abs(sweep_times - f.view.time_s).min() > SAME_MOMENT_S]
-        if alone:
+        if alone := [f.id for f in scene.frames if np.abs(sweep_times - f.view.time_s).min() > SAME_MOMENT_S]:
             message = f"{len(alone)} frames have no sweep within {SAME_MOMENT_S} s and colour no points"
             yield _note(f"frame {alone[0]}", message)
     if "test" not in scene.split.values():
@@ -356,8 +350,7 @@ def _check_relations(scene: Scene) -> Findings:
         yield Finding("error", "split", "no frame is left for training")
     if len(frame_times):
         first_s, last_s = frame_times.min() - 1e-6, frame_times.max() + 1e-6
-        outside = [track.id for track in scene.tracks if track.times_s[0] > last_s or track.times_s[-1] < first_s]
-        if outside:
+        if outside := [t.id for t in scene.tracks if t.times_s[0] > last_s or t.times_s[-1] < first_s]:
             lie = f"{len(outside)} tracks lie outside the time of the frames (first: {outside[0]})"
             yield _warning("tracks", f"{lie}; are the clocks the same?")
 
@@ -374,8 +367,7 @@ def check_points(scene: Scene, sweep: Sweep, points: SweepPoints) -> Findings:
     if len(points.xyz) == 0:
         yield _warning(where, "it has no points")
         return
-    zeros = int(at_sensor(points, sweep.time_s, sweep.world_from_lidar, scene.ego).sum())
-    if zeros:
+    if zeros := int(at_sensor(points, sweep.time_s, sweep.world_from_lidar, scene.ego).sum()):
         near = f"{zeros} of {len(points.xyz)} points lie within {LEAST_RANGE_M:g} m of the LiDAR"
         yield _warning(where, f"{near}: beams without a return? leave them out, or ingest the log again")
     ranges = np.linalg.norm(points.xyz, axis=1)

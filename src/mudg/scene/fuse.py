@@ -17,7 +17,7 @@ from mudg.base import log, store
 from mudg.base.errors import InputError
 from mudg.base.geometry import transform_points
 from mudg.base.run_folder import RunDir
-from mudg.base.types import SAME_COLORS, CameraColors, FusedCloud, Photo, Scene
+from mudg.base.types import SAME_COLORS, CameraColors, Frame, FusedCloud, Photo, Scene
 from mudg.core.calibration import match_cameras
 from mudg.core.fusion import (
     STATIC,
@@ -73,8 +73,8 @@ def refuse_without_lidar(scene: Scene) -> None:
 def fuse_scene(scene: Scene, config: FuseConfig) -> tuple[FusedCloud, FusionReport]:
     """The clouds of a scene, and what happened."""
     rules = rules_of(config)
-    cameras = camera_colors(scene, config, rules) if config.match_colors else SAME_COLORS
-    return fuse_sweeps(scene_sweeps(scene, config), scene.tracks, rules, cameras)
+    cameras = camera_colors(scene, rules) if config.match_colors else SAME_COLORS
+    return fuse_sweeps(scene_sweeps(scene), scene.tracks, rules, cameras)
 
 
 def fused_without_boxes(scene: Scene, folder: Path) -> FusedCloud:
@@ -92,23 +92,27 @@ def rules_of(config: FuseConfig) -> FusionRules:
     return FusionRules(**{name: value for name, value in configuration.to_dict(config).items() if name in names})
 
 
-def scene_sweeps(scene: Scene, config: FuseConfig) -> Iterator[SweepShots]:
-    """The sweeps of a scene, one at a time, each with the images that may colour it."""
+def _seen_by(scene: Scene) -> dict[str, list[Frame]]:
+    """Frames that may give colours, by the cameras that have some."""
     frames = scene.frames_in("train")
-    by_camera = {name: [f for f in frames if f.view.camera.name == name] for name in scene.cameras}
+    return {name: own for name in scene.cameras if (own := [f for f in frames if f.view.camera.name == name])}
+
+
+def scene_sweeps(scene: Scene) -> Iterator[SweepShots]:
+    """The sweeps of a scene, one at a time, each with the images that may colour it."""
+    by_camera = _seen_by(scene)
     for sweep in log.progress(scene.sweeps, len(scene.sweeps), "fusing sweeps"):
         gap = lambda frame, time_s=sweep.time_s: abs(frame.view.time_s - time_s)
-        chosen = [frame for own in by_camera.values() if own and gap(frame := min(own, key=gap)) <= MOST_IMAGE_GAP_S]
+        chosen = [frame for own in by_camera.values() if gap(frame := min(own, key=gap)) <= MOST_IMAGE_GAP_S]
         labels = [read_label(scene, f, "semantics") if "semantics" in f.labels else None for f in chosen]
         shots = [Photo(f.view, read_image(scene, f), ids) for f, ids in zip(chosen, labels, strict=True)]
         yield SweepShots(sweep.time_s, sweep.world_from_lidar, read_points(scene, sweep), shots)
 
 
-def camera_colors(scene: Scene, config: FuseConfig, rules: FusionRules) -> CameraColors:
+def camera_colors(scene: Scene, rules: FusionRules) -> CameraColors:
     """How the colours of the scene's cameras differ, from static points of some sweeps in images of about the same
     time."""
-    frames = scene.frames_in("train")
-    by_camera = {name: found for name in scene.cameras if (found := [f for f in frames if f.view.camera.name == name])}
+    by_camera = _seen_by(scene)
     if len(by_camera) < 2 or not scene.sweeps:
         return SAME_COLORS
     dynamic = [track for track in scene.tracks if judge_track(track, rules).moving]

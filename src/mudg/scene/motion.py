@@ -189,20 +189,14 @@ def jumps(times_s: Times, poses: Matrix, least_m: float) -> list[tuple[int, floa
 
 # the recorded path as a road -----------------------------------------------------------------------
 
-Matrix = NDArray[np.float64]
 LEAST_STEP_M: Final = 0.2
 """Recorded poses nearer to the last one than this add nothing to a road."""
 
 
 class Road:
-    """The path that was recorded, by arc length; height and tilt of the ground beside it are those of the path.
-
-    Args:
-        poses: world-from-vehicle f64[N, 4, 4] along it. Beyond its ends the road goes straight on.
-
-    Raises:
-        InputError: the poses do not move by a metre.
-    """
+    """The path that was recorded (``poses``: world-from-vehicle f64[N, 4, 4]), by arc length; height and tilt of the
+    ground beside it are those of the path. Beyond its ends the road goes straight on. InputError: the poses do not move
+    by a metre."""
 
     def __init__(self, poses: Matrix) -> None:
         chosen = [0]

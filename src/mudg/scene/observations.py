@@ -31,12 +31,8 @@ from mudg.scene.schema import camera_to_json, parse_camera
 
 _INDEX = "observations.json"
 _SCHEMA = 2
-_TYPES = {
-    "confidence": np.dtype(np.float16),
-    "mask": np.dtype(np.uint8),
-    "depth": np.dtype(np.float32),
-    "semantics": np.dtype(np.uint8),
-}
+_NAMES = ("confidence", "mask", "depth", "semantics")
+_TYPES = {name: np.dtype(kind) for name, kind in zip(_NAMES, ("f2", "u1", "f4", "u1"), strict=True)}
 _HEADER_BYTES = 4096
 """More than the header of an array takes."""
 

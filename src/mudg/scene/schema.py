@@ -117,8 +117,7 @@ def sixteen_numbers(value: Any) -> list[Any]:
 
 
 def _known_labels(value: Any) -> Any:
-    if isinstance(value, dict):
-        refuse_unknown(value, LABEL_NAMES)
+    refuse_unknown(value if isinstance(value, dict) else (), LABEL_NAMES)
     return value
 
 

@@ -40,7 +40,7 @@ from mudg.scene.observations import ObservationWriter
 from mudg.scene.read import read_scene
 from mudg.scoring import tables as score_tables
 from mudg.scoring import truth as scored_truth
-from mudg.scoring.sets import BASELINE, anchors_of, set_scores_of
+from mudg.scoring.sets import BASELINE, SetScores, anchors_of
 from mudg.scoring.sweeps import sweep_scores
 from mudg.scoring.truth import Baseline, PairDistance, Reference, ScoredTrajectory, ViewTruth
 
@@ -70,17 +70,10 @@ def write_scores(
     drawing the truth again. InputError: nothing to score, or methods disagree about a trajectory's views."""
     recorded, out = read_scene(scene), work.path
     trajectories = scored_truth.trajectories_of(config, recorded, methods)
-    reference = Reference(
-        truth=scored_truth.truth_of(recorded) if truth is None else scored_truth.stored_truth(truth),
-        baseline=baseline_of(recorded, read_fused(fused)) if fused is not None and config.baseline else None,
-        held_out=frozenset(f.id for f in recorded.frames_in("test") or recorded.frames),
-        error_pictures=config.error_pictures,
-        distances=_distances(config),
-        distance_views=config.perceptual_views,
-        facts=scored_truth.FactMaker(recorded),
-        vehicles=scored_truth.vehicles_of(recorded),
-    )
-    sets = set_scores_of(config, recorded, out)  # before the work: the weights may be unusable
+    true = scored_truth.truth_of(recorded) if truth is None else scored_truth.stored_truth(truth)
+    baseline = baseline_of(recorded, read_fused(fused)) if fused is not None and config.baseline else None
+    reference = Reference(config, recorded, true, baseline, _distances(config))
+    sets = SetScores(config, recorded, out)  # before the work: the weights may be unusable
     results: list[dict[str, Any]] = []
     with log.task("score", sum(len(trajectory.views) for trajectory in trajectories)) as bar:
         for trajectory in trajectories:
@@ -108,16 +101,14 @@ def write_scores(
 def _distances(config: ScoreConfig) -> dict[str, PairDistance]:
     """The rows that need weights and have them."""
     found: dict[str, PairDistance] = {}
-    if not (config.perceptual_views or any(getattr(config, flag) for flag in LPIPS_FILES)):
-        return found
-    device = choose_device(config.device, "networks of the scores")
+    files = {flag: weights for flag in LPIPS_FILES if (weights := getattr(config, flag))}
+    device = choose_device(config.device, "networks of the scores") if files or config.perceptual_views else None
     if config.perceptual_views:
         found["perceptual"] = PerceptualDistance(CodecFeatures(mdm_files.load("embedded").codec), device=device)
-    for flag, (row, trunk) in LPIPS_FILES.items():
-        if getattr(config, flag):
-            weights = getattr(config, flag)
-            network = LpipsFeatures(read_checkpoint(Path(weights)), weights, trunk, config.lpips_input)
-            found[row] = PerceptualDistance(network, network.channel_weights, device)
+    for flag, weights in files.items():
+        row, trunk = LPIPS_FILES[flag]
+        network = LpipsFeatures(read_checkpoint(Path(weights)), weights, trunk, config.lpips_input)
+        found[row] = PerceptualDistance(network, network.channel_weights, device)
     return found
 
 
@@ -170,7 +161,7 @@ def _score(
 ) -> list[dict[str, Any]]:
     """Score all methods on one trajectory; writes its truth, its baseline and its error picture."""
     names = [*([BASELINE] if reference.baseline is not None else []), *trajectory.sets]
-    motion, exact_motion = metrics.ExactMotion(), metrics.ExactMotion(reference.vehicles)
+    motion, exact_motion = metrics.ExactMotion(), metrics.ExactMotion(reference.facts.vehicles)
     build = lambda: metrics.build_all(reference.distances, motion, metrics.build_facts(exact_motion))
     sums = {name: build() for name in names} | {TRUTH: metrics.build_facts(exact_motion)}
     counted = reference.counted(trajectory)

@@ -167,11 +167,8 @@ class TrajectorySets:
             return ImageSet(len(counted), lambda number: views.rgb_u8(indices[counted[number]]))
 
         def true_image(number: int) -> NDArray[np.uint8]:
-            place = counted[number]
-            true = reference.truth.at_view(trajectory.views[place], trajectory.frames[place], trajectory.name)
-            if true is None:
-                raise InputError("a view has no ground truth", where=f"{trajectory.name}, view {place}")
-            return to_bytes(true.seen.rgb)
+            view, frame = trajectory.views[counted[number]], trajectory.frames[counted[number]]
+            return to_bytes(reference.truth.at_view(view, frame, trajectory.name).seen.rgb)
 
         methods = {name: chosen(found, trajectory.indices[name]) for name, found in trajectory.sets.items()}
         every = range(len(trajectory.views))
@@ -406,14 +403,25 @@ BASELINE: Final = "nearest_fill"
 Scored = Sequence[dict[str, Any]]
 
 
-@dataclass(frozen=True)
 class SetScores:
     """What is computed of whole sets, as far as its weights or files were given. ``comparisons``: entry of metrics.json
     -> what compares images or clips. ``detected``: metric -> entry of a result, and what holds detections against the
-    truth."""
+    truth. InputError: a file is missing, damaged, or holds another network, or the log has no lane lines."""
 
-    comparisons: Mapping[str, SetComparison]
-    detected: Mapping[str, tuple[str, BoxDetections | LaneDetections]]
+    def __init__(self, config: ScoreConfig, scene: Scene, out: Path) -> None:
+        self.comparisons, folder = dict[str, SetComparison](), out / FEATURES_FOLDER
+        fid, fvd = config.fid_weights, config.fvd_weights
+        device = choose_device(config.device, "networks of the scores") if fid or fvd else torch.device("cpu")
+        if fid:
+            files = FeatureFiles(Path(fid), config.fid_resize, folder, device)
+            self.comparisons["distributions"] = distributions(scene, files)
+        if fvd:
+            self.comparisons["videos"] = videos(scene, ClipFiles(Path(fvd), config.fvd_resize, folder, device))
+        self.detected: dict[str, tuple[str, BoxDetections | LaneDetections]] = {}
+        if config.detections:
+            self.detected["nta_iou"] = ("nta", BoxDetections(scene, Path(config.detections)))
+        if config.lanes:
+            self.detected["ntl_iou"] = ("ntl", LaneDetections(scene, Path(config.lanes)))
 
     def add_to(
         self, results: Scored, trajectories: Sequence[ScoredTrajectory], reference: Reference, out: Path
@@ -440,8 +448,30 @@ class SetScores:
                 else:
                     row["values"] |= of["values"]
                     row[entry] = {name: value for name, value in of.items() if name != "values"}
+        if self.detected:
+            self._add_detected(trajectory, rows, reference, counted)
+
+    def _add_detected(
+        self, trajectory: ScoredTrajectory, rows: Scored, reference: Reference, counted: Sequence[int]
+    ) -> None:
+        """NTA-IoU and NTL-IoU, with their anchors."""
+        views, frames = tuple(trajectory.views[n] for n in counted), reference.facts.frames_of(trajectory.camera)
+        recorded = f"{detections.RECORDED}/{trajectory.camera}"
+        there = {
+            "truth": ViewImages(f"{detections.TRUTH}/{trajectory.name}", tuple(counted), views),
+            "recorded": ViewImages(recorded, tuple(range(len(frames))), tuple(frame.view for frame in frames)),
+        }
         for metric, (entry, source) in self.detected.items():
-            _add_detected(rows, metric, entry, source, trajectory, counted, reference)
+            found = ((name, source.of(images)) for name, images in there.items())
+            beside = {name: of["value"] for name, of in found if not isinstance(of, str)}
+            for row in rows:
+                indices = trajectory.indices.get(row["method"], tuple(range(len(trajectory.views))))
+                images = ViewImages(f"{row['method']}/{trajectory.name}", tuple(indices[n] for n in counted), views)
+                row.setdefault("anchors", {})[metric] = beside
+                row["values"][metric] = value = source.of(images)
+                if not isinstance(value, str):
+                    row["values"][metric] = value.pop("value")
+                    row[entry] = value
 
     def records(self) -> dict[str, Any]:
         """How the numbers were made, by entry of metrics.json."""
@@ -449,25 +479,6 @@ class SetScores:
         if self.detected:
             found["detections"] = {metric: source.record() for metric, (_, source) in self.detected.items()}
         return found
-
-
-def set_scores_of(config: ScoreConfig, scene: Scene, out: Path) -> SetScores:
-    """What the given weights and files allow to compute. InputError: a file is missing, damaged, or holds another
-    network, or the log has no lane lines."""
-    comparisons: dict[str, SetComparison] = {}
-    folder, fid, fvd = out / FEATURES_FOLDER, config.fid_weights, config.fvd_weights
-    device = choose_device(config.device, "networks of the scores") if fid or fvd else torch.device("cpu")
-    if fid:
-        files = FeatureFiles(Path(fid), config.fid_resize, folder, device)
-        comparisons["distributions"] = distributions(scene, files)
-    if fvd:
-        comparisons["videos"] = videos(scene, ClipFiles(Path(fvd), config.fvd_resize, folder, device))
-    detected: dict[str, tuple[str, BoxDetections | LaneDetections]] = {}
-    if config.detections:
-        detected["nta_iou"] = ("nta", BoxDetections(scene, Path(config.detections)))
-    if config.lanes:
-        detected["ntl_iou"] = ("ntl", LaneDetections(scene, Path(config.lanes)))
-    return SetScores(comparisons, detected)
 
 
 def anchors_of(results: Scored, trajectories: Sequence[ScoredTrajectory]) -> list[dict[str, Any]]:
@@ -489,31 +500,3 @@ def anchors_of(results: Scored, trajectories: Sequence[ScoredTrajectory]) -> lis
                         own[BASELINE] = row["values"][name]
         found += [{"trajectory": trajectory.name, "metric": name, **own} for name, own in sorted(anchors.items())]
     return found
-
-
-def _add_detected(
-    rows: Scored,
-    metric: str,
-    entry: str,
-    source: BoxDetections | LaneDetections,
-    trajectory: ScoredTrajectory,
-    counted: Sequence[int],
-    reference: Reference,
-) -> None:
-    """NTA-IoU or NTL-IoU into the results of one trajectory, with its anchors."""
-    views = tuple(trajectory.views[n] for n in counted)
-    frames = reference.facts.frames_of(trajectory.camera)
-    recorded = f"{detections.RECORDED}/{trajectory.camera}"
-    there = {
-        "truth": ViewImages(f"{detections.TRUTH}/{trajectory.name}", tuple(counted), views),
-        "recorded": ViewImages(recorded, tuple(range(len(frames))), tuple(frame.view for frame in frames)),
-    }
-    beside = {name: value["value"] for name, images in there.items() if not isinstance(value := source.of(images), str)}
-    for row in rows:
-        indices = trajectory.indices.get(row["method"], tuple(range(len(trajectory.views))))
-        images = ViewImages(f"{row['method']}/{trajectory.name}", tuple(indices[n] for n in counted), views)
-        row.setdefault("anchors", {})[metric] = beside
-        row["values"][metric] = value = source.of(images)
-        if not isinstance(value, str):
-            row["values"][metric] = value.pop("value")
-            row[entry] = value

@@ -111,9 +111,6 @@ def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path) -> N
             with ObservationWriter(out / path.name, path.name, "truth", "recorded") as writer:
                 for view in path.views:
                     true = truth.at_view(view, None, path.name)
-                    if true is None or true.moving is None or true.instance is None or true.marking is None:
-                        where = f"{path.name}, {view.time_s:g} s"
-                        raise InputError("the city has no ground truth at this view", where=where)
                     own = (true.moving[0].numpy().astype(np.uint8), true.instance, true.marking.astype(np.uint8))
                     for found, value in zip(maps.values(), own, strict=True):
                         found.append(value)
@@ -207,9 +204,10 @@ class LogPoints:
         near = [nearest_sweeps(sweeps, time_s, 1) for sweeps in self._sensors.values()]
         return self._merged([s for found in near for s in found if abs(s.time_s - time_s) <= SAME_SWEEP_S])
 
-    def around(self, time_s: float, count: int = MERGED_SWEEPS) -> OwnedPoints | None:
-        """Points of the ``count`` sweeps of each LiDAR that are nearest in time, or None where none is near."""
-        return self._merged([s for sweeps in self._sensors.values() for s in nearest_sweeps(sweeps, time_s, count)])
+    def around(self, time_s: float) -> OwnedPoints | None:
+        """Points of the sweeps of each LiDAR that are nearest in time, or None where none is near."""
+        every = (nearest_sweeps(sweeps, time_s, MERGED_SWEEPS) for sweeps in self._sensors.values())
+        return self._merged([sweep for sweeps in every for sweep in sweeps])
 
     def placed(self, points: OwnedPoints, time_s: float) -> NDArray[np.float32]:
         """Where points are at a moment, f32[N, 3] in the world; NaN where their object has no box then."""
@@ -286,7 +284,7 @@ class FactMaker:
     """Makes the facts of views; threads may call."""
 
     def __init__(self, scene: Scene) -> None:
-        self._scene, self._points, self._vehicles = scene, LogPoints(scene), vehicles_of(scene)
+        self._scene, self._points, self.vehicles = scene, LogPoints(scene), vehicles_of(scene)
         self._path = driven_path(scene.ego.world_from_ego)
 
     def of(self, view: View, truth: ViewTruth | None) -> ViewFacts:
@@ -295,7 +293,7 @@ class FactMaker:
         frame = next(near, None)  # what the view's camera recorded at its time
         points = self._points.truth_at(view, frame)
         if truth is not None and truth.instance is not None:
-            agents, seen, lanes = visible_agents(view, self._vehicles, truth.instance), truth.seen, None
+            agents, seen, lanes = visible_agents(view, self.vehicles, truth.instance), truth.seen, None
             if truth.marking is not None and seen.semantics is not None and seen.depth is not None:
                 depth = seen.depth[0].numpy()
                 road = (seen.semantics.numpy() == palette.ID["road"]) & (depth > 0) & (depth < street_scores.LANE_FAR_M)
@@ -383,21 +381,23 @@ class ScoredTrajectory:
         return {**names, **sizes, "methods": list(self.sets), "indices": indices}
 
 
-@dataclass(frozen=True)
 class Reference:
-    """What every method is compared with, and how. ``truth``, ``baseline``: of any view. ``held_out``: ids of the
-    recorded frames that count. ``distances``: what computes the rows of the table that need weights, at
-    ``distance_views`` views of a trajectory (0 = all). ``facts``: makes what is known of views beside their true image.
-    ``vehicles``: numbers in instance maps, and their tracks."""
+    """What every method is compared with, and how. ``truth``, ``baseline``: of any view. ``distances``: what computes
+    the rows of the table that need weights, at ``distance_views`` views of a trajectory (0 = all). ``held_out``: ids of
+    the recorded frames that count. ``facts``: makes what is known of views beside their true image."""
 
-    truth: Truth
-    baseline: Baseline | None
-    held_out: frozenset[str]
-    error_pictures: bool
-    distances: Mapping[str, PairDistance]
-    distance_views: int
-    facts: FactMaker
-    vehicles: tuple[tuple[int, Track], ...]
+    def __init__(
+        self,
+        config: ScoreConfig,
+        scene: Scene,
+        truth: Truth,
+        baseline: Baseline | None,
+        distances: Mapping[str, PairDistance],
+    ) -> None:
+        self.truth, self.baseline, self.distances = truth, baseline, distances
+        self.error_pictures, self.distance_views = config.error_pictures, config.perceptual_views
+        self.held_out = frozenset(frame.id for frame in scene.frames_in("test") or scene.frames)
+        self.facts = FactMaker(scene)
 
     def counted(self, trajectory: ScoredTrajectory) -> list[int]:
         """The views that count. Recorded training frames were seen by the fit and do not; views off the path never

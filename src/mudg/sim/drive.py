@@ -5,7 +5,7 @@ the middle of the rear axle."""
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
@@ -220,14 +220,13 @@ class Drive:
 
     def boxes(self) -> dict[str, Box]:
         """The other road users that are there."""
-        return dict(self._boxes())
-
-    def _boxes(self) -> Iterator[tuple[str, Box]]:
+        found = {}
         for name, actor in self.actors.items():
             follower = self._follower(name, actor)
             box = actor.box_at(self.time_s) if follower is None else follower.box()
             if box is not None:
-                yield name, box
+                found[name] = box
+        return found
 
     def _follower(self, name: str, actor: RoadUser) -> Follower | None:
         """A road user that drives by itself, from when its track begins."""
@@ -248,7 +247,7 @@ class Drive:
         if not (math.isfinite(controls.acceleration_mps2) and math.isfinite(controls.steer_rate_radps)):
             raise UsageError("controls are not finite", where="action", got=str(controls))
         bodies = {"": (self.car.box(self.pose), self.motion.speed_mps)}
-        for name, box in self._boxes():
+        for name, box in self.boxes().items():
             follower = self._followers.get(name)
             speed = self.actors[name].speed_at(self.time_s) if follower is None else follower.speed_mps
             bodies[name] = (box, speed)
@@ -260,7 +259,7 @@ class Drive:
     def collision(self) -> str:
         """Name of the object that the vehicle overlaps, ``SURROUNDINGS``, or empty."""
         body = self.car.box(self.pose)
-        for name, box in self._boxes():
+        for name, box in self.boxes().items():
             if body.meets(box):
                 return name
         x, y, z = geometry.transform_points(geometry.invert(self.pose), self.solid).T

@@ -69,8 +69,7 @@ class Env(gym.Env[Observation, NDArray[np.float32]]):
         largest_shift_m: float = 6.0,
         render_mode: str | None = "rgb_array",
     ) -> None:
-        unknown = [layer for layer in layers if layer not in LIMITS]
-        if unknown:
+        if unknown := [layer for layer in layers if layer not in LIMITS]:
             raise UsageError("no such layer", where="layers", expected=", ".join(LIMITS), got=", ".join(unknown))
         if not (math.isfinite(step_s) and step_s > 0):
             raise UsageError("a step takes a positive time", where="step_s", got=str(step_s))
@@ -98,8 +97,7 @@ class Env(gym.Env[Observation, NDArray[np.float32]]):
         """Begin a drive. ``options``: ``time_s`` where in the log it begins, ``shift_m`` how far to the left of the
         path. Nothing is drawn at random. UsageError: an unknown option, or a time outside the log."""
         super().reset(seed=seed)
-        unknown = sorted(set(options or {}) - {"time_s", "shift_m"})
-        if unknown:
+        if unknown := sorted(set(options or {}) - {"time_s", "shift_m"}):
             raise UsageError("no such option", where="options", expected="time_s, shift_m", got=", ".join(unknown))
         self.drive = self.cockpit.drive(**dict(options or {}), traffic=self.traffic)
         return self._look(self.drive)

@@ -211,19 +211,12 @@ def _sweep(session: Session, request: LidarRequest) -> LidarReply:
         kept, points, intensity, fog = kept[rows], changed.xyz, changed.intensity, kind == SOFT
         classes = hits.classes[kept] if changed.classes is None else changed.classes
     share = beams.share[kept]
-    return LidarReply(
-        kept,
-        np.linalg.norm(points, axis=1),
-        points if request.end is None else _carried(points, share, start, end),
-        ((share - 1) * (end.time_s - start.time_s)).astype(np.float32),
-        intensity,
-        beams.ring[kept],
-        classes,
-        np.where(fog, 0, hits.instances[kept]).astype(np.uint16),
-        tuple(sorted(session.sizes_m())),
-        np.where(within, hits.distance, np.nan).astype(np.float32),
-        hits.facing,
-    )
+    xyz = points if request.end is None else _carried(points, share, start, end)
+    dt_s = ((share - 1) * (end.time_s - start.time_s)).astype(np.float32)
+    instances = np.where(fog, 0, hits.instances[kept]).astype(np.uint16)
+    returned = (kept, np.linalg.norm(points, axis=1), xyz, dt_s, intensity, beams.ring[kept], classes, instances)
+    surface_m = np.where(within, hits.distance, np.nan).astype(np.float32)
+    return LidarReply(*returned, tuple(sorted(session.sizes_m())), surface_m, hits.facing)
 
 
 class Hits:
@@ -242,13 +235,13 @@ def _draw(session: Session, moment: Instant, rays: Floats, own: NDArray[np.int64
     """Draw a slice of a sweep; ``rays`` f64[n, 3] in camera axes."""
     world_from_camera = moment.world_from_sensor @ geometry.from_rotation_translation(AXES, (0.0, 0.0, 0.0))
     for face in faces_of(rays, focal_px):
-        planes = session.pinhole(face.view(world_from_camera, moment.time_s), moment, instances=True)
+        seen, instances = session.pinhole(face.view(world_from_camera, moment.time_s), moment, instances=True)
         target = own[face.pixels]
-        hits.distance[target], hits.facing[target] = face.surface(planes.seen.depth.numpy())
+        hits.distance[target], hits.facing[target] = face.surface(seen.depth.numpy())
         hits.intensity[target] = 0.5 * hits.facing[target]
-        hits.classes[target] = nearest(planes.seen.semantics.numpy(), face.uv)
-        if planes.instances is not None:
-            hits.instances[target] = nearest(planes.instances, face.uv)
+        hits.classes[target] = nearest(seen.semantics.numpy(), face.uv)
+        if instances is not None:
+            hits.instances[target] = nearest(instances, face.uv)
 
 
 def _meet(

@@ -71,6 +71,11 @@ class Pilot(Protocol):
         ...
 
 
+def stations_of(sight: DriverView) -> Matrix:
+    """Arc lengths f64[N] of the points of the route."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(sight.route[:, :2], axis=0), axis=1))])
+
+
 def pursue(target: Matrix, sight: DriverView, car: Car) -> float:
     """Steering rate of pure pursuit (Coulter 1992): the circle through the rear axle and a target f64[2] ahead."""
     x, y = target
@@ -93,14 +98,10 @@ class RoutePilot:
         """See ``Pilot``."""
         return Controls(self.accelerate(sight), pursue(self.target(sight), sight, self.car))
 
-    def lookahead_m(self, sight: DriverView) -> float:
-        """How far ahead it aims."""
-        return max(LEAST_LOOKAHEAD_M, sight.speed_mps)
-
     def target(self, sight: DriverView) -> Matrix:
         """Where it aims f64[2]."""
-        arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(sight.route[:, :2], axis=0), axis=1))])
-        reach = self.lookahead_m(sight) + np.array([0.0, 1.0])
+        arc = stations_of(sight)
+        reach = max(LEAST_LOOKAHEAD_M, sight.speed_mps) + np.array([0.0, 1.0])
         aim, beyond = np.stack([np.interp(reach, arc, sight.route[:, axis]) for axis in (0, 1)], 1)
         along = (beyond - aim) / max(float(np.linalg.norm(beyond - aim)), 1e-9)
         return aim + self.aim_m(sight) * np.array([-along[1], along[0]])
@@ -142,9 +143,7 @@ class EdgePilot(RoutePilot):
     def edge_m(self, sight: DriverView, side: float) -> float:
         """How far the road reaches to the left (``side`` 1) or right (-1) of the route, at its narrowest ahead; 0
         where none is seen."""
-        route = sight.route[:, :2]
-        steps = np.linalg.norm(np.diff(route, axis=0), axis=1)
-        stations = np.concatenate([[0.0], np.cumsum(steps)])
+        route, stations = sight.route[:, :2], stations_of(sight)
         ahead = np.gradient(route, axis=0)
         ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
         points = sight.points((ID["road"],))[:, :2]
@@ -209,9 +208,8 @@ class Policy:
         shown = wire.available_camera(camera, mount)
         shown.logical_id = shown.intrinsics.logical_id = name
         vehicle = types.RolloutSpec(vehicle=types.VehicleDefinition(available_cameras=[shown]))
-        request = types.DriveSessionRequest(
-            session_uuid=self._id, random_seed=seed, debug_info=types.DriveScene(scene_id=scene), rollout_spec=vehicle
-        )
+        told = {"debug_info": types.DriveScene(scene_id=scene), "rollout_spec": vehicle}
+        request = types.DriveSessionRequest(session_uuid=self._id, random_seed=seed, **told)
         self._call("start_session", request, REVISION)
 
     def __enter__(self) -> Self:
@@ -239,9 +237,8 @@ class Policy:
         self._call("submit_route", types.RouteRequest(session_uuid=self._id, route=route))
         file = io.BytesIO()
         Image.fromarray(sight.rgb).save(file, "JPEG", quality=QUALITY)
-        image = types.CameraImage(
-            frame_start_us=now, frame_end_us=now, image_bytes=file.getvalue(), logical_id=self._name
-        )
+        span = {"frame_start_us": now, "frame_end_us": now}
+        image = types.CameraImage(**span, image_bytes=file.getvalue(), logical_id=self._name)
         self._call("submit_image_observation", types.RolloutCameraImage(session_uuid=self._id, camera_image=image))
         query = self._micros(sight.time_s + sight.step_s)
         reply = self._call("drive", types.DriveRequest(session_uuid=self._id, time_now_us=now, time_query_us=query))

@@ -4,7 +4,7 @@ Gaussians of; parked vehicles belong to the background unless an edit script tak
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal, Protocol, Self, TypeVar, get_args
@@ -175,12 +175,8 @@ class Absent(StaticNode):
         return None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Planes:
-    """A pinhole view of the scene: what ``RenderedCondition`` holds, and instances i32[H, W] (None: not asked for)."""
-
-    seen: RenderedCondition
-    instances: NDArray[np.int32] | None
+Planes = tuple[RenderedCondition, NDArray[np.int32] | None]
+"""A pinhole view of the scene, and its instances i32[H, W] (None: not asked for)."""
 
 
 class Session:
@@ -315,7 +311,7 @@ class Session:
         raster = raster_of(model)
         seen = render_condition(model, view, raster, gaussians)
         if not instances:
-            return Planes(seen, None)
+            return seen, None
         owner = {node.name: index for index, node in enumerate(model.nodes)}
         names = sorted(self._nodes)
         shape = tuple(seen.alpha.shape)
@@ -333,7 +329,7 @@ class Session:
             most, which = weights.max(0)
             own = (most > 1 - weights.sum(0)) & (most >= COVERED / 2)
             found = torch.where(own, first[which] + 1, 0).numpy().astype(np.int32)
-        return Planes(seen, found)
+        return seen, found
 
     def alone(self, view: View, moment: Instant, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Alpha f32[H, W] and depth f32[H, W] in metres of one object drawn alone; alpha is 0 where it is absent."""
@@ -380,39 +376,27 @@ class Session:
                 cx, cy = plain.cx - columns.start, plain.cy - rows.start
                 camera = Camera(name, shape[1], shape[0], plain.fx, plain.fy, cx, cy)
                 view = View(camera, pose, moment.time_s)
-                planes = self.pinhole(view, moment, wants_instances)
-                if self._mixer is not None:
-                    planes = replace(planes, seen=_repaired(self._mixer, view, planes.seen))
-                canvas.take((rows, columns), planes, part)
+                seen, instances = self.pinhole(view, moment, wants_instances)
+                seen = seen if self._mixer is None else _repaired(self._mixer, view, seen)
+                canvas.take((rows, columns), (seen, instances), part)
                 continue
             for face in faces_of(part, rays_per_radian(rays), name):
                 planes = self.pinhole(face.view(pose, moment.time_s), moment, wants_instances)
                 canvas.sample((rows, columns), planes, face)
         middle = request.start if request.end is None else request.start.towards(request.end, 0.5)
-        layers = {layer: self._layer(layer, canvas, request, rays, middle) for layer in request.layers}
+        made: dict[Layer, Callable[[], NDArray[Any]]] = {
+            "rgb": lambda: to_bytes(torch.from_numpy(canvas.rgb)),
+            "depth": lambda: (canvas.distance * rays[..., 2]).astype(np.float32),
+            "distance": lambda: canvas.distance,
+            "classes": lambda: canvas.classes,
+            "instances": lambda: canvas.instances.astype(np.uint16),
+            "confidence": lambda: canvas.certainty,
+            "normals": lambda: normals_of(rays * canvas.distance[..., None]),
+            "motion": lambda: self._motion(canvas, request, rays, middle),
+        }
+        layers = {layer: made[layer]() for layer in request.layers}
         trust = self._trust(canvas, middle, rays @ middle.world_from_sensor[2, :3])
         return CameraReply(layers, tuple(sorted(self._nodes)), trust)
-
-    def _layer(
-        self, layer: Layer, canvas: Canvas, request: CameraRequest, rays: Matrix, middle: Instant
-    ) -> NDArray[Any]:
-        match layer:
-            case "rgb":
-                return to_bytes(torch.from_numpy(canvas.rgb))
-            case "depth":
-                return (canvas.distance * rays[..., 2]).astype(np.float32)
-            case "distance":
-                return canvas.distance
-            case "classes":
-                return canvas.classes
-            case "instances":
-                return canvas.instances.astype(np.uint16)
-            case "confidence":
-                return canvas.certainty
-            case "normals":
-                return normals_of(rays * canvas.distance[..., None])
-            case "motion":
-                return self._motion(canvas, request, rays, middle)
 
     def _motion(self, canvas: Canvas, request: CameraRequest, rays: Matrix, now: Instant) -> NDArray[np.float32]:
         later = request.motion_to
@@ -464,24 +448,24 @@ class Canvas:
 
     def take(self, where: tuple[slice, slice], planes: Planes, rays: Matrix) -> None:
         """A part that was drawn pixel by pixel."""
-        seen = planes.seen
+        seen, instances = planes
         self.rgb[:, *where] = seen.rgb.numpy()
         self.distance[where] = seen.depth.numpy() / rays[..., 2]
         self.classes[where] = seen.semantics.numpy()
         self.certainty[where] = seen.sure().numpy()
-        if planes.instances is not None:
-            self.instances[where] = planes.instances
+        if instances is not None:
+            self.instances[where] = instances
 
     def sample(self, where: tuple[slice, slice], planes: Planes, face: Face) -> None:
         """Pixels of a part that lie in a face of the cube: colours between pixels, all else of the nearest one."""
         rows, columns = np.divmod(face.pixels, where[1].stop - where[1].start)
-        place, seen = (rows + where[0].start, columns + where[1].start), planes.seen
+        place, (seen, instances) = (rows + where[0].start, columns + where[1].start), planes
         self.rgb[:, *place] = bilinear(seen.rgb.numpy(), face.uv)
         self.distance[place] = face.surface(seen.depth.numpy())[0]
         self.classes[place] = nearest(seen.semantics.numpy(), face.uv)
         self.certainty[place] = nearest(seen.sure().numpy(), face.uv)
-        if planes.instances is not None:
-            self.instances[place] = nearest(planes.instances, face.uv)
+        if instances is not None:
+            self.instances[place] = nearest(instances, face.uv)
 
 
 def _repaired(mixer: RenderMixer, view: View, rendered: RenderedCondition) -> RenderedCondition:

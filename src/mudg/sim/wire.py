@@ -16,23 +16,13 @@ from mudg.base import geometry
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.types import Camera
 
-SERVICES: Final = (
-    "nre.grpc.protos.sensorsim.SensorsimService",
-    "nurec.grpc.protos.sensorsim.SensorsimService",
-    "sensorsim.SensorsimService",
-)
+SERVICES: Final = tuple(f"{at}sensorsim.SensorsimService" for at in ("nre.grpc.protos.", "nurec.grpc.protos.", ""))
 """Full names under which simulators of different years call the same service."""
 DRIVER: Final = "egodriver.EgodriverService"
 HEALTH: Final = "grpc.health.v1.Health"
 PNG, JPEG, RGB_PLANAR = 1, 2, 4
-SHUTTERS: Final = {
-    1: "top_to_bottom",
-    2: "left_to_right",
-    3: "bottom_to_top",
-    4: "right_to_left",
-    5: "global",
-    0: "global",
-}
+_SHUTTERS: Final = ("global", "top_to_bottom", "left_to_right", "bottom_to_top", "right_to_left", "global")
+SHUTTERS: Final = dict(enumerate(_SHUTTERS))
 """Numbers of ``CameraSpec.shutter_type`` -> our names."""
 MESSAGES: Final = {
     "Empty": "",

@@ -124,8 +124,9 @@ def ready(step: Result) -> tuple[Result, dict[str, str], Make]:
     from mudg.base.run_folder import refuse_overlap
 
     refuse_overlap(step.out, step.reads())
-    if isinstance(step, Watched):
-        step.refuse_unwatchable()
+    if isinstance(step, Watched) and step.tensorboard and importlib.util.find_spec("tensorboard") is None:
+        what, remedy = "TensorBoard is not installed", "pip install 'mudg[track]', or leave the flag out"
+        raise ResourceError(what, where="--tensorboard", remedy=f"{remedy}: log.jsonl holds the same")
     step = step.checked()
     inputs = step.inputs()
     return step, inputs, step.prepare(inputs)
@@ -191,9 +192,3 @@ class Watched(Output):
 
     tensorboard: bool = False
     """Also write the numbers of log.jsonl to OUT/tensorboard, for TensorBoard (needs `pip install 'mudg[track]'`)."""
-
-    def refuse_unwatchable(self) -> None:
-        """ResourceError without the package."""
-        if self.tensorboard and importlib.util.find_spec("tensorboard") is None:
-            what, remedy = "TensorBoard is not installed", "pip install 'mudg[track]', or leave the flag out"
-            raise ResourceError(what, where="--tensorboard", remedy=f"{remedy}: log.jsonl holds the same")

@@ -261,11 +261,19 @@ class _Ledger:
     @classmethod
     def open(cls, out: Path, config: RunConfig, source: str, overwrite: bool) -> _Ledger:
         """Open or begin the ledger of ``out``; UsageError if it belongs to other settings or something else."""
-        asked = {"verb": "run", "source": source, **configuration.result_settings(config)}
+        asked, path = {"verb": "run", "source": source, **configuration.result_settings(config)}, out / "run.json"
         before: dict[str, Any] = {}
-        known = out / "run.json"
-        if known.is_file():
-            before = cls._read(known)
+        if path.is_file():
+            before = store.json_object(path)
+            try:
+                own = parse_record(_LedgerRecord, before, str(path)).asked.get("verb") == "run"
+            except InputError:
+                own = False
+            if not own:  # as the run.json of a single verb
+                raise cls._foreign(out)
+            if not store.check_holds(before):
+                what, remedy = "the record of the run was altered after it was written", "restore the file"
+                raise IntegrityError(what, where=str(path), remedy=f"choose another --out, or {remedy}")
             same = configuration.without_devices(before["asked"]) == asked
             if not same and not overwrite:
                 differences = configuration.differences(before["asked"], asked)[:8]
@@ -286,21 +294,6 @@ class _Ledger:
             return
         if not out.is_dir() or any(entry.name not in own and not is_temporary(entry.name) for entry in out.iterdir()):
             raise cls._foreign(out)
-
-    @classmethod
-    def _read(cls, path: Path) -> dict[str, Any]:
-        """An earlier ledger; UsageError if the file is something else, as the run.json of a single verb is."""
-        content = store.json_object(path)
-        try:
-            own = parse_record(_LedgerRecord, content, str(path)).asked.get("verb") == "run"
-        except InputError:
-            own = False
-        if not own:
-            raise cls._foreign(path.parent)
-        if not store.check_holds(content):
-            what, remedy = "the record of the run was altered after it was written", "restore the file"
-            raise IntegrityError(what, where=str(path), remedy=f"choose another --out, or {remedy}")
-        return dict(content)
 
     @staticmethod
     def _foreign(out: Path) -> UsageError:

@@ -3,7 +3,6 @@ on."""
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import io
 import os
@@ -21,7 +20,7 @@ from mudg.base.records import understood
 from mudg.base.run_folder import ResultFile
 from mudg.fleet.plan import BOOKKEEPING
 from mudg.scoring.tables import TERMINAL_METRICS, number_text
-from mudg.viewer.report import viewer_address
+from mudg.viewer.report import data_uri, duration, viewer_address
 
 THUMBNAIL_PX: Final = 320, 120
 """Width of the pictures on cards, and where there are more than `MANY` runs."""
@@ -74,10 +73,10 @@ def _read(folder: Path) -> GalleryEntry:
         raise InputError("the scores are malformed", where=str(file), expected=expected, remedy=remedy)
     if not is_run:
         return GalleryEntry(folder, "score", scores)
-    minutes, rest = divmod(round(sum(float(step.get("seconds", 0)) for step in state.get("steps", {}).values())), 60)
+    taken = duration(sum(float(step.get("seconds", 0)) for step in state.get("steps", {}).values()))
     pages = {"report": folder / "report.html", "viewer": folder / viewer_address(folder)}
     pages["scores"] = folder / "score" / "metrics.md"
-    return GalleryEntry(folder, "run", scores, f"{minutes} min {rest} s", _picture(folder), pages)
+    return GalleryEntry(folder, "run", scores, taken, _picture(folder), pages)
 
 
 def _picture(folder: Path) -> Path | None:
@@ -143,7 +142,7 @@ def _thumbnail(picture: Path | None, width: int) -> str:
     image.thumbnail((width, width))
     content = io.BytesIO()
     image.save(content, "JPEG", quality=80)
-    return f"data:image/jpeg;base64,{base64.b64encode(content.getvalue()).decode('ascii')}"
+    return data_uri("image/jpeg", content.getvalue())
 
 
 def _rows(one: GalleryEntry, name: str, metrics: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -153,33 +152,24 @@ def _rows(one: GalleryEntry, name: str, metrics: Sequence[Mapping[str, Any]]) ->
     rows = []
     for entry in sorted(one.scores["by_distance"], key=lambda e: float(e["distance_m"])):
         distance, values = float(entry["distance_m"]), [entry["values"].get(metric["name"]) for metric in metrics]
+        if not any(isinstance(value, float) for value in values):
+            continue
         cells = [
             {"text": number_text(metric["name"], value), "value": value}
             if isinstance(value, float)
             else {"text": "", "value": ""}
             for metric, value in zip(metrics, values, strict=True)
         ]
-        row = {"run": name, "scene": str(one.scores["scene"]["id"]), "cells": cells}
-        row["method"] = str(titles.get(entry["method"], entry["method"]))
-        row["place"] = "recorded path" if distance == 0 else f"{distance:g} m aside"
-        rows += [row] if any(isinstance(value, float) for value in values) else []
+        place = "recorded path" if distance == 0 else f"{distance:g} m aside"
+        words = {"run": name, "scene": str(one.scores["scene"]["id"]), "place": place}
+        rows.append({**words, "method": str(titles.get(entry["method"], entry["method"])), "cells": cells})
     return rows
 
 
 def run(runs: Sequence[Path], out: Path, *, overwrite: bool = False) -> dict[str, Any]:
-    """Write the page of finished runs, scores and benchmarks.
-
-    Args:
-        runs: folders of ``mudg run``, ``mudg score`` or ``mudg bench``; of any other folder, those directly in it; of
-            ``mudg batch``, the runs of its logs.
-        out: the file to write. overwrite: replace it if it exists.
-
-    Returns:
-        ``page``: the file; ``shown``: how many folders are on it; ``text``.
-
-    Raises:
-        UsageError: another page is there, or the output is no HTML file. InputError: nothing can be shown.
-    """
+    """Write the page of finished runs, scores and benchmarks (``_folders``); returns ``page``, the file, ``shown``, how
+    many folders are on it, and ``text``. UsageError: another page is there, or the output is no HTML file. InputError:
+    nothing can be shown."""
     out = Path(out)
     if out.suffix != ".html":
         raise UsageError("the page is an HTML file", where="--out", expected="a name that ends in .html", got=str(out))

@@ -30,6 +30,7 @@ from mudg.core.edit import HeightMap
 from mudg.core.pictures import depth_colors, resize_area
 from mudg.core.weather.air import FLAKE_EDGES_MM, RAIN_EDGES_MM
 from mudg.editing.apply import SEED, spread
+from mudg.formats.splats import binary
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import DeformableNode, RigidNode
 from mudg.gaussians.start import SH_C0
@@ -149,12 +150,9 @@ def morton_codes(
         low, high = means[rows[own]].min(0), means[rows[own]].max(0)
         for part in _slices(len(own)):
             here = own[part]
-            cell = ((means[rows[here]] - low) / np.maximum(high - low, 1e-9) * 65535).astype(np.uint64)
-            mixed = np.zeros(len(cell), np.uint64)
-            for bit in range(16):
-                for axis in range(3):
-                    mixed |= ((cell[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
-            codes[here] = mixed
+            cells = ((means[rows[here]] - low) / np.maximum(high - low, 1e-9) * 65535).astype(np.uint64)
+            for axis in range(3):
+                codes[here] |= binary.with_gaps(cells[:, axis]) << np.uint64(axis)
     return codes
 
 
@@ -229,7 +227,12 @@ class Packed:
         red, green, blue = to_u8(shown / (facts["color_high"] - facts["color_low"])).T
         opacity = to_u8(opacity_of(columns["logits"][rows]))
         sections["color"] = np.stack([red - green, green, blue - green, opacity])
-        sections["class"] = _classes(columns.get("semantics"), rows)
+        logits = columns.get("semantics")
+        sections["class"] = np.full((2, len(rows)), [[255], [0]], np.uint8)
+        if logits is not None and logits.shape[1] > 1:
+            best = np.partition(logits[rows], -2, axis=1)[:, -2:]
+            lead = np.clip(np.rint((best[:, 1] - best[:, 0]) / LEAD_STEP), 1, 255)
+            sections["class"] = np.stack([logits[rows].argmax(1), lead]).astype(np.uint8)
         if self.model.certainty is not None:
             sections["certainty"] = to_u8(self.model.certainty[torch.from_numpy(rows)].float().numpy())
         if self.model.sh_degree:
@@ -297,7 +300,7 @@ def _geometry(columns: Mapping[str, Any], rows: Any, blocks: Sequence[Any]) -> S
         bounds[index, :3], bounds[index, 3:6], places[own] = _quantised(means[own], 65535, PLACE_STEP_M)
         bounds[index, 6:9], bounds[index, 9:], sizes[own] = _quantised(scales[own], 255, SCALE_STEP)
     bytes_of = np.concatenate([(places & 255).T, (places >> 8).T]).astype(np.uint8)
-    turns = smallest_three(columns["quats"][rows].astype(np.float64))
+    turns = packed_turns(columns["quats"][rows])
     rotation = turns.view(np.uint8).reshape(-1, 4).T.copy()
     return {"block": bounds, "position": bytes_of, "scale": sizes.T.copy(), "rotation": rotation}
 
@@ -310,24 +313,11 @@ def _quantised(values: NDArray[np.float64], levels: int, least_step: float) -> t
     return low, step, np.clip(np.rint((values - low) / step), 0, levels).astype(np.uint16 if levels > 255 else np.uint8)
 
 
-def smallest_three(quats: NDArray[np.float64]) -> NDArray[np.uint32]:
+def packed_turns(quats: NDArray[np.floating]) -> NDArray[np.uint32]:
     """Quaternions [n, 4] (w x y z, any length) as u32[n]."""
-    unit = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
-    unit[np.abs(unit).max(1) == 0] = (1, 0, 0, 0)
-    largest = np.abs(unit).argmax(1)
-    unit *= np.where(np.take_along_axis(unit, largest[:, None], 1) < 0, -1.0, 1.0)
-    others = unit[np.arange(4) != largest[:, None]].reshape(-1, 3)
+    largest, others = binary.smallest_three(quats)
     level = (np.clip(np.rint(others * np.sqrt(2) * 511), -511, 511) + 512).astype(np.uint32)
     return level[:, 0] | level[:, 1] << 10 | level[:, 2] << 20 | largest.astype(np.uint32) << 30
-
-
-def _classes(logits: Any, rows: Any) -> NDArray[np.uint8]:
-    if logits is None or logits.shape[1] < 2:
-        return np.stack([np.full(len(rows), 255, np.uint8), np.zeros(len(rows), np.uint8)])
-    here = logits[rows]
-    best = np.partition(here, -2, axis=1)[:, -2:]
-    lead = np.clip(np.rint((best[:, 1] - best[:, 0]) / LEAD_STEP), 1, 255)
-    return np.stack([here.argmax(1), lead]).astype(np.uint8)
 
 
 def to_u8(values: NDArray[np.floating]) -> NDArray[np.uint8]:
@@ -337,14 +327,10 @@ def to_u8(values: NDArray[np.floating]) -> NDArray[np.uint8]:
 
 # -- motion ----------------------------------------------------------------------------------------
 def motion_sections(model: SceneModel, begin_s: float) -> tuple[list[dict[str, Any]], Sections]:
-    """What carries the rows of each node.
-
-    Returns:
-        One record per node (name, kind, label, size_m, ``keys``: first row and number of its keys in section "keys",
-        ``grid``: first value and cells of its displacements in "deform"), and the sections: ``keys`` f32[k, 8] (time
-        since ``begin_s``, position, quaternion w x y z, world from box), ``deform`` i16[...] as [key, xyz, z, y, x] per
-        deformable node, in `DEFORM_STEP_M`.
-    """
+    """What carries the rows of each node: one record per node (name, kind, label, size_m, ``keys``: first row and
+    number of its keys in section "keys", ``grid``: first value and cells of its displacements in "deform"), and the
+    sections: ``keys`` f32[k, 8] (time since ``begin_s``, position, quaternion w x y z, world from box), ``deform``
+    i16[...] as [key, xyz, z, y, x] per deformable node, in `DEFORM_STEP_M`."""
     records, keys, grids = [], [np.zeros((0, 8), np.float32)], [np.zeros(0, np.int16)]
     for node in model.nodes:
         record: dict[str, Any] = {"name": node.name, "kind": node.kind}
@@ -384,7 +370,7 @@ def blob_of(sections: Mapping[str, NDArray[Any]]) -> tuple[bytes, dict[str, list
 # What the viewer page knows about a log besides Gaussians: cameras, frames with small images, boxes, the vehicle's
 # path, LiDAR points. Times on the page are seconds since the first frame. Sections of the log's blob: ``keys`` f32[k,
 # 8], ``lidar`` u16[3, m], places in the world as ``lidar_low + value * lidar_step``, ``ground`` u16[x, y] (see
-# ``with_ground``).
+# ``PageFacts.with_ground``).
 WEBP_QUALITY: Final = 50
 REACH_M: Final = 80.0
 MOST_CELLS: Final = 4_000_000
@@ -404,6 +390,20 @@ class PageFacts:
     facts: dict[str, Any]
     sections: Sections
     images: bytes
+
+    def with_ground(self, ground: HeightMap | None) -> PageFacts:
+        """With heights of the ground, for objects that are moved on it; without them where they are not known or too
+        many. Section ``ground``: world z as ``low + value * step``, steps of `LEAST_STEP_M`, larger where heights span
+        more than 33 m; `UNKNOWN` where it is not known."""
+        heights = np.zeros((0, 0)) if ground is None else ground.heights
+        if ground is None or heights.size > MOST_CELLS or min(heights.shape) < 2 or not np.isfinite(heights).any():
+            return replace(self, facts=self.facts | {"ground": None})
+        low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
+        step = max((high - low) / (UNKNOWN - 1), LEAST_STEP_M)
+        levels = np.where(np.isfinite(heights), np.rint((heights - low) / step), UNKNOWN).astype(np.uint16)
+        record = {"origin": ground.origin.tolist(), "cell_m": ground.cell_m, "shape": list(levels.shape)}
+        facts = self.facts | {"ground": {**record, "low": low, "step": step}}
+        return replace(self, facts=facts, sections=self.sections | {"ground": levels})
 
 
 def begin_of(scene: Scene) -> float:
@@ -457,24 +457,6 @@ def log_facts(scene: Scene, colors: CameraColors, image_width: int, most_images:
         "particle_keys": particles,
     }
     return PageFacts(facts, {"keys": np.concatenate(keys), "lidar": points}, images)
-
-
-def with_ground(page: PageFacts, ground: HeightMap | None) -> PageFacts:
-    """The page with heights of the ground, for objects that are moved on it; without them where they are not known or
-    too many.
-
-    Section ``ground``: world z as ``low + value * step``, steps of `LEAST_STEP_M`, larger where heights span more than
-    33 m; `UNKNOWN` where it is not known.
-    """
-    heights = np.zeros((0, 0)) if ground is None else ground.heights
-    if ground is None or heights.size > MOST_CELLS or min(heights.shape) < 2 or not np.isfinite(heights).any():
-        return replace(page, facts=page.facts | {"ground": None})
-    low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
-    step = max((high - low) / (UNKNOWN - 1), LEAST_STEP_M)
-    levels = np.where(np.isfinite(heights), np.rint((heights - low) / step), UNKNOWN).astype(np.uint16)
-    record = {"origin": ground.origin.tolist(), "cell_m": ground.cell_m, "shape": list(levels.shape)}
-    facts = page.facts | {"ground": {**record, "low": low, "step": step}}
-    return replace(page, facts=facts, sections=page.sections | {"ground": levels})
 
 
 def _camera(camera: Camera, colors: CameraColors) -> dict[str, Any]:
@@ -550,7 +532,7 @@ class PageFile:
 class ViewerPage:
     """What is to be written. ``title``, ``subtitle``, ``about``: texts. ``report``: relative address of the report, or
     empty. ``scenes``: (name, scene), the one that is shown first; at most two. ``log``: everything else. ``live``:
-    settings of a server behind the page, or None. ``effort``: of gzip, 1 to 9."""
+    settings of a server behind the page, or None."""
 
     title: str
     subtitle: str
@@ -559,7 +541,6 @@ class ViewerPage:
     scenes: Sequence[tuple[str, Packed]]
     log: PageFacts
     live: Mapping[str, Any] | None = None
-    effort: int = 9
 
     def files(self, facts: dict[str, Any]) -> Iterator[PageFile]:
         """The data files, made one at a time; `facts` becomes what the page says about them and is complete after the
@@ -583,7 +564,8 @@ class ViewerPage:
 
     def _file(self, name: str, sections: Sections) -> tuple[PageFile, dict[str, Any]]:
         blob, directory = blob_of(sections)
-        made = PageFile(name, gzip.compress(blob, self.effort, mtime=0))
+        effort = 9 if self.live is None else 1  # nothing leaves this machine
+        made = PageFile(name, gzip.compress(blob, effort, mtime=0))
         return made, {"file": made.record(), "directory": directory}
 
     def one_file(self, files: Iterable[PageFile], facts: Mapping[str, Any]) -> bytes:

@@ -75,11 +75,8 @@ def next_commands(out: Path) -> list[tuple[str, tuple[str, ...]]]:
         ),
         ("The same on your own log", [["run", "LOG", "--out", "runs/mine"]]),
     ]
-    return [(title, tuple(map(_line, lines))) for title, lines in blocks]
-
-
-def _line(words: Sequence[str]) -> str:
-    return words[0] if len(words) == 1 else f"mudg {shlex.join(words)}"
+    line = lambda words: words[0] if len(words) == 1 else f"mudg {shlex.join(words)}"
+    return [(title, tuple(map(line, lines))) for title, lines in blocks]
 
 
 # -- the page: what ``templates/report.html.j2`` shows, worked out from plain values ---------------
@@ -127,7 +124,10 @@ class TrajectoryVideo:
     @property
     def place(self) -> str:
         """Where the trajectory runs, for people."""
-        return shift_title(self.shift_m, self.name)
+        if self.shift_m is None:
+            return self.name
+        side = "left" if self.shift_m > 0 else "right"
+        return f"{abs(self.shift_m):g} m {side}" if self.shift_m else "recorded path"
 
 
 def page(
@@ -210,23 +210,17 @@ def _facts(scores: Mapping[str, Any], ledger: Mapping[str, Any]) -> list[tuple[s
         (f"{cameras}", "camera" if cameras == 1 else "cameras"),
         (f"{scene['tracks']}", "tracked objects"),
         (f"{sum(t['views'] for t in scores['trajectories'])}", "views rendered per method"),
-        (_duration(sum(step["seconds"] for step in ledger.get("steps", {}).values())), "from log to this page"),
+        (duration(sum(step["seconds"] for step in ledger.get("steps", {}).values())), "from log to this page"),
     ]
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """Minutes and seconds in words."""
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
 
 
 # ---- player ----
-
-
-def shift_title(shift_m: float | None, name: str) -> str:
-    """Where a trajectory runs, for people."""
-    if shift_m is None:
-        return name
-    return "recorded path" if shift_m == 0 else f"{abs(shift_m):g} m {'left' if shift_m > 0 else 'right'}"
 
 
 def _player_values(
@@ -436,7 +430,7 @@ def _time_values(ledger: Mapping[str, Any]) -> dict[str, Any]:
         }
         for name, step in ledger.get("steps", {}).items()
     ]
-    return {"steps": steps, "total_time": _duration(total)}
+    return {"steps": steps, "total_time": duration(total)}
 
 
 def _provenance(scores: Mapping[str, Any], ledger: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -461,13 +455,14 @@ def _provenance(scores: Mapping[str, Any], ledger: Mapping[str, Any]) -> list[tu
 
 
 # -- panels of a video: several methods' views of one moment side by side, one row per modality ----
+PANEL_WIDTH: Final = 320
 BLANK: Final = 24
 """Grey value of a panel that a method does not produce."""
 
 
-def panel_size(camera_width: int, camera_height: int, widest: int) -> tuple[int, int]:
-    """Width and height of a panel, both even: at most ``widest``, in the camera's proportions."""
-    width = min(widest, camera_width) // 2 * 2
+def panel_size(camera_width: int, camera_height: int) -> tuple[int, int]:
+    """Width and height of a panel, both even: at most `PANEL_WIDTH`, in the camera's proportions."""
+    width = min(PANEL_WIDTH, camera_width) // 2 * 2
     return width, max(2, round(camera_height * width / camera_width) // 2 * 2)
 
 
@@ -498,7 +493,6 @@ def panel_grid(
 
 
 # -- the report of a run ---------------------------------------------------------------------------
-PANEL_WIDTH: Final = 320
 BUDGET_BYTES: Final = 9 * 2**19
 """For all videos together, before base64; with the posters the page stays under 8 MB."""
 VIEWER: Final = "viewer.html"
@@ -510,15 +504,46 @@ QUALITY: Final = (33, 45)
 
 @dataclass(frozen=True)
 class Columns:
-    """The observation sets of one trajectory, by column name, and which view of each stands at each frame.
-
-    ``has_truth``: the column "truth" shows this very trajectory, not the recorded path at the same moments.
-    """
+    """The observation sets of one trajectory, by column name, and which view of each stands at each frame. Truth and
+    baseline have just the scored views; of the methods' views the scorer's indices pick the same. ``has_truth``: the
+    column "truth" shows this very trajectory; else (a shifted view of a recorded log) the recorded path at the same
+    moments."""
 
     sets: Mapping[str, ObservationSet]
     indices: Mapping[str, Sequence[int]]
     frames: int
     has_truth: bool
+
+    @classmethod
+    def of(cls, trajectory: Mapping[str, Any], folders: Mapping[str, Mapping[str, Path]]) -> Columns:
+        """Those of a trajectory of the scores."""
+        name, frames, picked = trajectory["name"], int(trajectory["views"]), trajectory["indices"]
+        sets = {column: read_observations(found[name]) for column, found in folders.items() if name in found}
+        indices: dict[str, Sequence[int]] = {c: picked[c] if c in picked else range(frames) for c in sets}
+        has_truth = "truth" in sets
+        recorded_folder = folders.get("truth", {}).get(f"{trajectory['camera']}_recorded")
+        if not has_truth and recorded_folder is not None:
+            recorded = read_observations(recorded_folder)
+            column = next(iter(sets))
+            wanted = np.array([sets[column].views[i].time_s for i in indices[column]])
+            apart = np.abs(np.array([view.time_s for view in recorded.views])[None] - wanted[:, None])
+            if apart.min(1).max() < SAME_TIME_S:
+                sets = {"truth": recorded, **sets}
+                indices["truth"] = apart.argmin(1).tolist()
+        return cls(sets, indices, frames, has_truth)
+
+    def rows(self, column: str) -> tuple[str, ...]:
+        """The rows that a column has, as its first view says."""
+        first = self.sets[column][self.indices[column][0]]
+        has = {"rgb": True, "depth": first.depth is not None, "semantics": first.semantics is not None}
+        has["error"] = self.has_truth and column != "truth"
+        return tuple(row for row in ROWS if has[row])
+
+    def pictures(self, order: Sequence[str], size: tuple[int, int], first: int = 0) -> Iterator[NDArray[np.uint8]]:
+        """One picture per frame: columns in page order, rows of ``ROWS``; what a method does not produce stays grey."""
+        for frame in range(first, self.frames):
+            views = {c: self.sets[c][self.indices[c][frame]] if c in self.sets else None for c in order}
+            yield panel_grid(views, ROWS, size, views["truth"] if self.has_truth else None)
 
 
 def film(out: Path) -> list[TrajectoryVideo]:
@@ -573,11 +598,10 @@ def _folders(out: Path, scores: Mapping[str, Any]) -> dict[str, dict[str, Path]]
 
 def _video(trajectory: Mapping[str, Any], folders: Mapping[str, Mapping[str, Path]], budget: int) -> TrajectoryVideo:
     """All panels of a trajectory as one video of at most ``budget`` bytes; 0 = only the picture of its middle frame."""
-    columns = _columns(trajectory, folders)
-    size = panel_size(int(trajectory["width"]), int(trajectory["height"]), PANEL_WIDTH)
-    order = list(folders)
-    video = mp4_within(lambda: _frames(columns, order, size), FPS, QUALITY, budget) if budget else b""
-    poster = jpeg_bytes(next(_frames(columns, order, size, first=columns.frames // 2)), quality=60)
+    columns, order = Columns.of(trajectory, folders), list(folders)
+    size = panel_size(int(trajectory["width"]), int(trajectory["height"]))
+    video = mp4_within(lambda: columns.pictures(order, size), FPS, QUALITY, budget) if budget else b""
+    poster = jpeg_bytes(next(columns.pictures(order, size, first=columns.frames // 2)), quality=60)
     return TrajectoryVideo(
         name=trajectory["name"],
         camera=str(trajectory["camera"]),
@@ -585,50 +609,12 @@ def _video(trajectory: Mapping[str, Any], folders: Mapping[str, Mapping[str, Pat
         width=size[0],
         height=size[1],
         frames=columns.frames,
-        panels={column: _rows(columns, column) for column in columns.sets},
-        video=_data_uri("video/mp4", video) if video else "",
-        poster=_data_uri("image/jpeg", poster),
+        panels={column: columns.rows(column) for column in columns.sets},
+        video=data_uri("video/mp4", video) if video else "",
+        poster=data_uri("image/jpeg", poster),
     )
 
 
-def _columns(trajectory: Mapping[str, Any], folders: Mapping[str, Mapping[str, Path]]) -> Columns:
-    """Truth and baseline have just the scored views; of the methods' views the scorer's indices pick the same.
-
-    Where a trajectory has no truth (a shifted view of a recorded log), its column shows the recorded path at the same
-    moments.
-    """
-    name, frames, picked = trajectory["name"], int(trajectory["views"]), trajectory["indices"]
-    sets = {column: read_observations(found[name]) for column, found in folders.items() if name in found}
-    indices: dict[str, Sequence[int]] = {c: picked[c] if c in picked else range(frames) for c in sets}
-    has_truth = "truth" in sets
-    recorded_folder = folders.get("truth", {}).get(f"{trajectory['camera']}_recorded")
-    if not has_truth and recorded_folder is not None:
-        recorded = read_observations(recorded_folder)
-        column = next(iter(sets))
-        wanted = np.array([sets[column].views[i].time_s for i in indices[column]])
-        apart = np.abs(np.array([view.time_s for view in recorded.views])[None] - wanted[:, None])
-        if apart.min(1).max() < SAME_TIME_S:
-            sets = {"truth": recorded, **sets}
-            indices["truth"] = apart.argmin(1).tolist()
-    return Columns(sets, indices, frames, has_truth)
-
-
-def _rows(columns: Columns, column: str) -> tuple[str, ...]:
-    """The rows that a column has, as its first view says."""
-    first = columns.sets[column][columns.indices[column][0]]
-    has = {"rgb": True, "depth": first.depth is not None, "semantics": first.semantics is not None}
-    has["error"] = columns.has_truth and column != "truth"
-    return tuple(row for row in ROWS if has[row])
-
-
-def _frames(
-    columns: Columns, order: Sequence[str], size: tuple[int, int], first: int = 0
-) -> Iterator[NDArray[np.uint8]]:
-    """One picture per frame: columns in page order, rows of ``ROWS``; what a method does not produce stays grey."""
-    for frame in range(first, columns.frames):
-        views = {c: columns.sets[c][columns.indices[c][frame]] if c in columns.sets else None for c in order}
-        yield panel_grid(views, ROWS, size, views["truth"] if columns.has_truth else None)
-
-
-def _data_uri(kind: str, content: bytes) -> str:
+def data_uri(kind: str, content: bytes) -> str:
+    """A file as an address that holds it."""
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"

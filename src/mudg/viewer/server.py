@@ -43,7 +43,6 @@ _NO_ROOM: Final = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 _LENGTH: Final = re.compile(r"[0-9]{1,9}")
 Answer = Callable[[Any], tuple[bytes, str]]
 """From a JSON value to content and its type."""
-TYPES: Final = {"html": "text/html; charset=utf-8", "bin": "application/octet-stream"}
 
 
 def token_for(host: str, token: str) -> str:
@@ -178,11 +177,11 @@ class SiteRequest(BaseHTTPRequestHandler):
         name = self._name()
         if name is None:
             return
-        content = self.server.files.get(name)
-        if content is None:
+        if name not in self.server.files:
             self._answer(HTTPStatus.NOT_FOUND, b"no such file")
-            return
-        self._answer(HTTPStatus.OK, content, TYPES["html" if name in ("", "report.html") else "bin"], cookie=name == "")
+        else:
+            kind = "text/html; charset=utf-8" if name in ("", "report.html") else "application/octet-stream"
+            self._answer(HTTPStatus.OK, self.server.files[name], kind, cookie=name == "")
 
     def do_POST(self) -> None:
         """JSON to one of the site's answers."""

@@ -14,7 +14,6 @@ from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from PIL import Image
 from pydantic import Field
 
@@ -44,7 +43,6 @@ from mudg.editing.apply import (
     weather_of,
 )
 from mudg.editing.model import motion_of
-from mudg.editing.plan import EditPlan
 from mudg.editing.render import RenderMixer, check_as_recorded
 from mudg.editing.runs import RunParts, find_run
 from mudg.editing.script import EditScript, conditions_of, parse_edits, read_edits
@@ -90,19 +88,11 @@ def run_page(
     report: str = "",
     overwrite: bool = False,
 ) -> dict[str, Any]:
-    """Write the page of a run or a fit.
-
-    Args:
-        run: a folder of ``mudg run``, or of ``mudg fit`` with ``scene``. out: the file to write. compare: another run
-            or fit of the same log. report: address of the run's report, relative to the page.
-
-    Returns:
-        ``page``: the file (of a folder, its ``index.html``); ``bytes``: of everything; ``gaussians``: on the page;
-        ``text``.
-
-    Raises:
-        UsageError: another page is there, or the output is an input. InputError: no fitted scene, or another log.
-    """
+    """Write the page of a run or a fit. ``run``: a folder of ``mudg run``, or of ``mudg fit`` with ``scene``.
+    ``compare``: another run or fit of the same log. ``report``: address of the run's report, relative to the page.
+    Returns ``page``, the file (of a folder, its ``index.html``), ``bytes`` of everything, ``gaussians`` on the page,
+    and ``text``. UsageError: another page is there, or the output is an input. InputError: no fitted scene, or another
+    log."""
     out, run = Path(out), Path(run)
     # beside a run's report it overwrites nothing that was read
     beside = out.resolve().parent == run.resolve() and not (run / "model.json").is_file()
@@ -131,12 +121,8 @@ def run_page(
 
 
 def write_page(page: ViewerPage, out: Path, folder: Path) -> dict[str, Any]:
-    """Write a page: one file where it is small enough, else a folder, completely or not at all. At most
-    `ONE_FILE_BYTES` of it are held at a time.
-
-    Returns:
-        ``page``, ``bytes`` and ``gaussians``, as ``run_page``.
-    """
+    """Write a page: one file where it is small enough, else a folder, completely or not at all; returns ``page``,
+    ``bytes`` and ``gaussians`` of ``run_page``. At most `ONE_FILE_BYTES` of it are held at a time."""
     facts: dict[str, Any] = {}
     made, held, size = page.files(facts), list[PageFile](), 0
     for file in made:
@@ -218,8 +204,7 @@ def page_of(config: PageConfig, shown: Shown, report: str = "", live: dict[str, 
     path = np.stack([frame.view.center_world for frame in scene.frames])
     packed = [(name, pages.pack_scene(model, begin, path, config.budget, CHUNK)) for name, model in shown.fits]
     width = PAGE_IMAGE_PX if live is None else LIVE_IMAGE_PX
-    facts = pages.log_facts(scene, shown.fits[0][1].colors, width, config.images)
-    facts = pages.with_ground(facts, shown.ground())
+    facts = pages.log_facts(scene, shown.fits[0][1].colors, width, config.images).with_ground(shown.ground())
     counted = lambda things, noun: f"{len(things)} {noun}{'' if len(things) == 1 else 's'}"
     about = (
         f"{kept_text(packed[0][1])}, {len(scene.frames)} recorded frames of {counted(scene.cameras, 'camera')},"
@@ -271,14 +256,9 @@ class EditRequest(StrictRecord):
 
 @dataclass(slots=True)
 class EditDesk:
-    """Carries out scripts on what a page shows.
-
-    Args:
-        models: the fits, on the CPU. scene, cloud: the log; the cloud may be unknown. begin: the script that the page
-            begins with.
-        place: file to save to.
-        run: the finished run that is shown, whose objects a page may insert; empty where it is a fit alone.
-    """
+    """Carries out scripts on what a page shows. ``models``: the fits, on the CPU. ``place``: file to save to.
+    ``begin``: the script that the page begins with. ``run``: the finished run that is shown, whose objects a page may
+    insert; empty where it is a fit alone."""
 
     models: Sequence[SceneModel]
     scene: Scene
@@ -309,16 +289,15 @@ class EditDesk:
         drive = self._carried(text)
         with self._making:
             if text not in self._made:
-                made = [drive.model(model, street=self._street(model, drive.plan)) for model in self.models]
+                made = list[SceneModel]()
+                for model in self.models:  # closing a street takes seconds, and an object is moved many times
+                    key = (id(model), *left_behind(model, drive.plan))
+                    if key not in self._streets:
+                        kept = _last(self._streets, STREETS * len(self.models) - 1)
+                        self._streets = {**kept, key: street_left(model, drive.plan)}
+                    made.append(drive.model(model, street=self._streets[key]))
                 self._made = {**_last(self._made, KEPT - 1), text: made}
             return self._made[text]
-
-    def _street(self, model: SceneModel, plan: EditPlan) -> SceneModel:
-        """What ``street_left`` makes, remembered: closing a street takes seconds, and an object is moved many times."""
-        key = (id(model), *left_behind(model, plan))
-        if key not in self._streets:
-            self._streets = {**_last(self._streets, STREETS * len(self.models) - 1), key: street_left(model, plan)}
-        return self._streets[key]
 
     def _carried(self, text: str) -> EditedDrive:
         """A script carried out on all but the fits; quick."""
@@ -460,28 +439,24 @@ def over_ground(model: SceneModel) -> SceneModel:
     return replace(model, sky=SkyNode(Table({"panorama": panorama})))
 
 
+@dataclass(slots=True, eq=False)
 class FrameSource:
     """Draws frames of one or two fitted scenes, one at a time. ``edited``: the scenes with a script carried out; "" =
     as they are. ``scene``: the log; its recorded views tell the light of the drive, where a script asks for other
     weather or light. ``widest``: pixels of the widest frame. ``mixers``: by number of the scene, what repairs frames of
     it as it was fitted."""
 
-    def __init__(
-        self,
-        edited: Callable[[str], Sequence[SceneModel]],
-        scene: Scene,
-        widest: int,
-        device: torch.device,
-        mixers: Sequence[RenderMixer] = (),
-    ) -> None:
-        self._mixers = mixers
-        self._edited, self._scene, self._widest, self._device = edited, scene, widest, device
-        self._edits: str | None = None
-        self._models: list[SceneModel] = []
-        """The scenes with the script ``_edits`` carried out, on the device."""
-        self._weather: dict[int, InWeather] = {}
-        """Of the scenes that were asked for in colour, by their number."""
-        self._lock = threading.Lock()
+    edited: Callable[[str], Sequence[SceneModel]]
+    scene: Scene
+    widest: int
+    device: torch.device
+    mixers: Sequence[RenderMixer] = ()
+    _edits: str | None = None
+    _models: list[SceneModel] = field(default_factory=list)
+    """The scenes with the script ``_edits`` carried out, on the device."""
+    _weather: dict[int, InWeather] = field(default_factory=dict)
+    """Of the scenes that were asked for in colour, by their number."""
+    _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def png(self, asked: object) -> tuple[bytes, str]:
         """The frame of a ``FrameRequest`` as PNG. InputError: a camera that is none, or edits that cannot be carried
@@ -489,10 +464,11 @@ class FrameSource:
         request, content = parse_record(FrameRequest, asked, "request"), io.BytesIO()
         lens = (request.width, request.height, request.fx, request.fy, request.cx, request.cy)
         camera = Camera(request.camera or "free", *lens)
-        if request.width > self._widest:
-            camera = camera.resized(self._widest, max(1, round(request.height * self._widest / request.width)))
+        if request.width > self.widest:
+            camera = camera.resized(self.widest, max(1, round(request.height * self.widest / request.width)))
         pose = np.eye(4)
-        pose[:3, :3] = orthonormal(np.array(request.axes, np.float64).T)
+        left, _, right = np.linalg.svd(np.array(request.axes, np.float64).T)
+        pose[:3, :3] = left @ right  # the nearest rotation: axes come with the rounding of a browser's sums
         pose[:3, 3] = request.eye
         with self._lock:
             seen = self._drawer(request)(View(camera, pose, float(request.time_s)))
@@ -507,27 +483,21 @@ class FrameSource:
     def _drawer(self, request: FrameRequest) -> Drawer:
         """What draws the scene that is asked for, without what is hidden, in the weather and light of the script."""
         if self._edits != request.edits:
-            self._models = [model.to(self._device) for model in self._edited(request.edits)]
+            self._models = [model.to(self.device) for model in self.edited(request.edits)]
             self._edits, self._weather = request.edits, {}
         index = min(request.scene, len(self._models) - 1)
         model = self._models[index]
         gone = [name for name in request.hidden if name in model.node_names()]
         seen = model if request.camera else over_ground(model)
         draw = drawer(seen.without_nodes(gone) if gone else seen)
-        if self._mixers and request.layer != "class" and not gone and not request.edits.strip():
-            return lambda view: self._mixers[index](view, draw(view))
+        if self.mixers and request.layer != "class" and not gone and not request.edits.strip():
+            return lambda view: self.mixers[index](view, draw(view))
         conditions = conditions_of(model.facts.get(FACT, {}).get("script", ()))
         if conditions is None or request.layer != "color":
             return draw
         if index not in self._weather:
-            self._weather[index] = weather_of(drawer(model), conditions, self._scene)
+            self._weather[index] = weather_of(drawer(model), conditions, self.scene)
         return in_weather(draw, self._weather[index])
-
-
-def orthonormal(axes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The nearest rotation: axes come with the rounding of a browser's sums."""
-    left, _, right = np.linalg.svd(axes)
-    return left @ right
 
 
 # -- served ---
@@ -579,7 +549,7 @@ def server_of(
             mixers.append(RenderMixer(JobInputs(sources.scene, sources.cloud, folder), device=config.device))
     desk = desk_for([model for _, model in shown.fits], shown.scene, shown.cloud, Path(run), edits, edits_out)
     live = {"layers": list(LAYERS), "token": token, "edits": desk.entries(), "place": desk.place.name, "run": desk.run}
-    page, facts = replace(page_of(config, shown, live=live), effort=1), dict[str, Any]()  # nothing leaves this machine
+    page, facts = page_of(config, shown, live=live), dict[str, Any]()
     served = {file.url: file.content for file in page.files(facts)}
     size = sum(map(len, served.values()))
     served[""] = page.html(facts, size)

@@ -20,7 +20,7 @@ from mudg.base import geometry, store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Scene
 from mudg.core.edit import HeightMap
-from mudg.formats.exporters.ncore import MICRO, PoseKeys, shutter_type
+from mudg.formats.exporters.ncore import MICRO, PoseKeys, intrinsics_of
 from mudg.formats.splats import ply
 from mudg.formats.splats.cloud import SplatScene
 from mudg.formats.splats.usd import to_package
@@ -116,7 +116,7 @@ def _rig(log: Scene, path: PoseKeys, spans: Spans) -> dict[str, Any]:
             "logical_sensor_name": camera.name,
             "unique_sensor_idx": index,
             "T_sensor_rig": _mount(log, camera).tolist(),
-            "camera_model": {"type": "opencv-pinhole", "parameters": intrinsics(camera)},
+            "camera_model": {"type": "opencv-pinhole", "parameters": intrinsics_of(camera)},
         }
         for index, camera in enumerate(log.cameras.values())
     }
@@ -137,20 +137,6 @@ def _mount(log: Scene, camera: Camera) -> NDArray[np.float64]:
         if ego is not None:
             return geometry.invert(ego) @ frame.view.world_from_cam
     raise InputError("the vehicle's path covers no image of a camera", where=f"{log.id}: camera {camera.name}")
-
-
-def intrinsics(camera: Camera) -> dict[str, Any]:
-    """A pinhole camera as NCore tells it: principal point from the corner of the image."""
-    return {
-        "resolution": [camera.width, camera.height],
-        "shutter_type": shutter_type(camera),
-        "external_distortion_parameters": None,
-        "principal_point": [camera.cx, camera.cy],
-        "focal_length": [camera.fx, camera.fy],
-        "radial_coeffs": [0.0] * 6,
-        "tangential_coeffs": [0.0] * 2,
-        "thin_prism_coeffs": [0.0] * 4,
-    }
 
 
 def _tracks(scene: SplatScene, us: Callable[[float], int]) -> dict[str, Any]:

@@ -228,23 +228,17 @@ def ros_names(names: Iterable[str]) -> dict[str, str]:
     return dict(zip(names, each_once(f"n{name}" if name[0].isdigit() else name for name in plain)))
 
 
-def ros_types() -> Any:
-    """The messages of Humble and later as rosbags keeps them; ResourceError if it is not installed."""
-    mcap_writer()
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    types = get_typestore(Stores.ROS2_HUMBLE)
-    for name, text in VISION.items():
-        types.register(get_types_from_msg(text, f"vision_msgs/msg/{name}"))
-    return types
-
-
 class Ros2Messages:
-    """The messages of a log in order of time; of one moment, transforms first. Raises InputError: an object's id or
-    class holds a zero byte."""
+    """The messages (of Humble and later) of a log in order of time; of one moment, transforms first. InputError: an
+    object's id or class holds a zero byte. ResourceError: rosbags is not installed."""
 
     def __init__(self, records: LogRecords) -> None:
-        self._log, self._scene, self._types = records, records.scene, ros_types()
+        mcap_writer()
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        self._log, self._scene, self._types = records, records.scene, get_typestore(Stores.ROS2_HUMBLE)
+        for name, text in VISION.items():
+            self._types.register(get_types_from_msg(text, f"vision_msgs/msg/{name}"))
         packages = {"builtin_interfaces", "std_msgs", "geometry_msgs", "sensor_msgs", "nav_msgs", "tf2_msgs"}
         packages |= {"visualization_msgs", "vision_msgs"}
         kinds = {kind: made for kind, made in self._types.types.items() if kind.split("/")[0] in packages}
@@ -340,19 +334,11 @@ class Ros2Messages:
     def _camera_info(self, view: View) -> Any:
         camera, k = view.camera, view.camera.matrix
         k[:2, 2] -= 0.5
-        return self._ros.CameraInfo(
-            self._header(view.time_s, self._frame(f"camera/{camera.name}")),
-            camera.height,
-            camera.width,
-            "plumb_bob",
-            d=np.zeros(5),
-            k=k.reshape(-1),
-            r=np.eye(3).reshape(-1),
-            p=np.column_stack([k, np.zeros(3)]).reshape(-1),
-            binning_x=0,
-            binning_y=0,
-            roi=self._ros.RegionOfInterest(0, 0, 0, 0, False),
-        )
+        lens = {"d": np.zeros(5), "k": k.reshape(-1), "r": np.eye(3).reshape(-1)}
+        lens |= {"p": np.column_stack([k, np.zeros(3)]).reshape(-1), "binning_x": 0, "binning_y": 0}
+        header, whole = self._header(view.time_s, self._frame(f"camera/{camera.name}")), (0, 0, 0, 0, False)
+        roi = self._ros.RegionOfInterest(*whole)
+        return self._ros.CameraInfo(header, camera.height, camera.width, "plumb_bob", **lens, roi=roi)
 
     def _image(self, frame: Frame) -> Any:
         header = self._header(frame.view.time_s, self._frame(f"camera/{frame.view.camera.name}"))

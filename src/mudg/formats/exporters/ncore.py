@@ -180,11 +180,7 @@ class _WrittenLog:
         self._start_us, self._end_us = min(times), max(max(times), min(times) + 1)
         self._rig = self._keys(ego.times_s, lambda time_s: ego.pose_at(time_s)).covering(self._start_us, self._end_us)
         self._mounts = records.mounts(FIXED_M)
-        self._paths = {
-            sensor: self._path(sensor)
-            for sensor in (*self._names("camera"), *self._names("lidar"))
-            if sensor not in self._mounts
-        }
+        self._paths = {sensor: self._path(sensor) for sensor in self._ids if sensor not in self._mounts}
 
     def write(self, folder: Path, name: str) -> list[Path]:
         """The files, in the order in which they take their place."""
@@ -201,7 +197,8 @@ class _WrittenLog:
         intrinsics, masks = component("Intrinsics"), component("Masks")
         for camera, recorded in self._scene.cameras.items():
             sensor = self._ids[f"camera/{camera}"]
-            intrinsics.store_camera_intrinsics(sensor, camera_model(self._package.data, recorded))
+            model = self._package.data.OpenCVPinholeCameraModelParameters.from_dict(intrinsics_of(recorded))
+            intrinsics.store_camera_intrinsics(sensor, model)
             masks.store_camera_masks(sensor, _masks(self._scene, self._frames[camera]))
         with log.task("export", len(self._scene.frames) + len(self._scene.sweeps)) as bar:
             for camera, frames in self._frames.items():
@@ -240,9 +237,6 @@ class _WrittenLog:
         return at + first, at + last
 
     # -- poses
-
-    def _names(self, kind: str) -> list[str]:
-        return [name for name in self._ids if name.startswith(f"{kind}/")]
 
     def _keys(self, times_s: Iterable[float], pose_at: Any) -> PoseKeys:
         """Poses at whole microseconds, each once."""
@@ -330,18 +324,18 @@ def sensor_ids(cameras: Iterable[str], lidars: Iterable[str]) -> dict[str, str]:
     return made
 
 
-def camera_model(data: Any, camera: Camera) -> Any:
-    """The intrinsics of a pinhole camera, f32."""
-    return data.OpenCVPinholeCameraModelParameters(
-        resolution=np.array([camera.width, camera.height], np.uint64),
-        shutter_type=data.ShutterType[shutter_type(camera)],
-        external_distortion_parameters=None,
-        principal_point=np.array([camera.cx, camera.cy], np.float32),
-        focal_length=np.array([camera.fx, camera.fy], np.float32),
-        radial_coeffs=np.zeros(6, np.float32),
-        tangential_coeffs=np.zeros(2, np.float32),
-        thin_prism_coeffs=np.zeros(4, np.float32),
-    )
+def intrinsics_of(camera: Camera) -> dict[str, Any]:
+    """A pinhole camera as a record: principal point from the corner of the image."""
+    return {
+        "resolution": [camera.width, camera.height],
+        "shutter_type": shutter_type(camera),
+        "external_distortion_parameters": None,
+        "principal_point": [camera.cx, camera.cy],
+        "focal_length": [camera.fx, camera.fy],
+        "radial_coeffs": [0.0] * 6,
+        "tangential_coeffs": [0.0] * 2,
+        "thin_prism_coeffs": [0.0] * 4,
+    }
 
 
 def _masks(scene: Scene, frames: list[Frame]) -> dict[str, Any]:

@@ -91,15 +91,6 @@ def returns_of(columns: Columns, where: object, places: Iterable[NDArray[np.floa
 
 
 @contextmanager
-def record_fields(what: str, where: object, expected: str) -> Iterator[None]:
-    """Code that takes a foreign record apart: what is missing or of another type becomes an InputError ``what``."""
-    try:
-        yield
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError, RecursionError) as error:
-        raise InputError(what, where=str(where), got=repr(error)[:120], expected=expected) from error
-
-
-@contextmanager
 def arrow_files(path: Path) -> Iterator[None]:
     """Code that reads a Feather or Parquet file with pyarrow. ResourceError: it is not installed. InputError: the file
     is damaged or cut off."""
@@ -138,18 +129,14 @@ Resolution = int | tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class ImportOptions:
-    """Options of an import.
-
-    Args:
-        frames: source frame numbers ``(first, end)``, end not included; None takes all.
-        cameras: the dataset's camera names; empty takes the importer's default.
-        sequence: which sequence of a folder that holds many. poses, boxes: files to use instead of those found.
-        skip_missing: leave out frames of which an image, scan or vehicle pose is missing, instead of refusing.
-        untwist: undo the distortion of scans by the vehicle's motion; auto decides by what the dataset documents.
-        test_every: hold out every n-th frame of all cameras (n, 2n, ...); 0 holds out none.
-        resolution: size of the scene's images; None keeps the recorded one.
-        workers: threads that convert frames; 0 = as many as there are processors to use. Results do not depend on it.
-    """
+    """Options of an import. ``frames``: source frame numbers (first, end), end not included; None takes all.
+    ``cameras``: the dataset's camera names; empty takes the importer's default. ``sequence``: which one of a folder
+    that holds many. ``poses``, ``boxes``: files to use instead of those found. ``skip_missing``: leave out frames of
+    which an image, scan or vehicle pose is missing, instead of refusing. ``untwist``: undo the distortion of scans by
+    the vehicle's motion; auto decides by what the dataset documents. ``test_every``: hold out every n-th frame of all
+    cameras (n, 2n, ...); 0 holds out none. ``resolution``: size of the scene's images; None keeps the recorded one.
+    ``workers``: threads that convert frames; 0 = as many as there are processors to use. Results do not depend on
+    it."""
 
     frames: tuple[int, int] | None = None
     cameras: tuple[str, ...] = ()
@@ -233,10 +220,8 @@ def for_each(
 ) -> None:
     """Do ``work`` on every item with a progress bar, in ``workers`` threads (0 = as many as there are processors to
     use); at most two items per worker are in memory. ``items``: read lazily, by the calling thread. ``total``: their
-    number; 0 = unknown. ``name``: what an item is called, put before the place of an error.
-
-    Raises the error of the earliest failed item. No item is started after one failed; those under way are waited for.
-    """
+    number; 0 = unknown. ``name``: what an item is called, put before the place of an error. Raises the error of the
+    earliest failed item. No item is started after one failed; those under way are waited for."""
     workers = workers or native.default_threads()
     pending: deque[Future[None]] = deque()
     with log.task(title, total) as bar, ThreadPoolExecutor(workers, thread_name_prefix="importer") as pool:
@@ -303,9 +288,9 @@ def seconds(times: Sequence[int] | Sequence[float] | NDArray, unit: TimeUnit, wh
     return since_start
 
 
-def check_epoch(stamps: NDArray[np.integer], per_second: int, where: str) -> None:
-    """Refuse integer time stamps that are not since 1970 in the unit ``per_second`` (10**6 = microseconds)."""
-    unit = {10**6: "microseconds", 10**9: "nanoseconds"}[per_second]
+def check_epoch(stamps: NDArray[Any], per_second: int, where: str) -> None:
+    """Refuse time stamps that are not since 1970 in the unit ``per_second`` (10**6 = microseconds)."""
+    unit = {1: "seconds", 10**6: "microseconds", 10**9: "nanoseconds"}[per_second]
     outside = (stamps < _EPOCH_S[0] * per_second) | (stamps > _EPOCH_S[1] * per_second)
     if outside.any():
         what, expected, got = "time stamp is in another unit", f"{unit} since 1970", f"{int(stamps[outside][0])}"

@@ -46,20 +46,18 @@ _EGO_MARGIN_S: Final = 0.6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneImage:
-    """One image on its way into a scene, as ``<camera>/<number>``. Images of one ``moment`` are held out together."""
+    """One image on its way into a scene, as ``<camera>/<number>``, at a time of the scene's clock. ``where``: for
+    errors; empty = the path. ``labels``: see ``SceneWriter.add_label``; in the scene's size. Images of one ``moment``
+    (None = the number) are held out together."""
 
     camera: str
     number: int
     time_s: float
-    """Of the scene's clock."""
     world_from_cam: Matrix
     image: Path | bytes
     where: str = ""
-    """For errors; empty = the path."""
     labels: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """See ``SceneWriter.add_label``; in the scene's size."""
     moment: int | None = None
-    """None = the number."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,8 +79,7 @@ class SceneContent(Generic[Item]):
     ``name``: the scene's id. ``source``: its notes are logged. ``fits``: by the cameras' scene names, in the order of
     the scene. ``items``: what is converted one by one; may be a generator (``total`` says how many then). ``convert``:
     an item to its images and sweeps; called from several threads if ``workers`` > 1. ``item_name``: put before the
-    place of an error. ``tracks``: called after the last item: tracks, and notes about them.
-    """
+    place of an error. ``tracks``: called after the last item: tracks, and notes about them."""
 
     name: str
     source: Source
@@ -204,8 +201,7 @@ class DriveLog:
     ``name``: the scene's id. ``cameras``: by scene name; the first one counts frames. ``images``, ``sweeps``: in any
     order; times in seconds on one clock. ``where``: for messages. ``optics``: by scene name; other cameras are
     rectified. ``box_times``: ``sweeps``: keys of tracks are the times of the sweeps in which people saw the boxes;
-    ``own``: the boxes' own.
-    """
+    ``own``: the boxes' own."""
 
     name: str
     cameras: Mapping[str, Camera]
@@ -496,16 +492,11 @@ class BoxTracks:
         late_s: float = 0.0,
         where: str = "",
     ) -> None:
-        """Add one box of the object ``track``. Raises InputError: the size is not positive or absurd, or the id is
-        longer than 200 bytes.
-
-        Args:
-            label: of ``label_of``; the track takes its commonest one. size_m: length, width, height.
-            world_from_box: f64[4, 4], x forward, y left, z up, origin in the centre.
-            standing: the data set says with every box of the object that it does not move in the whole log.
-            late_s: how long after ``time_s`` the box was measured; it is moved there with the object's velocity.
-            where: file and record, for messages.
-        """
+        """Add one box of the object ``track``, f64[4, 4], x forward, y left, z up, origin in the centre; ``size_m``:
+        length, width, height. ``label``: of ``label_of``; the track takes its commonest one. ``standing``: the data set
+        says with every box of the object that it does not move in the whole log. ``late_s``: how long after ``time_s``
+        the box was measured; it is moved there with the object's velocity. Raises InputError: the size is not positive
+        or absurd, or the id is longer than 200 bytes."""
         foreign_name(track, f"{where or self._where}: id of an object")
         size = box_size(*size_m, where=where or f"{self._where}: object {track} ({label})")
         if not standing:
@@ -517,14 +508,11 @@ class BoxTracks:
     def tracks(
         self, speeds: Speeds | None = None, images_s: Mapping[float, tuple[float, float]] | None = None
     ) -> tuple[list[Track], list[str]]:
-        """All tracks in the order of their first boxes, and notes. Raises InputError: an object has two boxes at one
-        moment; length and width are swapped.
-
-        The size is the median over the track. What stands gets one pose (median place, mean heading) from its first to
-        its last moment. What may move is split where it is not seen for more than ``max_gap_s``: ``7``, ``7.1``, ...
-        ``speeds``: how velocities are found; None = from the neighbouring boxes of a piece. ``images_s``: time of a box
-        -> times of the first and last image that show the object, which a track reaches to.
-        """
+        """All tracks in the order of their first boxes, and notes. The size is the median over the track. What stands
+        gets one pose (median place, mean heading) from its first to its last moment. What may move is split where it is
+        not seen for more than ``max_gap_s``: ``7``, ``7.1``, ... ``speeds``: how velocities are found; None = from the
+        neighbouring boxes of a piece. ``images_s``: time of a box -> times of the first and last image that show the
+        object, which a track reaches to. Raises InputError: two boxes at one moment; length and width are swapped."""
         tracks: list[Track] = []
         split = 0
         for name, numbers in self._rows.items():

@@ -39,8 +39,7 @@ def brown_conrady(
 ) -> Lens:
     """Radial and tangential distortion in OpenCV's order: k1 k2 p1 p2 k3, and the rational model's k4 k5 k6.
 
-    Source: D. C. Brown, Close-range camera calibration, 1971; the form of the OpenCV calibration module.
-    """
+    Source: D. C. Brown, Close-range camera calibration, 1971; the form of the OpenCV calibration module."""
 
     def distort(xy: Floats) -> Floats:
         x, y = xy[:, 0], xy[:, 1]
@@ -77,8 +76,7 @@ class ImageFit:
 
     ``camera``: the scene's: pinhole, rectified, of the scene's size; ``recorded``: of the size of the files. ``note``:
     what is done, for ``Source.notes``; empty if images are kept as they are. ``table``: where each pixel of the
-    rectified image (recorded size) comes from; None if images are rectified already.
-    """
+    rectified image (recorded size) comes from; None if images are rectified already."""
 
     camera: Camera
     recorded: Camera
@@ -126,15 +124,10 @@ class ImageFit:
 
 
 def fit_images(camera: Camera, options: ImportOptions, lens: Lens | None = None) -> ImageFit:
-    """Plan what happens to the images of a camera. A lens' pinhole camera keeps the optical centre, and has its focal
-    length, longer just as far as needed for every pixel to show something. Raises InputError: the lens cannot be
-    rectified like this. UsageError: ``resolution`` is larger than the images.
-
-    Args:
-        camera: as recorded: size and intrinsics of the files; with a lens, its coefficients in ``distortion``.
-        options: ``resolution`` is used.
-        lens: the lens' distortion; None = images are rectified.
-    """
+    """Plan what happens to the images of a camera as recorded: size and intrinsics of the files; with a ``lens``, its
+    coefficients in ``distortion``; None = images are rectified. A lens' pinhole camera keeps the optical centre, and
+    has its focal length, longer just as far as needed for every pixel to show something. Raises InputError: the lens
+    cannot be rectified like this. UsageError: ``options.resolution`` is larger than the images."""
     changes = []
     table = None
     out = camera

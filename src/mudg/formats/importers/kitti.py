@@ -536,8 +536,7 @@ class _Recording:
     ``images``: scene camera name -> frame number -> file, ``numbers``: its KITTI number; ``scans`` may be empty.
     ``single``: one frame of the object benchmark, without a clock or motion. ``frames``: the numbers that are imported.
     ``image_s`` by camera and frame and ``scan_s`` by frame: seconds since the first frame, which is ``start_s`` in the
-    source. ``untwist``: whether scans are to be untwisted with the vehicle's path ``ego``.
-    """
+    source. ``untwist``: whether scans are to be untwisted with the vehicle's path ``ego``."""
 
     def __init__(self, folder: Path, options: ImportOptions) -> None:
         self.folder, self.options = folder, options

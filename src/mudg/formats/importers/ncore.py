@@ -30,6 +30,7 @@ from scipy.spatial.transform import Rotation
 from mudg.base import log, memory, store
 from mudg.base.errors import InputError, MudgError
 from mudg.base.geometry import all_rigid, from_rotation_translation
+from mudg.base.records import understood
 from mudg.base.types import Camera, EgoPath, Scene, Shutter, Source, SweepPoints, Track
 from mudg.formats.exporters.ncore import (
     ABOUT,
@@ -129,11 +130,8 @@ def foreign_reader(where: str) -> Iterator[None]:
 
 
 def check_store(path: Path) -> None:
-    """Refuse a store that is cut off, that contradicts itself, or that would take more memory than its files can need.
-
-    Raises:
-        InputError: so it is; nothing of the size that was promised has been allocated.
-    """
+    """Refuse a store that is cut off, that contradicts itself, or that would take more memory than its files can need:
+    nothing of the size that was promised is allocated."""
     if path.is_dir():
         files = [store.regular(file) for file in sorted(path.rglob("*")) if not file.is_dir()]
         members = {file.relative_to(path).as_posix(): _StoredMember(file, 0, file.stat().st_size) for file in files}
@@ -148,7 +146,7 @@ def check_store(path: Path) -> None:
     if METADATA not in members:
         what, expected = "NCore store has no metadata", "a store that was finished"
         raise InputError(what, where=where, expected=expected, remedy="was the program that wrote it stopped?")
-    with common.record_fields("NCore metadata make no sense", where, "groups and arrays of zarr 2"):
+    with understood("NCore metadata: groups and arrays of zarr 2", where):
         metadata = _cbor(_unpacked(members[METADATA].read(), where), where)["metadata"]
         groups = dict.fromkeys(name.partition("/")[0] for name in metadata if "/" in name)
         note_unknown("the stores of the recording", groups, COMPONENTS)
@@ -176,7 +174,7 @@ def _members_of_tar(path: Path) -> dict[str, _StoredMember]:
     if offset + length > size - _BLOCK:
         what, got, remedy = "index lies outside of the file", f"{length} bytes from {offset} on", "copy the file again"
         raise InputError(what, where=where, expected=f"at most {size - _BLOCK} bytes", got=got, remedy=remedy)
-    with common.record_fields("index makes no sense", where, "names, offsets and sizes of members"):
+    with understood("an index: names, offsets and sizes of members", where):
         table = _cbor(_unpacked(_StoredMember(path, offset, length).read(), where), where)
         names, offsets, sizes = table["items"], table["offset_datas"], table["sizes"]
         if not len(names) == len(offsets) == len(sizes):
@@ -347,7 +345,7 @@ def _is_store(path: Path) -> bool:
 
 def _listed(path: Path) -> list[Path]:
     """The stores that a ``.json`` names."""
-    with common.record_fields("list of stores makes no sense", path, "component_stores with a path each"):
+    with understood("a list of stores: component_stores with a path each", str(path)):
         content = store.read_json(path)
         note_unknown_within(path.name, content, _LIST)
         names = [one["path"] for one in content["component_stores"]]
@@ -492,7 +490,7 @@ def _scene_names(sensors: Iterable[str], taken: Collection[str] = ()) -> dict[st
 
 def _spans(reader: Any, where: str) -> Times:
     """First and last microsecond of every frame of a sensor, i64[N, 2]."""
-    with common.record_fields("frames of a sensor have no times", where, "frames_timestamps_us: begin and end of each"):
+    with understood("times of frames: begin and end of each", where):
         spans = np.asarray(reader.frames_timestamps_us, np.uint64).reshape(-1, 2)
         if (spans > 2**62).any():
             raise InputError("time stamp is no time in microseconds", where=where, got=str(int(spans.max())))

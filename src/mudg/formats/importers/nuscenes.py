@@ -77,8 +77,7 @@ def read_scan(path: Path) -> SweepPoints:
 def point_times(xyz: NDArray[np.float32], rings: NDArray[np.float32]) -> NDArray[np.float32]:
     """When each point was measured, f32[N] seconds relative to the end of the turn (-0.05..0).
 
-    By column where all 32 returns of every column are there in firing order, else by azimuth.
-    """
+    By column where all 32 returns of every column are there in firing order, else by azimuth."""
     columns = len(rings) // BEAMS
     if columns > 1 and len(rings) == columns * BEAMS and (rings.reshape(-1, BEAMS) == np.arange(BEAMS)).all():
         fraction = (np.arange(len(rings)) // BEAMS + 1) / columns
@@ -130,17 +129,15 @@ def read_table(path: Path) -> list[Row]:
     return rows
 
 
-def find_records(
-    path: Path, field: str, values: Collection[str], *, buffer_bytes: int = _BUFFER_BYTES
-) -> Iterator[Row]:
-    """Records whose text ``field`` is one of ``values``, in file order.
+def find_records(path: Path, name: str, values: Collection[str], *, buffer_bytes: int = _BUFFER_BYTES) -> Iterator[Row]:
+    """Records whose text field ``name`` is one of ``values``, in file order.
 
     Records that do not match are not parsed: the field is looked for in the bytes, and the record around a hit, from
     brace to brace, is cut out and parsed strictly. The file's first and last character are checked, so that a cut-off
     table is noticed. ``values`` are tokens: texts without escapes. Raises InputError: no JSON array, a matching record
     that is malformed or holds braces, or the file is cut off."""
     wanted = {value.encode() for value in values}
-    hit = re.compile(rb'"' + re.escape(field.encode()) + rb'"\s*:\s*"([^"\\]*)"')
+    hit = re.compile(rb'"' + re.escape(name.encode()) + rb'"\s*:\s*"([^"\\]*)"')
     with store.open_file(_there(path)) as file:
         buffer, offset, piece = file.read(buffer_bytes), 0, b" "
         if buffer.lstrip()[:1] != b"[":
@@ -183,29 +180,15 @@ def _there(path: Path) -> Path:
 # --- rows -----------------------------------------------------------------------------------------
 
 
-def _field(row: Row, key: str, where: str, expected: str, kinds: Any, count: int = 0) -> Any:
-    """A field that is one of ``kinds``, or a list of ``count`` such."""
-    found = row.get(key)
+def field(row: Row, key: str, where: str, kind: type, count: int = 0) -> Any:
+    """A field of a kind (float: any number), or a list of ``count`` such."""
+    found, kinds = row.get(key), (int, float) if kind is float else kind
     items = found if count and isinstance(found, list) else [found]
     if len(items) != (count or 1) or not all(isinstance(one, kinds) and not isinstance(one, bool) for one in items):
         what, where = f"field {key!r} is missing or malformed", f"{where}: record {row.get('token', '?')!r}"
-        raise InputError(what, where=where, expected=expected, got=repr(found)[:120])
+        expected = f"{count} numbers" if count else {str: "a text", int: "an integer"}[kind]
+        raise InputError(what, where=where, expected=expected, got=repr(found))
     return found
-
-
-def text(row: Row, key: str, where: str) -> str:
-    """A text field."""
-    return _field(row, key, where, "a text", str)
-
-
-def integer(row: Row, key: str, where: str) -> int:
-    """An integer field."""
-    return _field(row, key, where, "an integer", int)
-
-
-def numbers(row: Row, key: str, count: int, where: str) -> list[float]:
-    """A field that is a list of ``count`` numbers."""
-    return [float(one) for one in _field(row, key, where, f"{count} numbers", int | float, count)]
 
 
 class TokenTable:
@@ -299,10 +282,10 @@ def _all_of(folder: Path, name: str) -> TokenTable:
     return TokenTable(path, read_table(path))
 
 
-def _those(folder: Path, name: str, field: str, values: set[str]) -> TokenTable:
-    """The records of a large table whose ``field`` is one of ``values``."""
+def _those(folder: Path, name: str, key: str, values: set[str]) -> TokenTable:
+    """The records of a large table whose field ``key`` is one of ``values``."""
     path = folder / f"{name}.json"
-    return TokenTable(path, find_records(path, field, values))
+    return TokenTable(path, find_records(path, key, values))
 
 
 def read_log(source: Path, options: ImportOptions) -> DriveLog:
@@ -317,14 +300,14 @@ def read_log(source: Path, options: ImportOptions) -> DriveLog:
     for row in data.rows.values():
         calibration = calibrations.get(row, "calibrated_sensor_token", data.where)
         sensor = sensors.get(calibration, "sensor_token", calibrations.where)
-        channel_of[row["token"]] = text(sensor, "channel", sensors.where)
+        channel_of[row["token"]] = field(sensor, "channel", sensors.where, str)
     there = {raw: name for raw, name in CAMERAS.items() if raw in channel_of.values()}
     chosen = {there[raw]: raw for raw in common.chosen_cameras(there, options, where, tuple(CAMERAS))}
     common.refuse_missing_cameras(there.values(), CAMERAS.values(), options, where)
     used = [row for row in data.rows.values() if channel_of[row["token"]] in (*chosen.values(), LIDAR)]
     _check_times(used, samples, data.where)
     used.sort(key=lambda row: row["timestamp"])
-    ego_poses = _those(folder, "ego_pose", "token", {text(r, "ego_pose_token", data.where) for r in used})
+    ego_poses = _those(folder, "ego_pose", "token", {field(r, "ego_pose_token", data.where, str) for r in used})
     zero_us = int(used[0]["timestamp"])
 
     def time_s(row: Row) -> float:
@@ -346,7 +329,7 @@ def read_log(source: Path, options: ImportOptions) -> DriveLog:
         images.append(ImageRecord(name, time_s(row), pose, path))
         if name not in cameras:
             here = f"{calibrations.where}: record {calibration['token']!r}"
-            size = integer(row, "width", data.where), integer(row, "height", data.where)
+            size = field(row, "width", data.where, int), field(row, "height", data.where, int)
             cameras[name] = common.pinhole_camera(name, size, calibration.get("camera_intrinsic"), here)
     cameras = {name: cameras[name] for name in chosen if name in cameras}
     tracks, notes = _read_tracks(folder, samples, zero_us)
@@ -363,7 +346,7 @@ def _choose_scene(source: Path, options: ImportOptions) -> tuple[Path, Row]:
     releases, scenes = _releases(source), dict[str, tuple[Path, Row]]()
     for folder in releases:
         for row in read_table(folder / "scene.json"):
-            name = text(row, "name", str(folder / "scene.json"))
+            name = field(row, "name", str(folder / "scene.json"), str)
             if wanted in (name, row.get("token")) and wanted_release in ("", folder.name):
                 return folder, row
             scenes[f"{folder.name}/{name}" if len(releases) > 1 else name] = folder, row
@@ -374,15 +357,15 @@ def _choose_scene(source: Path, options: ImportOptions) -> tuple[Path, Row]:
 def _samples_in_order(folder: Path, scene: Row) -> dict[str, int]:
     """Key frames of a scene: token -> time stamp in microseconds, in the order of the chain."""
     where = str(folder / "scene.json")
-    token = text(scene, "token", where)
+    token = field(scene, "token", where, str)
     samples = _those(folder, "sample", "scene_token", {token})
-    at = text(scene, "first_sample_token", where)
+    at = field(scene, "first_sample_token", where, str)
     stamps: dict[str, int] = {}
     while at:
         if at in stamps:
             raise InputError("the chain of key frames runs in a circle", where=samples.where, got=f"back at {at!r}")
-        stamps[at] = integer(samples.record(at, samples.where), "timestamp", samples.where)
-        at = text(samples.rows[at], "next", samples.where)
+        stamps[at] = field(samples.record(at, samples.where), "timestamp", samples.where, int)
+        at = field(samples.rows[at], "next", samples.where, str)
     values = np.array(list(stamps.values()), np.int64)
     common.check_epoch(values, MICROSECONDS, f"{samples.where}: timestamp")
     if (np.diff(values) <= 0).any():
@@ -395,7 +378,7 @@ def _samples_in_order(folder: Path, scene: Row) -> dict[str, int]:
 
 def _check_times(rows: Sequence[Row], samples: Mapping[str, int], where: str) -> None:
     """Stamps of images and sweeps are microseconds near their scene."""
-    stamps = np.array([integer(row, "timestamp", where) for row in rows], np.int64)
+    stamps = np.array([field(row, "timestamp", where, int) for row in rows], np.int64)
     common.check_epoch(stamps, MICROSECONDS, f"{where}: timestamp")
     first, last = min(samples.values()), max(samples.values())
     beside = np.maximum(first - stamps, stamps - last) / MICROSECONDS
@@ -407,7 +390,7 @@ def _check_times(rows: Sequence[Row], samples: Mapping[str, int], where: str) ->
 
 def _pose(row: Row, where: str) -> Matrix:
     """Rigid f64[4, 4] of a record with ``rotation`` (w, x, y, z) and ``translation``."""
-    rotation, translation = numbers(row, "rotation", 4, where), numbers(row, "translation", 3, where)
+    rotation, translation = field(row, "rotation", where, float, 4), field(row, "translation", where, float, 3)
     return common.pose_from_quaternion(rotation, translation, f"{where}: record {row.get('token', '?')!r}")
 
 
@@ -426,12 +409,12 @@ def _read_tracks(folder: Path, samples: Mapping[str, int], zero_us: int) -> tupl
     for row in annotations.rows.values():
         instance = instances.get(row, "instance_token", annotations.where)
         category = categories.get(instance, "category_token", instances.where)
-        label = tracks.label_of(text(category, "name", categories.where))
+        label = tracks.label_of(field(category, "name", categories.where, str))
         if attributes is not None and label in _RIDDEN:
             tokens = row.get("attribute_tokens")
             known = [attributes.rows.get(str(one), {}) for one in tokens] if isinstance(tokens, list) else []
             label = _RIDDEN[label] if any(one.get("name") == _WITH_RIDER for one in known) else label
-        width, length, height = numbers(row, "size", 3, annotations.where)  # in this order in the tables
+        width, length, height = field(row, "size", annotations.where, float, 3)  # in this order in the tables
         where = f"{annotations.where}: record {row['token']!r}"
         time_s = (samples[row["sample_token"]] - zero_us) / MICROSECONDS
         pose = _pose(row, annotations.where)

@@ -41,6 +41,7 @@ from mudg.base import palette, store
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert, transform_points, yaw_matrix
 from mudg.base.plain_pickle import MAX_BYTES, NUMPY_MAKERS, Array, Maker, Name, PickledObject, read_pickle
+from mudg.base.records import understood
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints
 from mudg.formats.importers import common
 from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
@@ -346,8 +347,7 @@ class _Motion:
     ``world_from_source``: the scene's world from the data set's, f64[4, 4]. ``raw_s``: the data set's time of each
     chosen frame's cloud, ``start_s``: the one that is 0 in the scene. ``path``: the vehicle, x forward, y left, z up,
     at the clouds' times from one before the first chosen frame on. By camera: ``camera_s`` f64[n], when its images
-    were taken, and ``world_from_cam`` f64[n, 4, 4].
-    """
+    were taken, and ``world_from_cam`` f64[n, 4, 4]."""
 
     def __init__(
         self, folder: Path, frames: Sequence[int], cameras: Sequence[str], options: ImportOptions, notes: list[str]
@@ -425,9 +425,7 @@ def _times(path: Path, frames: Sequence[int]) -> NDArray[np.float64]:
         raise InputError("timestamps are not numbers", where=str(path), got=str(values)[:80])
     times = np.array(values, np.float64)
     common.seconds(times, "s", str(path))
-    if times[0] > 1e11:
-        what, remedy = "timestamps are in another unit than expected", "divide them by 1000 or 1000000"
-        raise InputError(what, where=str(path), expected="seconds of the epoch", got=f"{times[0]:.6g}", remedy=remedy)
+    common.check_epoch(times, 1, str(path))
     return times
 
 
@@ -435,9 +433,7 @@ def _poses(path: Path, frames: Sequence[int]) -> Matrix:
     poses = []
     for number, entry in zip(frames, _entries(path, frames), strict=True):
         where = f"{path}: entry {number}"
-        with common.record_fields(
-            "pose is incomplete", where, "position x y z (metres) and heading w x y z (quaternion)"
-        ):
+        with understood("a pose: position x y z (metres) and heading w x y z (quaternion)", where):
             heading = [entry["heading"][key] for key in "wxyz"]
             poses.append(common.pose_from_quaternion(heading, [entry["position"][key] for key in "xyz"], where))
         note_unknown_within(path.name, entry, _POSE_FIELDS)
@@ -447,7 +443,7 @@ def _poses(path: Path, frames: Sequence[int]) -> Matrix:
 def _fit(folder: Path, name: str, image: Path, options: ImportOptions) -> ImageFit:
     path = folder / "intrinsics.json"
     values = store.read_json(path)
-    with common.record_fields("intrinsics are incomplete", path, "fx fy cx cy"):
+    with understood("intrinsics: fx fy cx cy", str(path)):
         fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
         note_unknown(path.name, values, OFFICIAL[path.name])
     # the data set counts pixels from the centre of the top-left one, as OpenCV does

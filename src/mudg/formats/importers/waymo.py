@@ -277,8 +277,7 @@ def _carried(
     """Points of the LiDAR's frame, each with the pose (roll, pitch, yaw, x, y, z) of its moment, to the frame's moment.
 
     Rotations are about z, then y, then x of the vehicle. Positions are taken relative to the frame's pose first: they
-    are tens of kilometres, and their differences centimetres.
-    """
+    are tens of kilometres, and their differences centimetres."""
     x, y, z = (xyz @ vehicle_from_lidar[:3, :3].T + vehicle_from_lidar[:3, 3]).T
     (cr, cp, cy), (sr, sp, sy) = np.cos(poses[:, :3].T), np.sin(poses[:, :3].T)
     y, z = cr * y - sr * z, sr * y + cr * z

@@ -138,24 +138,16 @@ def morton_order(means: NDArray[np.floating]) -> NDArray[np.intp]:
     low = means.min(0).astype(np.float64)
     span = np.maximum(means.max(0).astype(np.float64) - low, 1e-9)
     cells = ((means.astype(np.float64) - low) / span * ((1 << 21) - 1)).astype(np.uint64)
-    key = np.zeros(len(means), np.uint64)
-    for axis in range(3):
-        key |= _spread(cells[:, axis]) << np.uint64(axis)
-    return np.argsort(key, kind="stable")
+    key = with_gaps(cells) << np.arange(3, dtype=np.uint64)
+    return np.argsort(np.bitwise_or.reduce(key, axis=1), kind="stable")
 
 
-def _spread(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
+def with_gaps(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """Two zero bits after every bit of 21."""
-    v = bits
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        v = (v | (v << np.uint64(shift))) & np.uint64(mask)
-    return v
+    masks = (0x1F00000000FFFF, 0x1F0000FF0000FF, 0x100F00F00F00F00F, 0x10C30C30C30C30C3, 0x1249249249249249)
+    for shift, mask in zip((32, 16, 8, 4, 2), masks):
+        bits = (bits | bits << np.uint64(shift)) & np.uint64(mask)
+    return bits
 
 
 def smallest_three(quats: Floats) -> tuple[NDArray[np.intp], NDArray[np.float64]]:

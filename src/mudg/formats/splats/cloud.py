@@ -311,19 +311,19 @@ def doubtful_values(cloud: SplatCloud, where: str) -> list[str]:
         got = f"sizes from {cloud.log_scales[:, :2].min():.3g}, opacities from {cloud.logits.min():.3g} to"
         remedy = "write log(scale) and log(opacity / (1 - opacity)) into the file"
         raise InputError(what, where=where, expected=expected, got=f"{got} {cloud.logits.max():.3g}", remedy=remedy)
-    found, fog = [], "if it looks like fog, write"
+    found, fog, stored = [], "if it looks like fog, write", "had been stored where"
     if plain_opacity:
-        stored = "all opacities lie between 0.5 and 0.73, as if values from 0 to 1 had been stored where logits are due"
-        found.append(f"{stored}: {fog} log(opacity / (1 - opacity)) into the file")
+        doubt = f"all opacities lie between 0.5 and 0.73, as if values from 0 to 1 {stored} logits are due"
+        found.append(f"{doubt}: {fog} log(opacity / (1 - opacity)) into the file")
     if plain_size:
-        stored = "all Gaussians are wider than 1 m, as if sizes had been stored where their logarithms are due"
-        found.append(f"{stored}: {fog} log(scale) into the file")
-    if len(cloud) and (cloud.logits >= 0).all() and cloud.logits.max() > 2 * MOST_LOGIT:
-        stored = "as if values from 0 to 255 had been stored where logits are due"
-        found.append(f"opacities reach {cloud.logits.max():.4g}, {stored}: all Gaussians count as solid")
-    if len(cloud) and np.median(np.abs(cloud.sh[:, 0])) > 8:
-        stored = "colours lie far beyond black and white, as if values from 0 to 255 had been stored as f_dc"
-        found.append(f"{stored}: write (colour / 255 - 0.5) / 0.2821 into the file")
+        doubt = f"all Gaussians are wider than 1 m, as if sizes {stored} their logarithms are due"
+        found.append(f"{doubt}: {fog} log(scale) into the file")
+    if (cloud.logits >= 0).all() and cloud.logits.max() > 2 * MOST_LOGIT:
+        doubt = f"opacities reach {cloud.logits.max():.4g}, as if values from 0 to 255 {stored} logits are due"
+        found.append(f"{doubt}: all Gaussians count as solid")
+    if np.median(np.abs(cloud.sh[:, 0])) > 8:
+        doubt = "colours lie far beyond black and white, as if values from 0 to 255 had been stored as f_dc"
+        found.append(f"{doubt}: write (colour / 255 - 0.5) / 0.2821 into the file")
     return found
 
 

@@ -169,7 +169,8 @@ def format_of(content: bytes, name: str) -> str:
     read."""
     suffix = PurePath(name).suffix.lower()
     if content[:3] == b"ply":
-        return "compressed-ply" if ply.is_compressed(content) else "ply"
+        header = content[: content.find(b"end_header", 0, ply.MAX_HEADER) + 1]
+        return "compressed-ply" if b"element chunk" in header else "ply"
     for mark, found in ((b"\x1f\x8b", "spz"), (b"NGSP", "spz"), (b"glTF", "glb"), (b"PK\x03\x04", "sog")):
         if content.startswith(mark) and suffix != ".usdz":
             return found
@@ -205,15 +206,10 @@ def read_cloud(content: bytes, name: str, choice: str = "file") -> tuple[SplatCl
     if file.step_m > COARSE_M:
         steps = f"its places are stored in steps of {file.step_m * 1000:.3g} mm"
         log.warn(f"{name}: {steps}: take an offset away before the file is written")
-    return in_world(file.cloud, chosen), found
-
-
-def in_world(cloud: SplatCloud, letters: str) -> SplatCloud:
-    """A cloud from other axes in those of this program."""
-    turn = axes.world_from_axes(letters)
+    cloud, turn = file.cloud, axes.world_from_axes(chosen)
     if np.linalg.det(turn) < 0:
         cloud, turn = cloud.mirrored(), turn @ np.diag([1.0, -1.0, 1.0])
-    return cloud.moved(geometry.from_rotation_translation(turn, (0.0, 0.0, 0.0)))
+    return cloud.moved(geometry.from_rotation_translation(turn, (0.0, 0.0, 0.0))), found
 
 
 def losses(name: str, request: WriteRequest) -> list[str]:

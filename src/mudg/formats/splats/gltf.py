@@ -334,8 +334,7 @@ class _GlbFile:
             length, kind = binary.unpacked("<II", content, place, "the second chunk", where)
             if kind == BIN_CHUNK:
                 self.binary = binary.part(content, place + 8, length, "the binary chunk", where)
-        unknown = [name for name in self.document.extensionsRequired if name not in _READ]
-        if unknown:
+        if unknown := [name for name in self.document.extensionsRequired if name not in _READ]:
             what, expected = "the GLB file needs an extension that is not read", ", ".join(_READ)
             remedy = "write the file without it, or as SPZ"
             raise InputError(what, where=f"{where}: JSON", got=listed(unknown), expected=expected, remedy=remedy)
@@ -401,8 +400,7 @@ class _GlbFile:
         """The Gaussians of a primitive, in the frame of its node."""
         attributes, where = primitive.attributes, f"{self.where}: {EXTENSION}"
         kind = parse_record(_Splatting, primitive.extensions[EXTENSION], f"{where}: ")
-        compressed = [name for name in kind.extensions if "compression" in name]
-        if compressed:
+        if compressed := [name for name in kind.extensions if "compression" in name]:
             what, got = "the Gaussians of the GLB file are compressed", listed(compressed)
             expected, remedy = "attributes without compression", "write it without, or as SPZ"
             raise InputError(what, where=where, got=got, expected=expected, remedy=remedy)

@@ -83,8 +83,7 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
         file.notes.append("it has no scale_2: read as flat Gaussians (2DGS)")
     quats, logits = columns_of(table, _indexed("rot", 4)), np.asarray(table["opacity"], np.float32)
     cloud = checked(SplatCloud(means, quats, logs, logits, sh, classes, file.antialias), where)
-    filters = [name for name in names if name.lower() == "filter_3d"]
-    if filters:
+    if filters := [name for name in names if name.lower() == "filter_3d"]:
         cloud = _filtered(cloud, np.asarray(table[filters[0]], np.float64), where)
         file.notes.append("the column filter_3D (Mip-Splatting) went into sizes and opacities")
     used = {*wanted, *_indexed("f_rest", rest), *_UNREAD, *filters, *(["class"] if ours else [])}
@@ -102,16 +101,14 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
 def _refuse_columns(table: NDArray[Any], wanted: tuple[str, ...], where: str) -> None:
     """InputError unless all columns are there, as numbers with a fraction."""
     names = table.dtype.names or ()
-    missing = [name for name in wanted if name not in names]
-    if missing:
+    if missing := [name for name in wanted if name not in names]:
         starts = ("scal", "rot", "quat", "opac", "f_dc", "f_rest", "sh", "feat")
         alike = any(name.lower().startswith(starts) for name in names)
         rename = f"name the columns as 3D Gaussian Splatting does: {', '.join(wanted)}"
         remedy = rename if alike else "points or meshes cannot be imported"
         what = "the PLY file holds no Gaussians" if not alike else "a column of the Gaussians is missing"
         raise InputError(what, where=where, expected=f"a property {missing[0]!r}", got=listed(names), remedy=remedy)
-    whole = [name for name in wanted if name not in "xyz" and table.dtype[name].kind != "f"]
-    if whole:
+    if whole := [name for name in wanted if name not in "xyz" and table.dtype[name].kind != "f"]:
         what, expected = "a column of the Gaussians holds whole numbers", f"{whole[0]} as float"
         remedy = "write logits, logarithms of sizes, and harmonics"
         raise InputError(what, where=where, expected=expected, got=str(table.dtype[whole[0]]), remedy=remedy)
@@ -345,11 +342,6 @@ def compressed_to_bytes(cloud: SplatCloud, marks: Sequence[str] = ()) -> bytes:
         elements.append(("sh", len(cloud), [("uchar", f"f_rest_{index}") for index in range(rest.shape[1])]))
         tables.append(np.trunc((rest / 8 + 0.5) * 256).clip(0, 255).astype(np.uint8).tobytes())
     return header(elements, marks) + b"".join(tables)
-
-
-def is_compressed(content: bytes) -> bool:
-    """Whether the header of a PLY file announces chunks."""
-    return b"element chunk" in content[: content.find(b"end_header", 0, MAX_HEADER) + 1]
 
 
 def compressed_from_bytes(content: bytes, where: str) -> SplatFile:
