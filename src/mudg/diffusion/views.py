@@ -264,7 +264,7 @@ class ViewMaker:
         if not drive.recorded:
             log.warn("synthesize: no recorded image is available; holes are filled with the nearest point's colour")
         self._model, self._drive, self._rules, self._full_size = model, drive, rules, config.full_size
-        self._parts = config.condition
+        self._parts: ConditionParts = config.condition
         self._images = drive.images.setdefault(rules.fine, PreparedImages(scratch))
         self._request = request_of(config, half_of(config) == torch.bfloat16)
 
