@@ -16,11 +16,7 @@ from mudg.editing.script import parse_edits
 SIZE = (4.0, 2.0, 1.6)
 SENSOR = geometry.yaw_matrix(0.0, (0, 0, 2.0))
 WALL_M = 40.0
-
-
-def ground() -> HeightMap:
-    x, y = np.meshgrid(np.arange(-2, 45, 0.25), np.arange(-12, 12, 0.25), indexing="ij")
-    return HeightMap.from_points(np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3))
+GROUND = HeightMap(np.array([-2.0, -12.0]), 0.5, np.zeros((94, 48)))
 
 
 def standing(x: float, y: float = 0.0) -> Actor:
@@ -65,7 +61,7 @@ def shell() -> PointCloud:
 def changed(
     boxes: dict[str, Actor], text: str, surfaces: dict[str, PointCloud]
 ) -> tuple[SweepPoints, SweepPoints, EditPlan]:
-    plan = plan_edits(parse_edits(text, "e"), EditWorld(boxes, None, ground()), lambda source: None)
+    plan = plan_edits(parse_edits(text, "e"), EditWorld(boxes, None, GROUND), lambda source: None)
     points, sweep = recorded(boxes), Sweep("0", "lidar", 0.5, SENSOR, "")
     static = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), "world")
     return points, edited_points(points, sweep, plan, FusedCloud(static, surfaces)), plan
@@ -83,7 +79,7 @@ def test_beams_meet_boxes_points_and_ground_where_geometry_says() -> None:
     assert both.sum() > 0.98 * np.isfinite(hit).sum() and np.median(np.abs(seen[both] - hit[both])) < 0.05
     assert (first[np.isfinite(seen)] >= 0).all()
     down = directions[directions[:, 2] < -0.1]
-    way = lidar.met_ground(down, SENSOR, ground(), np.full(len(down), 1.0), 25.0)
+    way = lidar.met_ground(down, SENSOR, GROUND, np.full(len(down), 1.0), 25.0)
     assert np.allclose(way, -2 / down[:, 2], atol=0.01)
     assert np.isinf(lidar.met_box(directions, geometry.yaw_matrix(0, (-10, 0, 0)), SIZE)).all()  # behind the sensor
 

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 import torch
@@ -46,6 +46,7 @@ from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
 from mudg.core.trajectory import ego_left_world
 from mudg.diffusion.clips import FAR_M, write_shard
 from mudg.diffusion.condition import ConditionRules, DriveInputs, RenderAt, WarpSource, build_conditions
+from mudg.diffusion.settings import Realism
 from mudg.gaussians import fit
 from mudg.gaussians.rendering import render_planes
 from mudg.gaussians.schedule import short_fit
@@ -269,8 +270,6 @@ DEVELOPMENT = tuple(range(HELD_OUT, HELD_OUT + 6))
 REPORTED = tuple(range(HELD_OUT + 100, HELD_OUT + 106))
 """Cities whose scores are reported and on which nothing is chosen."""
 LISTS: dict[str, tuple[int, ...]] = {"development": DEVELOPMENT, "reported": REPORTED}
-
-Realism = Literal["plain", "varied", "mixed"]
 
 FRAMES = 12
 SIZES = len(ASPECTS)

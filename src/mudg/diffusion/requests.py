@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ from mudg.core import noise
 from mudg.core.depth import DepthFit
 from mudg.core.noise import Denoise, Prediction, Schedule
 from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
+from mudg.diffusion.settings import Precision
 from mudg.networks.codec import Modality
 
 
@@ -84,7 +85,6 @@ def picture_row(
 
 
 CPU = torch.device("cpu")
-Precision = Literal["auto", "float32", "bfloat16", "float16"]
 
 
 def half_format(precision: Precision, device: torch.device = CPU, *, float16: bool = False) -> torch.dtype | None:

@@ -7,6 +7,11 @@ from typing import Annotated, Literal
 from mudg.base.config import Limits, setting, settings
 from mudg.base.devices import DeviceName
 
+ConditionParts = Literal["full", "reference", "points", "concat", "repair"]
+Precision = Literal["auto", "float32", "bfloat16", "float16"]
+Realism = Literal["plain", "varied", "mixed"]
+BelowOne = Annotated[float, Limits(ge=0, lt=1)]
+
 
 @settings
 class SynthesizeConfig:
@@ -26,7 +31,7 @@ class SynthesizeConfig:
     models."""
     eta: float | None = setting(default=None, ge=0, le=1)
     """Noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given: 1)."""
-    condition: Literal["full", "reference", "points", "concat", "repair"] = "full"
+    condition: ConditionParts = "full"
     """Which parts of the model's condition are given, to measure what each brings. reference: the nearest recorded
     image alone. points: LiDAR points alone. concat: both, without images warped by depth (published-type models: the
     image in frame 0, not in the image tokens). The shipped models were trained on whole conditions. repair: renders of
@@ -44,7 +49,7 @@ class SynthesizeConfig:
     full_size: bool = True
     """Write views at the camera's size: by the model's finisher, or, where it has none, with detail restored from
     warped recorded images. Off: at the size the model works at."""
-    precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
+    precision: Precision = "auto"
     """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32
     elsewhere (published-type models on older CUDA devices: float16). float16: published-type models on CUDA devices, as
     in the release."""
@@ -86,9 +91,6 @@ class ConvertConfig:
 # mudg learn ---------------------------------------------------------------------------------------
 
 
-BelowOne = Annotated[float, Limits(ge=0, lt=1)]
-
-
 @settings
 class LearnData:
     """Training clips: from recorded logs if `scenes` is given, else from generated cities."""
@@ -119,7 +121,7 @@ class LearnData:
     """Share of the steps after which all cities are in use, 0 to 1."""
     clips_per_city: int = setting(default=4, ge=1)
     """Clips taken from each generated city."""
-    realism: Literal["plain", "varied", "mixed"] = "plain"
+    realism: Realism = "plain"
     """Generated cities: varied = cities, cameras, LiDARs and their faults as in recorded logs (docs/training.md). mixed
     = half of them are. The small model then also learns five aspect ratios, all of about the area width x height.
     Cities for scoring stay plain."""

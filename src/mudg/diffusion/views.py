@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -36,7 +36,7 @@ from mudg.diffusion.model import MDM
 from mudg.diffusion.model_files import Model, generated, is_published
 from mudg.diffusion.published import PublishedMDM, WorkSplit
 from mudg.diffusion.requests import GeneratedClip, SampleRequest, half_format, picture_row
-from mudg.diffusion.settings import SynthesizeConfig
+from mudg.diffusion.settings import ConditionParts, SynthesizeConfig
 from mudg.gaussians.rendering import render_planes
 from mudg.gaussians.storage import load_model
 from mudg.networks.codec import Modality
@@ -48,12 +48,6 @@ from mudg.scene.read import read_image, read_scene
 # with only some of its parts ----------------------------------------------------------------------
 
 
-ConditionParts = Literal["full", "reference", "points", "concat", "repair"]
-"""full: the whole condition. reference: the nearest recorded image alone, put up far away. points: colour and depth of
-the points alone, without recorded images and renders. concat: points and that image, without anything warped by depth,
-and without renders. repair: renders of a fit and that image, without anything measured. Of published-type models
-reference and points leave out the other; concat shows the image in frame 0, beside the points, and not in the image
-tokens."""
 COVERED = 0.5
 """Opacity above which a render covers a pixel."""
 
@@ -61,8 +55,9 @@ COVERED = 0.5
 def conditions_of(
     drive: DriveInputs, parts: ConditionParts, views: Sequence[View], rules: ConditionRules, kept: dict[int, WarpSource]
 ) -> tuple[Condition, Condition]:
-    """The model's condition for ``views`` with only some of its parts, and the same on the fine grid. kept: recorded
-    images that are prepared already (see ``build_conditions``)."""
+    """The model's condition for ``views`` with some of its parts (`SynthesizeConfig.condition`), and the same on the
+    fine grid. Reference, points and concat are without renders; the reference is put up far away. kept: recorded images
+    that are prepared already (see ``build_conditions``)."""
     if parts == "full":
         return build_conditions(drive, views, rules, kept)
     if parts == "repair":
@@ -269,7 +264,7 @@ class ViewMaker:
         if not drive.recorded:
             log.warn("synthesize: no recorded image is available; holes are filled with the nearest point's colour")
         self._model, self._drive, self._rules, self._full_size = model, drive, rules, config.full_size
-        self._parts: ConditionParts = config.condition
+        self._parts = config.condition
         self._images = drive.images.setdefault(rules.fine, PreparedImages(scratch))
         self._request = request_of(config, half_of(config) == torch.bfloat16)
 

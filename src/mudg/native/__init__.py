@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from mudg.base.errors import ResourceError, UsageError
 
-ABI_VERSION: Final = 5
+ABI_VERSION: Final = 6
 FOLDER: Final = Path(__file__).resolve().parent
 LIBRARY_PATH: Final = FOLDER / {"darwin": "libmudg_native.dylib", "win32": "mudg_native.dll"}.get(
     sys.platform, "libmudg_native.so"

@@ -31,23 +31,15 @@ MUDG_INLINE AdamLanes adam_lanes(const AdamJob& job, Floats step_size, Floats pa
 MUDG_INLINE void adam_range(const AdamJob& job, const AdamColumn& column, std::size_t begin, std::size_t end) {
   const Floats step_size = splat(column.step_size);
   float *parameter = column.parameter, *moment1 = column.moment1, *moment2 = column.moment2;
-  std::size_t i = begin;
-  for (; i + kLanes <= end; i += kLanes) {
-    const Floats gradient = load_unaligned(column.gradient + i);
-    const AdamLanes next = adam_lanes(job, step_size, load_unaligned(parameter + i), gradient,
-                                      load_unaligned(moment1 + i), load_unaligned(moment2 + i));
-    store_unaligned(parameter + i, next.parameter);
-    store_unaligned(moment1 + i, next.moment1);
-    store_unaligned(moment2 + i, next.moment2);
+  for (std::size_t i = begin; i < end; i += kLanes) {
+    const int count = static_cast<int>(smaller<std::size_t>(kLanes, end - i));
+    const Floats gradient = load_up_to(column.gradient + i, count);
+    const AdamLanes next = adam_lanes(job, step_size, load_up_to(parameter + i, count), gradient,
+                                      load_up_to(moment1 + i, count), load_up_to(moment2 + i, count));
+    store_up_to(parameter + i, count, next.parameter);
+    store_up_to(moment1 + i, count, next.moment1);
+    store_up_to(moment2 + i, count, next.moment2);
   }
-  if (i == end) return;
-  const int left = static_cast<int>(end - i);
-  const Floats gradient = load_first(column.gradient + i, left);
-  const AdamLanes next = adam_lanes(job, step_size, load_first(parameter + i, left), gradient,
-                                    load_first(moment1 + i, left), load_first(moment2 + i, left));
-  store_first(parameter + i, left, next.parameter);
-  store_first(moment1 + i, left, next.moment1);
-  store_first(moment2 + i, left, next.moment2);
 }
 
 // The rows [begin, end) of a narrow column, of which some are visible: whole vectors in which the lanes of the other
@@ -66,20 +58,12 @@ MUDG_INLINE void adam_narrow(const AdamJob& job, const AdamColumn& column, std::
     float *parameter = column.parameter + start + i, *moment1 = column.moment1 + start + i;
     float* moment2 = column.moment2 + start + i;
     const float* gradient = column.gradient + start + i;
-    if (i + kLanes <= count) {
-      const Floats p = load_unaligned(parameter), m = load_unaligned(moment1), v = load_unaligned(moment2);
-      const AdamLanes next = adam_lanes(job, step_size, p, load_unaligned(gradient), m, v);
-      store_unaligned(parameter, select(moves, next.parameter, p));
-      store_unaligned(moment1, select(moves, next.moment1, m));
-      store_unaligned(moment2, select(moves, next.moment2, v));
-    } else {
-      const int left = static_cast<int>(count - i);
-      const Floats p = load_first(parameter, left), m = load_first(moment1, left), v = load_first(moment2, left);
-      const AdamLanes next = adam_lanes(job, step_size, p, load_first(gradient, left), m, v);
-      store_first(parameter, left, select(moves, next.parameter, p));
-      store_first(moment1, left, select(moves, next.moment1, m));
-      store_first(moment2, left, select(moves, next.moment2, v));
-    }
+    const int left = static_cast<int>(smaller<std::size_t>(kLanes, count - i));
+    const Floats p = load_up_to(parameter, left), m = load_up_to(moment1, left), v = load_up_to(moment2, left);
+    const AdamLanes next = adam_lanes(job, step_size, p, load_up_to(gradient, left), m, v);
+    store_up_to(parameter, left, select(moves, next.parameter, p));
+    store_up_to(moment1, left, select(moves, next.moment1, m));
+    store_up_to(moment2, left, select(moves, next.moment2, v));
   }
 }
 

@@ -9,4 +9,4 @@
 
 // Raised whenever the layout of a struct or the meaning of an argument of any mudg_* function changes;
 // native/__init__.py refuses a library with another number.
-#define MUDG_ABI_VERSION 5
+#define MUDG_ABI_VERSION 6

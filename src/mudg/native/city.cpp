@@ -64,55 +64,35 @@ void fill_street_map(Road& road, const double* line, int64_t count, const double
   }
 }
 
+struct RoadField {
+  RoadNumber number;
+  float Road::*field;
+};
+constexpr RoadField kRoadFields[] = {
+    {kLeft, &Road::left}, {kRight, &Road::right}, {kWalkLeft, &Road::sidewalk_left}, {kWalkRight, &Road::sidewalk_right},
+    {kParkLeft, &Road::park_left}, {kParkRight, &Road::park_right}, {kCrossS, &Road::cross_s}, {kCrossX, &Road::cross_x},
+    {kCrossY, &Road::cross_y}, {kCrossHalf, &Road::cross_half}, {kCorner, &Road::corner}, {kCrossFrom, &Road::cross_from},
+    {kCrossTo, &Road::cross_to}, {kCrossWalk, &Road::cross_sidewalk}, {kLaneWidth, &Road::lane_width}, {kSlab, &Road::slab},
+    {kWear, &Road::wear}, {kPatches, &Road::patches}, {kBrick, &Road::brick}};
+
 void read_road(Road& road, const double* n) {
-  road.left = num(n, kLeft);
-  road.right = num(n, kRight);
-  road.sidewalk_left = num(n, kWalkLeft);
-  road.sidewalk_right = num(n, kWalkRight);
+  for (const RoadField& f : kRoadFields) road.*f.field = num(n, f.number);
   road.paved_left = n[kPavedLeft] > 0.5;
   road.paved_right = n[kPavedRight] > 0.5;
-  road.park_left = num(n, kParkLeft);
-  road.park_right = num(n, kParkRight);
   road.has_cross = n[kHasCross] > 0.5;
-  road.cross_s = num(n, kCrossS);
-  road.cross_x = num(n, kCrossX);
-  road.cross_y = num(n, kCrossY);
   road.cross_cos = static_cast<float>(std::cos(n[kCrossYaw]));
   road.cross_sin = static_cast<float>(std::sin(n[kCrossYaw]));
-  road.cross_half = num(n, kCrossHalf);
-  road.corner = num(n, kCorner);
-  road.cross_from = num(n, kCrossFrom);
-  road.cross_to = num(n, kCrossTo);
-  road.cross_sidewalk = num(n, kCrossWalk);
-  road.lane_width = num(n, kLaneWidth);
   road.seed = static_cast<int>(n[kSeed]);
   road.asphalt = vec(n + kAsphalt);
   road.sidewalk = vec(n + kWalkColor);
   road.kerb = vec(n + kKerbColor);
   road.terrain = vec(n + kTerrainColor);
-  road.slab = num(n, kSlab);
-  road.wear = num(n, kWear);
-  road.patches = num(n, kPatches);
-  road.brick = num(n, kBrick);
 }
 
-void read_light(Light& light, const double* n) {
-  light.sun_dir = normalize(vec(n + kSunDir));
-  light.sun = vec(n + kSun);
-  light.zenith = vec(n + kZenith);
-  light.horizon = vec(n + kHorizon);
-  light.ambient = vec(n + kAmbient);
-  light.cloud = vec(n + kCloud);
-  light.white = vec(n + kWhite);
-  light.cloudiness = num(n, kCloudiness);
-  light.haze_m = num(n, kHaze);
-  light.night = num(n, kNight);
-  light.exposure = num(n, kExposure);
-  light.contrast = num(n, kContrast);
-  light.saturation = num(n, kSaturation);
-  light.noise = num(n, kNoise);
-  light.vignette = num(n, kVignette);
-  light.sun_size = num(n, kSunSize);
+Light light_of(const double* n) {
+  return {normalize(vec(n + kSunDir)), vec(n + kSun), vec(n + kZenith), vec(n + kHorizon), vec(n + kAmbient), vec(n + kCloud),
+          num(n, kCloudiness), num(n, kHaze), num(n, kNight), num(n, kExposure), num(n, kContrast), num(n, kSaturation),
+          num(n, kNoise), num(n, kVignette), vec(n + kWhite), num(n, kSunSize)};
 }
 
 // Two independent normal numbers from one hash.
@@ -137,7 +117,7 @@ MUDG_API void* mudg_city_create(const double* records, int64_t n, const double* 
     auto world = std::make_unique<World>();
     world->seed = seed;
     read_road(world->road, road);
-    read_light(world->light, light);
+    world->light = light_of(light);
     fill_street_map(world->road, centreline, m, road);
     for (int64_t i = 0; i < k; ++i) {
       const double* p = marks + 6 * i;

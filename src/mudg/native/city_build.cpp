@@ -114,6 +114,14 @@ Look look_of(Class cls, Material material, Vec3 rgb, uint32_t seed = 0, Vec3 rgb
   return l;
 }
 
+Look with_numbers(Look look, float p0, float p1, float p2, float p3) {
+  look.p0 = p0;
+  look.p1 = p1;
+  look.p2 = p2;
+  look.p3 = p3;
+  return look;
+}
+
 // Parameters: 0 bay, 1 floor height, 2 ground floor height, 3 window share, 4 sill, 5 window height, 6 recess, 7 shop,
 // 8 roof (0 flat, 1 gable), 9 balconies, 10 wall material (0 render, 1 brick). The street front is local -y.
 void add_building(World& world, const Record& r) {
@@ -270,19 +278,12 @@ void add_sign(World& world, const Record& r) {
   Sink s(world, r.x, r.y, r.z, r.yaw);
   const Look metal = look_of(kPole, kMatMetal, {0.35f, 0.35f, 0.36f}, r.seed);
   s.cylinder({0, 0, 0}, {0, 0, r.height + r.p[1]}, 0.035f, metal);
-  Look plate = look_of(kTrafficSign, kMatSign, r.rgb, r.seed, r.rgb2);
-  plate.p0 = r.p[0];
-  plate.p1 = r.p[1];
-  plate.p2 = r.p[3];
   const float half_w = r.width > 0 ? 0.5f * r.width : r.p[1];
-  plate.p3 = half_w;
+  const Look plate = with_numbers(look_of(kTrafficSign, kMatSign, r.rgb, r.seed, r.rgb2), r.p[0], r.p[1], r.p[3], half_w);
   s.card({0.05f, 0, r.height}, half_w, r.p[1], 0, static_cast<CardMask>(static_cast<int>(r.p[0])), 0, 0, plate);
   if (r.p[2] > 0.5f) {
-    Look extra = look_of(kTrafficSign, kMatSign, {0.75f, 0.75f, 0.73f}, r.seed + 1, {0.08f, 0.08f, 0.08f});
-    extra.p0 = 0;
-    extra.p1 = 0.15f;
-    extra.p2 = 9;
-    extra.p3 = 0.3f;
+    const Look white = look_of(kTrafficSign, kMatSign, {0.75f, 0.75f, 0.73f}, r.seed + 1, {0.08f, 0.08f, 0.08f});
+    const Look extra = with_numbers(white, 0, 0.15f, 9, 0.3f);
     s.card({0.05f, 0, r.height - r.p[1] - 0.2f}, 0.3f, 0.15f, 0, kMaskFull, 0, 0, extra);
   }
   s.contact(0.04f, 0.04f, 0.2f, 0.35f);
@@ -350,9 +351,7 @@ void add_part(World& world, const Record& r) {
   Sink s(world, r.x, r.y, r.z, r.yaw);
   Look look = look_of(static_cast<Class>(static_cast<int>(r.p[1])), static_cast<Material>(static_cast<int>(r.p[2])), r.rgb, r.seed, r.rgb2);
   if (look.material == kMatSign) {
-    look.p1 = 0.5f * r.height;
-    look.p2 = 8;
-    look.p3 = 0.5f * r.width;
+    look = with_numbers(look, 0, 0.5f * r.height, 8, 0.5f * r.width);
     s.card({0, 0, 0}, 0.5f * r.width, 0.5f * r.height, 0, kMaskFull, 0, 0, look);
   } else if (r.p[0] > 1.5f) {
     s.leaves({0, 0, 0}, {0.5f * r.length, 0.5f * r.width, 0.5f * r.height}, r.p[3], r.p[4], look);
@@ -423,10 +422,8 @@ void add_furniture(World& world, const Record& r) {
       s.box({0, 0, h}, {0.12f, hy, 0.16f}, metal);
       s.box({0, 0, h + 0.8f}, {0.08f, hy, 0.06f}, metal);
       for (int i = 0; i < 2; ++i) {
-        Look plate = look_of(kTrafficSign, kMatSign, r.rgb, r.seed + static_cast<uint32_t>(i), {0.8f, 0.8f, 0.8f});
-        plate.p2 = 8;
-        plate.p1 = 0.9f;
-        plate.p3 = 1.6f;
+        const Look board = look_of(kTrafficSign, kMatSign, r.rgb, r.seed + static_cast<uint32_t>(i), {0.8f, 0.8f, 0.8f});
+        const Look plate = with_numbers(board, 0, 0.9f, 8, 1.6f);
         s.card({-0.16f, (i ? -0.4f : 0.4f) * hy, h + 0.5f}, 1.6f, 0.9f, kPi, kMaskFull, 0, 0, plate);
       }
       return;
@@ -455,11 +452,7 @@ void add_car(World& world, const Record& r) {
   const float cowl = hl * (style == 1 ? 0.50f : 0.42f), nose = belt - (style == 2 ? 0.12f : 0.20f);
   const float tail_x = style == 0 ? -0.60f * hl : -0.93f * hl, tail_top = style == 0 ? -0.30f * hl : -0.74f * hl;
   const float wheel = style == 2 ? 0.36f : 0.32f, axle = 0.61f * hl;
-  Look body = look_of(kCar, kMatCarBody, r.rgb, r.seed);
-  body.p0 = hl;
-  body.p1 = hw;
-  body.p2 = axle;
-  body.p3 = wheel;
+  const Look body = with_numbers(look_of(kCar, kMatCarBody, r.rgb, r.seed), hl, hw, axle, wheel);
   const float shoulder = 0.55f * (floor + belt);
   s.convex({{{0, 0, -1}, {0, 0, floor}}, {{0, 0, 1}, {0, 0, belt}},
             {{belt - nose, 0, hl - cowl}, {cowl, 0, belt}}, {{-0.09f, 0, hl + tail_x + 0.05f}, {tail_x, 0, belt}},
@@ -470,11 +463,8 @@ void add_car(World& world, const Record& r) {
             {{0.42f, 0.9f, 0}, {hl - 0.30f, hw, 0}}, {{0.42f, -0.9f, 0}, {hl - 0.30f, -hw, 0}},
             {{0.85f, 0.52f, 0}, {hl, 0.62f * hw, 0}}, {{0.85f, -0.52f, 0}, {hl, -0.62f * hw, 0}},
             {{-0.5f, 0.87f, 0}, {-hl + 0.16f, hw, 0}}, {{-0.5f, -0.87f, 0}, {-hl + 0.16f, -hw, 0}}}, 0.11f, body);
-  Look cabin = look_of(kCar, kMatCarCabin, r.rgb, r.seed, {0.02f, 0.023f, 0.025f});
-  cabin.p0 = cowl - 0.02f;
-  cabin.p1 = tail_x;
-  cabin.p2 = belt;
-  cabin.p3 = h;
+  const Look glazed = look_of(kCar, kMatCarCabin, r.rgb, r.seed, {0.02f, 0.023f, 0.025f});
+  const Look cabin = with_numbers(glazed, cowl - 0.02f, tail_x, belt, h);
   const float screen_top = cowl - 0.36f * hl, rise = h - belt, tumble = style == 2 ? 0.12f : 0.19f;
   s.convex({{{0, 0, -1}, {0, 0, belt - 0.06f}}, {{0, 0, 1}, {0, 0, h}}, {{rise, 0, cowl - screen_top}, {cowl, 0, belt}},
             {{-rise, 0, tail_top - tail_x}, {tail_x, 0, belt}}, {{0, rise, tumble}, {0, hw - 0.07f, belt}}, {{0, -rise, tumble}, {0, -hw + 0.07f, belt}},
@@ -493,11 +483,7 @@ void add_car(World& world, const Record& r) {
 void add_van(World& world, const Record& r) {
   Sink s(world, 0, 0, 0, 0);
   const float hl = 0.5f * r.length, hw = 0.5f * r.width, h = r.height;
-  Look body = look_of(kCar, kMatBus, r.rgb, r.seed);
-  body.p0 = hl;
-  body.p1 = hw;
-  body.p2 = h;
-  body.p3 = 2;  // van: glass only at the front
+  const Look body = with_numbers(look_of(kCar, kMatBus, r.rgb, r.seed), hl, hw, h, 2);  // van: glass only at the front
   const float screen = 0.52f * h;
   s.convex({{{0, 0, -1}, {0, 0, 0.25f}}, {{0, 0, 1}, {0, 0, h}}, {{1, 0, 0.12f}, {hl, 0, 0.45f * h}}, {{1, 0, -0.3f}, {hl, 0, 0.5f}},
             {{0.5f * h, 0, 0.30f * hl}, {hl - 0.25f, 0, screen}}, {{-1, 0, 0.03f}, {-hl, 0, 0.5f * h}}, {{0, 1, 0.06f}, {0, hw, 0.45f * h}},
@@ -512,17 +498,11 @@ void add_truck(World& world, const Record& r, bool tank) {
   Sink s(world, 0, 0, 0, 0);
   const float hl = 0.5f * r.length, hw = 0.5f * r.width, h = r.height;
   const float cab = 1.9f, cab_h = std::min(h - 0.3f, 2.7f);
-  Look front = look_of(kTruck, kMatBus, r.rgb, r.seed);
-  front.p0 = hl;
-  front.p1 = hw;
-  front.p2 = cab_h;
-  front.p3 = 3;
+  const Look front = with_numbers(look_of(kTruck, kMatBus, r.rgb, r.seed), hl, hw, cab_h, 3);
   s.convex({{{0, 0, -1}, {0, 0, 0.4f}}, {{0, 0, 1}, {0, 0, cab_h}}, {{1, 0, 0.04f}, {hl, 0, 0.9f}}, {{1, 0, 0.22f}, {hl - 0.02f, 0, 1.4f}},
             {{-1, 0, 0}, {hl - cab, 0, 0}}, {{0, 1, 0.02f}, {0, hw - 0.06f, 1}}, {{0, -1, 0.02f}, {0, -hw + 0.06f, 1}},
             {{0.7f, 0.7f, 0}, {hl - 0.15f, hw - 0.06f, 0}}, {{0.7f, -0.7f, 0}, {hl - 0.15f, -hw + 0.06f, 0}}}, 0.10f, front);
-  Look cargo = look_of(kTruck, kMatCargo, r.rgb2, r.seed);
-  cargo.p0 = hl;
-  cargo.p1 = h;
+  const Look cargo = look_of(kTruck, kMatCargo, r.rgb2, r.seed);
   const float cargo_from = -hl, cargo_to = hl - cab - 0.15f, mid = 0.5f * (cargo_from + cargo_to);
   if (tank) {
     const float radius = std::min(hw - 0.05f, 0.5f * (h - 1.0f));
@@ -545,11 +525,7 @@ void add_truck(World& world, const Record& r, bool tank) {
 void add_bus(World& world, const Record& r) {
   Sink s(world, 0, 0, 0, 0);
   const float hl = 0.5f * r.length, hw = 0.5f * r.width, h = r.height;
-  Look body = look_of(kBus, kMatBus, r.rgb, r.seed, r.rgb2);
-  body.p0 = hl;
-  body.p1 = hw;
-  body.p2 = h;
-  body.p3 = 1;
+  const Look body = with_numbers(look_of(kBus, kMatBus, r.rgb, r.seed, r.rgb2), hl, hw, h, 1);
   s.convex({{{0, 0, -1}, {0, 0, 0.3f}}, {{0, 0, 1}, {0, 0, h}}, {{1, 0, 0.05f}, {hl, 0, 0.8f}}, {{-1, 0, 0.03f}, {-hl, 0, 0.8f}},
             {{0, 1, 0.02f}, {0, hw, 0.8f}}, {{0, -1, 0.02f}, {0, -hw, 0.8f}}, {{0.7f, 0.7f, 0}, {hl - 0.12f, hw, 0}},
             {{0.7f, -0.7f, 0}, {hl - 0.12f, -hw, 0}}, {{0, 0.5f, 1}, {0, hw - 0.15f, h}}, {{0, -0.5f, 1}, {0, -hw + 0.15f, h}}}, 0.12f, body);

@@ -41,10 +41,7 @@ void add_marks(const Road& road, float s, float u, float fp_u, float fp_s, Paint
 
 // Zebra bars and stop line at distance `along` from the start of a crossing of the given length.
 float zebra(float along, float length, float across, float fp) {
-  if (along < -1.9f || along > length + 1.9f) return 0;
-  float cover = 0;
-  if (along > 0 && along < length) cover = stripe(fract(across / 1.1f) * 1.1f - 0.3f, 0.27f, fp);
-  return cover;
+  return along > 0 && along < length ? stripe(fract(across / 1.1f) * 1.1f - 0.3f, 0.27f, fp) : 0;
 }
 
 // Where a ground point lies in street coordinates.
@@ -127,7 +124,7 @@ Vec3 painted_albedo(const Road& road, const Street& street, Vec3 albedo, Vec3 p,
   albedo = mix(albedo, Vec3{0.52f, 0.52f, 0.50f}, 0.9f * keep * paint.white);
   albedo = mix(albedo, Vec3{0.52f, 0.34f, 0.05f}, 0.9f * keep * paint.yellow);
   // gutter dirt along the kerb
-  const float k = -road.kerb_distance(s, u, a, b);
+  const float k = -road.kerb_distance(u, a, b);
   albedo *= 1.0f - 0.35f * clamp01(1.0f - k / 0.35f) * (0.6f + 0.4f * worn);
   return albedo;
 }
@@ -184,7 +181,7 @@ Vec3 ground_albedo(const Road& road, GroundPart& part, Vec3 p, float footprint_m
   gloss = 0;
   if (part == kGroundRoad) return painted_albedo(road, street, asphalt_albedo(road, street, p, footprint_m, gloss), p, footprint_m);
   if (part == kGroundKerb) return kerb_albedo(road, street, p, footprint_m);
-  const float k = road.kerb_distance(street.s, u, a, b);
+  const float k = road.kerb_distance(u, a, b);
   const bool left_side = u > 0;
   float width = left_side ? road.sidewalk_left : road.sidewalk_right;
   const bool paved = left_side ? road.paved_left : road.paved_right;

@@ -62,8 +62,7 @@ struct Road {
     b = -cross_sin * dx + cross_cos * dy;
   }
   // Signed distance to the nearest kerb line, negative on the road (approximate away from it, exact in sign).
-  float kerb_distance(float s, float u, float a, float b) const {
-    (void)s;
+  float kerb_distance(float u, float a, float b) const {
     const float main = std::max(u - left, right - u);
     if (!has_cross) return main;
     const float cross = std::max(std::max(std::fabs(b) - cross_half, a - cross_to), cross_from - a);
@@ -76,7 +75,7 @@ struct Road {
     float s, u, a = 0, b = 0;
     main_coordinates(x, y, s, u);
     if (has_cross) cross_coordinates(x, y, a, b);
-    return kerb_distance(s, u, a, b);
+    return kerb_distance(u, a, b);
   }
 };
 

@@ -6,6 +6,8 @@ constexpr float kNear = 0.05f;
 constexpr float kFar = 900.0f;
 constexpr float kLift = 0.012f;  // start of shadow rays above a surface, metres
 
+Class class_of(GroundPart part) { return part == kGroundRoad ? kRoad : (part == kGroundTerrain ? kTerrain : kSidewalk); }
+
 // Snow and water on a surface: its albedo and gloss change. Returns the wetness of road and sidewalk that is not under snow.
 template <class Open>
 float take_weather(const Weather& weather, Vec3 point, bool on_ground, Surface& surface, Moment::Sample& sample, const Open& open) {
@@ -153,6 +155,15 @@ void Moment::collect(Vec3 origin, float slack, const Vec3* corners, TileCandidat
   }
 }
 
+// Walks through the shapes of a posed object that the ray may hit, in its own frame.
+template <class Visit>
+bool Moment::within(const Ray& ray, int object, float fraction, float t_min, float& best, const Visit& visit) const {
+  const PosedState s = state(object, fraction);
+  const Ray local(to_yaw_frame(ray.o - Vec3{s.x, s.y, s.z}, s.cs, s.sn), to_yaw_frame(ray.d, s.cs, s.sn));
+  const Shape* shapes = shapes_of(object);
+  return world_.posed[object].bvh.traverse(local, t_min, best, [&](int item, float& near_t) { return visit(shapes, local, item, near_t); });
+}
+
 bool Moment::closest(const Ray& ray, float t_min, float t_max, float fraction, Hit& hit, const TileCandidates* tile) const {
   bool found = false;
   float limit = t_max;
@@ -168,23 +179,16 @@ bool Moment::closest(const Ray& ray, float t_min, float t_max, float fraction, H
     return false;
   };
   const auto try_posed = [&](int object, float& best) {
-    const Posed& posed = world_.posed[object];
-    const PosedState s = state(object, fraction);
-    const Ray local(to_yaw_frame(ray.o - Vec3{s.x, s.y, s.z}, s.cs, s.sn), to_yaw_frame(ray.d, s.cs, s.sn));
-    const Shape* shapes = shapes_of(object);
-    float inner = best;
-    posed.bvh.traverse(local, t_min, inner, [&](int item, float& near_t) {
+    return within(ray, object, fraction, t_min, best, [&](const Shape* shapes, const Ray& local, int item, float& near_t) {
       if (intersect(shapes[item], world_.pools, local.o, local.d, t_min, near_t, trial)) {
         hit = trial;
-        hit.prim = posed.first + item;
+        hit.prim = world_.posed[object].first + item;
         hit.instance = object;
         near_t = trial.t;
         found = true;
       }
       return false;
     });
-    best = inner;
-    return false;
   };
   if (tile == nullptr) {
     world_.static_bvh.traverse(ray, t_min, limit, try_static);
@@ -211,12 +215,7 @@ bool Moment::occluded(const Ray& ray, float t_min, float t_max, float fraction) 
     return intersect(world_.shapes[item], world_.pools, ray.o, ray.d, t_min, best, trial);
   };
   const auto by_posed = [&](int object, float& best) {
-    const Posed& posed = world_.posed[object];
-    const PosedState s = state(object, fraction);
-    const Ray local(to_yaw_frame(ray.o - Vec3{s.x, s.y, s.z}, s.cs, s.sn), to_yaw_frame(ray.d, s.cs, s.sn));
-    const Shape* shapes = shapes_of(object);
-    float inner = best;
-    return posed.bvh.traverse(local, t_min, inner, [&](int item, float& near_t) {
+    return within(ray, object, fraction, t_min, best, [&](const Shape* shapes, const Ray& local, int item, float& near_t) {
       return intersect(shapes[item], world_.pools, local.o, local.d, t_min, near_t, trial);
     });
   };
@@ -319,7 +318,7 @@ Moment::Sample Moment::look(Vec3 origin, Vec3 direction, float fraction, float p
     const TextureSlot slot = part == kGroundRoad ? kTexRoad : (part == kGroundTerrain ? kTexTerrain : kTexWalk);
     if (!world_.textures[slot].empty()) surface.albedo = surface.albedo * textured(world_, slot, point, {0, 0, 1}, footprint);
     surface.normal = ground.normal;
-    surface.cls = part == kGroundRoad ? kRoad : (part == kGroundTerrain ? kTerrain : kSidewalk);
+    surface.cls = class_of(part);
     surface.occlusion = ground_openness(point, fraction);
   }
   sample.cls = surface.cls;
@@ -433,7 +432,7 @@ Moment::Sample Moment::range(Vec3 origin, Vec3 direction, float fraction, float 
     GroundPart part = ground.part;
     float gloss = 0;
     surface.albedo = ground_albedo(world_.road, part, origin + direction * ground.t, 0.03f, gloss);
-    surface.cls = part == kGroundRoad ? kRoad : (part == kGroundTerrain ? kTerrain : kSidewalk);
+    surface.cls = class_of(part);
     sample.incidence = std::fabs(dot(direction, ground.normal));
     sample.reflectance = dot(surface.albedo, Vec3{0.5f, 0.35f, 0.15f}) * 1.2f;
   }

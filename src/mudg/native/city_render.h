@@ -65,6 +65,8 @@ class Moment {
   }
   PosedState interpolated(int object, float fraction) const;
   bool first_hit(Vec3 origin, Vec3 direction, float fraction, float t_max, Hit& hit, GroundHit& ground, const TileCandidates* tile) const;
+  template <class Visit>
+  bool within(const Ray& ray, int object, float fraction, float t_min, float& best, const Visit& visit) const;
   Vec3 lamp_light(Vec3 point, Vec3 normal, float fraction) const;
   Vec3 wet_mirror(const Sample& ground, Vec3 direction, Vec3 radiance, float wet, float fraction, uint32_t jitter) const;
   bool sun_reaches(const Hit& hit, const Surface& surface, bool on_ground, Vec3 point, Vec3 to_sun, float fraction) const;

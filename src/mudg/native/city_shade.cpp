@@ -6,7 +6,7 @@ namespace {
 
 Vec3 grey(float v) { return {v, v, v}; }
 
-void shade_brick(const Look& look, Vec3 p, float u, float v, float fp, Surface& s) {
+void shade_brick(const Look& look, float u, float v, float fp, Surface& s) {
   const float row = std::floor(v / 0.075f), shift = u / 0.24f + 0.5f * fract(row * 0.5f) * 2;
   const float detail = clamp01(1.4f - fp * 9.0f);
   const int seed = static_cast<int>(look.seed);
@@ -15,7 +15,6 @@ void shade_brick(const Look& look, Vec3 p, float u, float v, float fp, Surface& 
   s.albedo = look.rgb * tone;
   const float joint = std::min(fract(shift) * 0.24f, fract(v / 0.075f) * 0.075f);
   if (joint < 0.012f) s.albedo = mix(s.albedo, grey(0.30f), 0.55f * detail);
-  (void)p;
 }
 
 void shade_window(const World& world, const Look& look, const Hit& hit, Vec3 d, Surface& s) {
@@ -64,7 +63,7 @@ void shade_window(const World& world, const Look& look, const Hit& hit, Vec3 d, 
   if (!shop) s.gloss += 0.08f;
 }
 
-void shade_facade(const World& world, const Look& look, const Hit& hit, Vec3 p, Vec3 d, float fp, Surface& s) {
+void shade_facade(const World& world, const Look& look, const Hit& hit, Vec3 d, float fp, Surface& s) {
   const int seed = static_cast<int>(look.seed);
   if (hit.part == kPartGlass) {
     shade_window(world, look, hit, d, s);
@@ -82,7 +81,7 @@ void shade_facade(const World& world, const Look& look, const Hit& hit, Vec3 p, 
   }
   const float u = hit.wall_u, v = hit.wall_v;
   if (look.p0 > 0.5f) {
-    shade_brick(look, p, u, v, fp, s);
+    shade_brick(look, u, v, fp, s);
   } else {
     const float tone = 1 + 0.35f * fbm_filtered(u, v, 0.35f, fp, seed) + 0.18f * fbm_filtered(u, v, 5.0f, fp, seed + 3);
     s.albedo = look.rgb * tone;
@@ -368,7 +367,7 @@ Surface shade_surface(const World& world, const Hit& hit, Vec3 point, Vec3 d, fl
   const int seed = static_cast<int>(look.seed);
   const Vec3 p = hit.local;
   switch (look.material) {
-    case kMatFacade: shade_facade(world, look, hit, point, d, fp, s); break;
+    case kMatFacade: shade_facade(world, look, hit, d, fp, s); break;
     case kMatFoliage: shade_foliage(world, look, hit, s); break;
     case kMatBark: s.albedo = look.rgb * (1 + 0.9f * noise_filtered(p.x * 6 + p.y * 6, point.z, 2.2f, fp, seed)); break;
     case kMatMetal: s.gloss = 0.06f; break;
@@ -377,7 +376,7 @@ Surface shade_surface(const World& world, const Hit& hit, Vec3 point, Vec3 d, fl
     case kMatTyre: shade_tyre(world, look, hit, s); break;
     case kMatBus: shade_big_vehicle(world, look, hit, hit.normal, d, s); break;
     case kMatCargo: shade_cargo(world, look, hit, fp, s); break;
-    case kMatBrick: shade_brick(look, point, hit.face / 2 == 0 ? p.y : p.x, p.z + 3, fp, s); break;
+    case kMatBrick: shade_brick(look, hit.face / 2 == 0 ? p.y : p.x, p.z + 3, fp, s); break;
     case kMatWood: shade_wood(look, hit, fp, s); break;
     case kMatSign: shade_sign(look, hit, s); break;
     case kMatSignal:

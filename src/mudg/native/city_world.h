@@ -87,7 +87,7 @@ struct Texture {
 };
 void fill_texture(Texture& texture, const float* rgb, int width, int height, float metres);
 
-// Wet ground, snow and street lamps; the same rules as core/weather/ground.py and relight.py. A world without them is never asked.
+// Wet ground, snow and street lamps; the same rules as core/weather/light.py. A world without them is never asked.
 struct Weather {
   bool any = false;
   float wet = 0;                                // 0..1

@@ -12,7 +12,6 @@ namespace {
 
 constexpr std::int64_t kHexPlanesPiece = 256;   // points per piece of work
 constexpr std::int64_t kHexPlanesBlock = 2048;  // points whose gradients are kept at a time, before the planes add them up
-constexpr int kHexAxes[kHexPlanes][2] = {{0, 1}, {0, 2}, {1, 2}, {0, 3}, {1, 3}, {2, 3}};
 
 // Where the four coordinates of a point lie on the cells of a level.
 struct HexPlace {

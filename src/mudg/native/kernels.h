@@ -16,14 +16,14 @@ struct PhotometricJob {
   const float* weight;  // [height][width], null: 1 everywhere
   int planes, height, width;
   float ssim_weight;
-  float* gradient;        // like x
-  int padded_width;       // multiple of 16
-  int row_stride;         // padded_width + two aprons
-  float* maps;            // [3][planes][height][row_stride]
-  float* worker_scratch;  // [workers][worker_stride]
-  std::size_t worker_stride;
-  int workers;
-  double* partial;  // [planes * strips]
+  float* gradient;                  // like x
+  int padded_width = 0;             // multiple of 16
+  int row_stride = 0;               // padded_width + two aprons
+  float* maps = nullptr;            // [3][planes][height][row_stride]
+  float* worker_scratch = nullptr;  // [workers][worker_stride]
+  std::size_t worker_stride = 0;
+  int workers = 0;
+  double* partial = nullptr;  // [planes * strips]
 };
 
 // One Adam step (adam.h) on a table: columns [rows][width] that share their rows. Mirrored in core/native_ops.py.
@@ -55,10 +55,10 @@ struct ClassLossJob {
   int raised, classes;
   std::int64_t pixels;
   float scale;
-  float* gradient;        // like logits
-  float* worker_scratch;  // [workers][classes][kClassLossBlock], 64-byte aligned
-  int workers;
-  double* partial;  // one per piece
+  float* gradient;                  // like logits
+  float* worker_scratch = nullptr;  // [workers][classes][kClassLossBlock], 64-byte aligned
+  int workers = 0;
+  double* partial = nullptr;  // one per piece
 };
 
 // A picture over a coarse one (over.h), [channels][height][width]: forward with gradient = null, else backward.
@@ -68,10 +68,10 @@ struct OverJob {
   float* out;             // forward
   const float* gradient;  // of out
   float *of_alpha, *of_coarse;
-  float* row_sums;        // [channels][height][coarse_width], backward
-  float* worker_scratch;  // [workers][coarse_width + width]
-  void* columns;          // 12 bytes for every column
-  int workers;
+  float* row_sums = nullptr;        // [channels][height][coarse_width], backward
+  float* worker_scratch = nullptr;  // [workers][coarse_width + width]
+  void* columns = nullptr;          // 12 bytes for every column
+  int workers = 0;
 };
 
 // Means over squares of 2 radius + 1 pixels of planar images (box.h), cut at the borders; or the transposed map.
@@ -103,7 +103,8 @@ struct HashGridJob {
 };
 
 // Features of places and times in six planes of several sizes (hex_planes.h), and gradients; what is null is not computed.
-constexpr int kHexPlanes = 6;  // xy, xz, yz, xt, yt, zt
+constexpr int kHexPlanes = 6;
+constexpr int kHexAxes[kHexPlanes][2] = {{0, 1}, {0, 2}, {1, 2}, {0, 3}, {1, 3}, {2, 3}};  // xy, xz, yz, xt, yt, zt
 struct HexPlanesLevel {
   std::int64_t offset[kHexPlanes];  // of the planes, in floats; a plane is [second axis][first axis][features]
   std::int32_t cells[4];            // numbers along x, y, z, t

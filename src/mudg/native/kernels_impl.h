@@ -20,26 +20,11 @@ namespace mudg::MUDG_ISA_NAMESPACE {
 namespace {
 
 template <int kChannels>
-void blend_forward_channels(RasterState& state, float* const* planes, float* alpha) {
+void blend_all_tiles(RasterState& state, float* const* planes, float* alpha) {
   parallel_for(state.tiles_x * state.tiles_y, 1, [&](std::int64_t begin, std::int64_t end, int) {
     for (std::int64_t tile = begin; tile < end; ++tile)
       blend_tile<kChannels>(state, static_cast<int>(tile), planes, alpha);
   });
-}
-
-void blend_forward(RasterState& state, RasterImage& image) {
-  float* planes[kMaxChannels] = {};
-  channel_planes(state, image, planes);
-  switch (state.padded_channels) {
-    case 4: return blend_forward_channels<4>(state, planes, image.alpha);
-    case 8: return blend_forward_channels<8>(state, planes, image.alpha);
-    case 12: return blend_forward_channels<12>(state, planes, image.alpha);
-    case 16: return blend_forward_channels<16>(state, planes, image.alpha);
-    case 20: return blend_forward_channels<20>(state, planes, image.alpha);
-    case 24: return blend_forward_channels<24>(state, planes, image.alpha);
-    case 28: return blend_forward_channels<28>(state, planes, image.alpha);
-    default: return blend_forward_channels<32>(state, planes, image.alpha);
-  }
 }
 
 template <int kChannels, bool kAbsolute>
@@ -50,28 +35,27 @@ void undo_all_tiles(RasterState& state, const float* const* planes, const float*
   });
 }
 
-template <int kChannels>
-void blend_backward_channels(RasterState& state, const float* const* planes, const float* alpha) {
-  if (state.scene.want_abs_gradient) {
-    undo_all_tiles<kChannels, true>(state, planes, alpha);
-  } else {
-    undo_all_tiles<kChannels, false>(state, planes, alpha);
-  }
+// The loops over tiles for 4, 8, .. 32 channels.
+constexpr decltype(&blend_all_tiles<4>) kBlend[] = {
+    blend_all_tiles<4>,  blend_all_tiles<8>,  blend_all_tiles<12>, blend_all_tiles<16>,
+    blend_all_tiles<20>, blend_all_tiles<24>, blend_all_tiles<28>, blend_all_tiles<32>};
+template <bool kAbsolute>
+constexpr decltype(&undo_all_tiles<4, false>) kUndo[] = {
+    undo_all_tiles<4, kAbsolute>,  undo_all_tiles<8, kAbsolute>,  undo_all_tiles<12, kAbsolute>,
+    undo_all_tiles<16, kAbsolute>, undo_all_tiles<20, kAbsolute>, undo_all_tiles<24, kAbsolute>,
+    undo_all_tiles<28, kAbsolute>, undo_all_tiles<32, kAbsolute>};
+
+void blend_forward(RasterState& state, RasterImage& image) {
+  float* planes[kMaxChannels] = {};
+  channel_planes(state, image, planes);
+  kBlend[state.padded_channels / 4 - 1](state, planes, image.alpha);
 }
 
 void blend_backward(RasterState& state, const RasterImageGradient& image) {
   const float* planes[kMaxChannels] = {};
   channel_planes(state, image, planes);
-  switch (state.padded_channels) {
-    case 4: return blend_backward_channels<4>(state, planes, image.alpha);
-    case 8: return blend_backward_channels<8>(state, planes, image.alpha);
-    case 12: return blend_backward_channels<12>(state, planes, image.alpha);
-    case 16: return blend_backward_channels<16>(state, planes, image.alpha);
-    case 20: return blend_backward_channels<20>(state, planes, image.alpha);
-    case 24: return blend_backward_channels<24>(state, planes, image.alpha);
-    case 28: return blend_backward_channels<28>(state, planes, image.alpha);
-    default: return blend_backward_channels<32>(state, planes, image.alpha);
-  }
+  const auto* undo = state.scene.want_abs_gradient ? kUndo<true> : kUndo<false>;
+  undo[state.padded_channels / 4 - 1](state, planes, image.alpha);
 }
 
 constexpr Kernels kTable = {project_forward, blend_forward, blend_backward, project_backward, photometric, adam,

@@ -157,17 +157,14 @@ double gradient_strip(const PhotometricJob& job, int plane, int y0, int y1, floa
     Floats sums = zero;
     for (int i = 0; i < job.width; i += kLanes) {
       const int count = smaller(kLanes, job.width - i);
-      alignas(64) float x[kLanes] = {}, target[kLanes] = {}, out[kLanes];
-      std::memcpy(x, job.x + at + i, sizeof(float) * count);
-      std::memcpy(target, job.y + at + i, sizeof(float) * count);
-      const Floats value = load(x), wanted = load(target), difference = value - wanted;
+      const Floats value = load_up_to(job.x + at + i, count), wanted = load_up_to(job.y + at + i, count);
+      const Floats difference = value - wanted;
       const Floats ssim = mul_add(wanted, blur_column(rows[2], i),
                                   mul_add(value + value, blur_column(rows[1], i), blur_column(rows[0], i)));
       const Floats sign = select(difference > zero, of_l1, select(difference < zero, zero - of_l1, zero));
       const Floats weight = weight_at(job, y, i);
       sums = mul_add(weight, abs_of(difference), sums);
-      store(out, neg_mul_add(of_ssim, ssim, weight * sign));
-      std::memcpy(job.gradient + at + i, out, sizeof(float) * count);
+      store_up_to(job.gradient + at + i, count, neg_mul_add(of_ssim, ssim, weight * sign));
     }
     total += sum(sums);
   }

@@ -150,10 +150,9 @@ struct BackwardTile {
   alignas(64) float sigma_gradient[round_up(kChunk, 16)][kPixelsPerBlock];
   Chunk<kChannels> chunk;
 
-  // Loads the image gradients of one block (null planes count as zero); adds to the background's gradient.
+  // Loads the image gradients of one block (null planes count as zero).
   MUDG_INLINE void load_block(const RasterState& state, const TilePlace& place, int b, const float* const* planes,
-                              const float* alpha_plane, const float* final, const float* depth,
-                              float* background_gradient) {
+                              const float* alpha_plane, const float* final, const float* depth) {
     const int x0 = place.block_x(b), y0 = place.block_y(b);
     const std::size_t stride = static_cast<std::size_t>(place.width);
     const bool whole = x0 + kBlockSize <= place.width && y0 + kBlockSize <= place.height;
@@ -180,20 +179,14 @@ struct BackwardTile {
       for (int c = 0; c < kChannels; ++c) upstream_rows[b][l][c] = upstream[b][c][l];
       for (int c = kChannels; c < kColumns; ++c) upstream_rows[b][l][c] = 0.0f;
     }
-    // alpha = 1 - T and the image holds T * background, so the gradient of T is background . upstream - upstream_alpha.
-    Floats of_alpha = neg_mul_add(of_sum, load_unaligned(depth), load(upstream_alpha[b]));
-    for (int c = 0; c < 3; ++c) {
-      const Floats channel = load(upstream[b][c]);
-      of_alpha = neg_mul_add(splat(state.scene.background[c]), channel, of_alpha);
-      background_gradient[c] += sum(left * channel);
-    }
-    store(upstream_alpha[b], of_alpha * left);
+    // alpha = 1 - T, so the gradient of T is that of alpha, negated.
+    store(upstream_alpha[b], neg_mul_add(of_sum, load_unaligned(depth), load(upstream_alpha[b])) * left);
   }
 
   // Returns the position of the last entry of the tile that contributed anywhere, -1 if none did.
   MUDG_INLINE int start(const RasterState& state, const TilePlace& place, const float* const* planes,
                         const float* alpha_plane, const float* final, const float* depth, const std::int32_t* last,
-                        float* background_gradient, unsigned& blocks) {
+                        unsigned& blocks) {
     int tile_last = -1;
     blocks = 0;
     for (int b = 0; b < kBlocksPerTile; ++b) {
@@ -201,8 +194,7 @@ struct BackwardTile {
       for (int l = 0; l < kPixelsPerBlock; ++l) position = larger(position, last[b * kPixelsPerBlock + l]);
       block_last[b] = position;
       if (place.block_x(b) >= place.width || place.block_y(b) >= place.height) continue;
-      load_block(state, place, b, planes, alpha_plane, final + b * kPixelsPerBlock, depth + b * kPixelsPerBlock,
-                 background_gradient);
+      load_block(state, place, b, planes, alpha_plane, final + b * kPixelsPerBlock, depth + b * kPixelsPerBlock);
       if (position < 0) continue;
       blocks |= 1u << b;
       tile_last = larger(tile_last, position);
@@ -287,9 +279,7 @@ void undo_tile(RasterState& state, int tile, const float* const* planes, const f
   const std::size_t stride = static_cast<std::size_t>(state.record_stride);
   Work work;
   unsigned blocks = 0;
-  float background[4] = {};
-  const int tile_last = work.start(state, place, planes, alpha_plane, final, depth, last, background, blocks);
-  std::memcpy(state.tile_background + static_cast<std::size_t>(tile) * 4, background, sizeof background);
+  const int tile_last = work.start(state, place, planes, alpha_plane, final, depth, last, blocks);
   for (int i = tile_last + 1; i < count; ++i) mark_untouched(state.records + items[i].record * stride);
   if (tile_last < 0) return;
   const Floats cap = splat(state.scene.alpha_max);

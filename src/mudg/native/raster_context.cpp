@@ -67,20 +67,17 @@ bool RasterContext::prepare(const RasterScene& scene) {
 }
 
 bool RasterContext::prepare_backward() {
-  const std::size_t tiles = static_cast<std::size_t>(state.tiles_x) * state.tiles_y;
   const std::size_t blocks = (static_cast<std::size_t>(state.scene.count) + 15) / 16;
   const std::size_t chunks = (blocks + kCameraChunk - 1) / kCameraChunk;
   if (!records.reserve(static_cast<std::size_t>(state.entry_count) * state.record_stride + 64)) return false;
-  if (!tile_background.reserve(tiles * 4) || !camera_parts.reserve(chunks * 16 + 16)) return false;
+  if (!camera_parts.reserve(chunks * 16 + 16)) return false;
   state.records = records.data();
-  state.tile_background = tile_background.data();
   state.camera_parts = camera_parts.data();
   return true;
 }
 
 std::size_t RasterContext::bytes() const {
   std::size_t total = splats.bytes() + final_transmittance.bytes() + expected_depth.bytes() + records.bytes() +
-                      tile_background.bytes() +
                       clamped.bytes() + entry_worker.bytes() + depth_key.bytes() + entry_offset.bytes() +
                       order.bytes() + sort_key.bytes() + sort_key2.bytes() + sort_order.bytes() + entry_counts.bytes() +
                       first_record.bytes() + tile_start.bytes() + tile_cursor.bytes() + last_item.bytes() +

@@ -33,7 +33,7 @@ struct RasterContext {
   bool prepare_backward();
   std::size_t bytes() const;
 
-  Buffer<float> splats, final_transmittance, expected_depth, records, tile_background;
+  Buffer<float> splats, final_transmittance, expected_depth, records;
   Buffer<std::uint8_t> clamped, entry_worker, range_groups;
   Buffer<std::uint32_t> depth_key, entry_offset, order, sort_key, sort_order, sort_key2;
   Buffer<std::int32_t> entry_counts, first_record, tile_start, tile_cursor, last_item, sort_counts;

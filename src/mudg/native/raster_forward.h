@@ -67,13 +67,6 @@ struct ForwardTile {
     return bits(alive) != 0;
   }
 
-  MUDG_INLINE void add_background(const float* background) {
-    for (int b = 0; b < kBlocksPerTile; ++b) {
-      const Floats left = load(final[b]);
-      for (int c = 0; c < 3; ++c) store(color[b][c], mul_add(splat(background[c]), left, load(color[b][c])));
-    }
-  }
-
   // Turns accumulated depth into expected depth, and keeps it for the backward pass (`kept`: [16 blocks][16 pixels]).
   MUDG_INLINE void divide_depth(float* kept) {
     for (int b = 0; b < kBlocksPerTile; ++b) {
@@ -129,7 +122,6 @@ void blend_tile(RasterState& state, int tile, float* const* planes, float* alpha
       if (work.chunk.lists.counts[b] > 0 && !work.blend_block(b, base, place, cap)) blocks &= ~(1u << b);
     }
   }
-  work.add_background(state.scene.background);
   work.divide_depth(state.expected_depth + static_cast<std::size_t>(tile) * kPixelsPerTile);
   std::memcpy(state.final_transmittance + static_cast<std::size_t>(tile) * kPixelsPerTile, work.final,
               sizeof work.final);

@@ -52,8 +52,8 @@ MUDG_INLINE unsigned project_lanes(const RasterScene& s, int first, SplatLanes& 
       sqrt_of(mul_add(p.offset[0], p.offset[0],
                       mul_add(p.offset[1], p.offset[1], mul_add(p.offset[2], p.offset[2], splat(1e-24f)))));
   Floats basis[kMaxSh];
-  sh_basis(s.sh_degree, p.offset[0] * inv_length, p.offset[1] * inv_length, p.offset[2] * inv_length, basis);
-  for (int k = 0; k < (s.sh_degree + 1) * (s.sh_degree + 1); ++k) store(out.basis[k], basis[k]);
+  sh_basis(s.sh_coefficients, p.offset[0] * inv_length, p.offset[1] * inv_length, p.offset[2] * inv_length, basis);
+  for (int k = 0; k < s.sh_coefficients; ++k) store(out.basis[k], basis[k]);
   return bits((poison >= zero) & (poison <= zero));
 }
 
@@ -72,7 +72,7 @@ MUDG_INLINE bool pixel_rectangle(const RasterScene& s, const SplatLanes& lanes, 
 }
 
 MUDG_INLINE bool footprint_of(const RasterScene& s, const SplatLanes& lanes, int l, Footprint& f) {
-  const bool drawable = lanes.depth[l] > s.near_m && lanes.depth[l] < s.far_m && lanes.log_opacity[l] >= -kLog2Of255 &&
+  const bool drawable = lanes.depth[l] > s.near_m && lanes.depth[l] < kFar && lanes.log_opacity[l] >= -kLog2Of255 &&
                         lanes.determinant[l] > 0.0f && lanes.conic_xx[l] > 0.0f && lanes.inv_cov_yy[l] > 0.0f;
   if (!drawable || !pixel_rectangle(s, lanes, l, f)) return false;
   const float inv_stretch = 1.0f / lanes.conic_xx[l];
@@ -99,7 +99,7 @@ MUDG_INLINE bool write_splat(RasterState& state, const SplatLanes& lanes, int l,
   row[kDepth] = lanes.depth[l];
   float* channel = row + kFirstChannel;
   const auto harmonics = harmonics_of(s, s.sh, s.sh_rest, static_cast<std::size_t>(g));
-  sh_color(harmonics.first, harmonics.rest, &lanes.basis[0][l], kLanes, (s.sh_degree + 1) * (s.sh_degree + 1), channel);
+  sh_color(harmonics.first, harmonics.rest, &lanes.basis[0][l], kLanes, s.sh_coefficients, channel);
   float poison = (channel[0] * 0.0f + channel[1] * 0.0f) + channel[2] * 0.0f;
   std::uint8_t clamped = 0;
   for (int c = 0; c < 3; ++c) {

@@ -80,10 +80,10 @@ MUDG_INLINE void color_backward(const RasterState& state, const RasterGradient& 
   const Floats squared = mul_add(d[0], d[0], mul_add(d[1], d[1], mul_add(d[2], d[2], splat(1e-24f))));
   const Floats inv_length = splat(1.0f) / sqrt_of(squared);
   for (int k = 0; k < 3; ++k) d[k] = d[k] * inv_length;
-  const int active = (s.sh_degree + 1) * (s.sh_degree + 1);
+  const int active = s.sh_coefficients;
   Floats basis[kMaxSh], of_basis[kMaxSh];
   alignas(64) float columns[kMaxSh][kLanes];
-  sh_basis(s.sh_degree, d[0], d[1], d[2], basis);
+  sh_basis(active, d[0], d[1], d[2], basis);
   for (int k = 0; k < active; ++k) store(columns[k], basis[k]);
   alignas(64) float of_columns[kMaxSh][kLanes] = {};
   for (unsigned left = live; left != 0; left &= left - 1) {
@@ -92,30 +92,25 @@ MUDG_INLINE void color_backward(const RasterState& state, const RasterGradient& 
     const auto sh = harmonics_of(s, s.sh, s.sh_rest, row);
     const float red = group.rgb[0][l], green = group.rgb[1][l], blue = group.rgb[2][l];
     float values[kMaxSh], of_values[kMaxSh];
-    of_values[0] = sh.first[0] * red + sh.first[1] * green + sh.first[2] * blue;
-    for (int k = 1; k < active; ++k) {
-      const float* rest = sh.rest + 3 * (k - 1);
-      of_values[k] = rest[0] * red + rest[1] * green + rest[2] * blue;
+    for (int k = 0; k < active; ++k) {
+      const float* of_k = k == 0 ? sh.first : sh.rest + 3 * (k - 1);
+      of_values[k] = of_k[0] * red + of_k[1] * green + of_k[2] * blue;
     }
     for (int k = 0; k < active; ++k) of_columns[k][l] = of_values[k];
     if (gradient.sh == nullptr) continue;
     const auto of_sh = harmonics_of(s, gradient.sh, gradient.sh_rest, row);
     for (int k = 0; k < active; ++k) values[k] = columns[k][l];
-    of_sh.first[0] = values[0] * red;
-    of_sh.first[1] = values[0] * green;
-    of_sh.first[2] = values[0] * blue;
-    for (int k = 1; k < active; ++k) {
-      float* of_rest = of_sh.rest + 3 * (k - 1);
-      of_rest[0] = values[k] * red;
-      of_rest[1] = values[k] * green;
-      of_rest[2] = values[k] * blue;
+    for (int k = 0; k < active; ++k) {
+      float* of_row = k == 0 ? of_sh.first : of_sh.rest + 3 * (k - 1);
+      of_row[0] = values[k] * red;
+      of_row[1] = values[k] * green;
+      of_row[2] = values[k] * blue;
     }
-    for (int k = 3 * (active - 1); k < 3 * (s.sh_coefficients - 1); ++k) of_sh.rest[k] = 0.0f;
   }
-  if (s.sh_degree == 0) return;
+  if (active == 1) return;
   for (int k = 0; k < active; ++k) of_basis[k] = load(of_columns[k]);
   Floats v[3];
-  sh_basis_backward(s.sh_degree, d[0], d[1], d[2], of_basis, v);
+  sh_basis_backward(active, d[0], d[1], d[2], of_basis, v);
   const Floats along = dot3(v, d);
   for (int k = 0; k < 3; ++k) store(group.direction[k], neg_mul_add(along, d[k], v[k]) * inv_length);
 }
@@ -345,11 +340,6 @@ void project_backward(RasterState& state, RasterGradient& gradient) {
   }
   for (int k = 0; k < 9; ++k) gradient.rotation[k] = static_cast<float>(total[k]);
   for (int k = 0; k < 3; ++k) gradient.center[k] = static_cast<float>(total[9 + k]);
-  double background[3] = {};
-  for (int tile = 0; tile < state.tiles_x * state.tiles_y; ++tile) {
-    for (int c = 0; c < 3; ++c) background[c] += state.tile_background[tile * 4 + c];
-  }
-  for (int c = 0; c < 3; ++c) gradient.background[c] = static_cast<float>(background[c]);
 }
 
 }  // namespace

@@ -9,14 +9,14 @@ namespace {
 
 constexpr int kMaxSh = 16;
 
-// basis[(degree + 1)^2] at the unit direction (x, y, z).
-MUDG_INLINE void sh_basis(int degree, Floats x, Floats y, Floats z, Floats* basis) {
+// basis[count], count = (degree + 1)^2, at the unit direction (x, y, z).
+MUDG_INLINE void sh_basis(int count, Floats x, Floats y, Floats z, Floats* basis) {
   basis[0] = splat(0.2820947917738781f);
-  if (degree < 1) return;
+  if (count == 1) return;
   basis[1] = splat(-0.48860251190292f) * y;
   basis[2] = splat(0.48860251190292f) * z;
   basis[3] = splat(-0.48860251190292f) * x;
-  if (degree < 2) return;
+  if (count == 4) return;
   const Floats zz = z * z, cos2 = x * x - y * y, sin2 = splat(2.0f) * x * y;
   const Floats slope = splat(-1.092548430592079f) * z;
   const Floats a = splat(0.5462742152960395f);
@@ -25,7 +25,7 @@ MUDG_INLINE void sh_basis(int degree, Floats x, Floats y, Floats z, Floats* basi
   basis[6] = splat(0.9461746957575601f) * zz - splat(0.3153915652525201f);
   basis[7] = slope * x;
   basis[8] = a * cos2;
-  if (degree < 3) return;
+  if (count == 9) return;
   const Floats c = splat(0.4570457994644658f) - splat(2.285228997322329f) * zz;
   const Floats d = splat(1.445305721320277f) * z;
   const Floats e = splat(-0.5900435899266435f);
@@ -40,14 +40,13 @@ MUDG_INLINE void sh_basis(int degree, Floats x, Floats y, Floats z, Floats* basi
 }
 
 // Gradient of sum_k weight[k] * basis_k with respect to the direction, before the projection onto the unit sphere.
-MUDG_INLINE void sh_basis_backward(int degree, Floats x, Floats y, Floats z, const Floats* weight, Floats* direction) {
+// `count` is above 1.
+MUDG_INLINE void sh_basis_backward(int count, Floats x, Floats y, Floats z, const Floats* weight, Floats* direction) {
   const auto number = [](float value) { return splat(value); };
-  direction[0] = direction[1] = direction[2] = number(0.0f);
-  if (degree < 1) return;
   direction[0] = number(-0.48860251190292f) * weight[3];
   direction[1] = number(-0.48860251190292f) * weight[1];
   direction[2] = number(0.48860251190292f) * weight[2];
-  if (degree < 2) return;
+  if (count == 4) return;
   const Floats two = number(2.0f), x2 = two * x, y2 = two * y;
   const Floats cos2 = x * x - y * y, sin2 = x2 * y;
   const Floats slope = number(-1.092548430592079f), a = number(0.5462742152960395f);
@@ -55,7 +54,7 @@ MUDG_INLINE void sh_basis_backward(int degree, Floats x, Floats y, Floats z, con
   direction[1] = direction[1] + slope * z * weight[5] + a * (x2 * weight[4] - y2 * weight[8]);
   direction[2] = direction[2] + number(2.0f * 0.9461746957575601f) * z * weight[6] +
                  slope * (x * weight[7] + y * weight[5]);
-  if (degree < 3) return;
+  if (count == 9) return;
   const Floats c = number(0.4570457994644658f) - number(2.285228997322329f) * z * z;
   const Floats c_dz = number(-2.0f * 2.285228997322329f) * z;
   const Floats d = number(1.445305721320277f), e = number(-3.0f * 0.5900435899266435f);

@@ -24,6 +24,7 @@ constexpr float kLog2Of255 = 7.994353436858858f;  // contributions below alpha =
 constexpr float kLog2E = 1.4426950408889634f;
 constexpr float kLeastAlpha = 1e-10f;        // below, a pixel has no depth
 constexpr float kLn2 = 0.6931471805599453f;
+constexpr float kFar = 1e10f;  // metres; nothing farther away is drawn, by any backend
 
 // One projected Gaussian, followed by its channel values: R, G, B, depth, features.
 // log2 of its alpha at distance (dx, dy) from its mean: kLogOpacity - kStretch * (dx + kShear * dy)^2 - kHeight * dy^2.
@@ -49,12 +50,11 @@ struct TileItem {
 
 // extern "C" structs; native mirrors in core/raster/cpu.py. Pointers to float32 unless said otherwise.
 struct RasterScene {
-  std::int32_t count, width, height, extra_channels, sh_coefficients, sh_degree, antialias, want_abs_gradient;
-  float near_m, far_m, blur_px2, alpha_max;
+  std::int32_t count, width, height, extra_channels, sh_coefficients, antialias, want_abs_gradient;
+  float near_m, blur_px2, alpha_max;
   float fx, fy, cx, cy;
   float rotation[9];                    // cam_from_world, row by row
   float center_high[3], center_low[3];  // camera centre in the world as a sum of two floats
-  float background[3];
   const float *means, *quats, *scales, *opacities, *sh, *extra;  // [N,3] [N,4] [N,3] [N] [N,K,3] [N,C]
   const float* sh_rest;  // null, or harmonics from the second on [N,K-1,3]; `sh` is then [N,1,3]
 };
@@ -73,7 +73,7 @@ struct RasterGradient {
   float *means, *quats, *scales, *opacities;  // never null
   float *sh, *extra, *means2d, *abs_means2d;  // null: not wanted
   float* sh_rest;                             // as in the scene; written whenever `sh` is
-  float rotation[9], center[3], background[3];
+  float rotation[9], center[3];
 };
 
 // The harmonics of one Gaussian, or their gradient: the first one, and those that follow it.
@@ -129,7 +129,6 @@ struct RasterState {
   std::int32_t* last_item;      // the same layout: last list position before the pixel was finished, -1 if none
   float* expected_depth;        // the same layout: the depth image
   float* records;               // [entry_count][record_stride]
-  float* tile_background;       // [tiles][4] per-tile part of the background's gradient
   double* camera_parts;         // [chunks][16] per-chunk parts of the camera's gradient
   int worker_count;             // workers that may take part in projecting
   WorkerEntries workers[kMaxThreads];

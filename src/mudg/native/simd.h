@@ -44,6 +44,15 @@ MUDG_INLINE Floats log2_of(Floats x) {
   return mul_add(ratio, series, exponent);
 }
 
+// As load_first and store_first, without a mask where all lanes are meant.
+MUDG_INLINE Floats load_up_to(const float* p, int count) {
+  return count == kLanes ? load_unaligned(p) : load_first(p, count);
+}
+MUDG_INLINE void store_up_to(float* p, int count, Floats x) {
+  if (count == kLanes) return store_unaligned(p, x);
+  store_first(p, count, x);
+}
+
 // First `count` lanes set.
 MUDG_INLINE Mask first_lanes(int count) { return load(kLaneIndex) < splat(static_cast<float>(count)); }
 

@@ -65,12 +65,11 @@ MUDG_INLINE Ints load_int(const int* p) {
 }
 MUDG_INLINE void store_int(int* p, Ints a) { std::memcpy(p, a.q, 64); }
 
-#define MUDG_LANEWISE(expression)                                \
-  {                                                              \
-    {                                                            \
-      expression(0), expression(1), expression(2), expression(3) \
-    }                                                            \
-  }
+// {f(0), f(1), f(2), f(3)}: a function of each of the four vectors.
+template <class Lanes, class Function>
+MUDG_INLINE Lanes lanewise(const Function& f) {
+  return {{f(0), f(1), f(2), f(3)}};
+}
 #define MUDG_BINARY(Type, name, op)                                                    \
   MUDG_INLINE Type name(Type a, Type b) {                                              \
     return {{a.q[0] op b.q[0], a.q[1] op b.q[1], a.q[2] op b.q[2], a.q[3] op b.q[3]}}; \
@@ -92,54 +91,46 @@ MUDG_COMPARE(operator<, <)
 #undef MUDG_COMPARE
 
 MUDG_INLINE Mask at_least(Ints a, Ints b) {
-#define MUDG_LANE(k) a.q[k] >= b.q[k]
-  return MUDG_LANEWISE(MUDG_LANE);
-#undef MUDG_LANE
+  return lanewise<Mask>([&](int k) { return a.q[k] >= b.q[k]; });
 }
 MUDG_INLINE Floats mul_add(Floats a, Floats b, Floats c) {
 #if defined(__aarch64__)
-#define MUDG_LANE(k) reinterpret_cast<Quad>(vfmaq_f32((float32x4_t)c.q[k], (float32x4_t)a.q[k], (float32x4_t)b.q[k]))
+  return lanewise<Floats>([&](int k) {
+    return reinterpret_cast<Quad>(vfmaq_f32((float32x4_t)c.q[k], (float32x4_t)a.q[k], (float32x4_t)b.q[k]));
+  });
 #else
-#define MUDG_LANE(k) a.q[k] * b.q[k] + c.q[k]
+  return lanewise<Floats>([&](int k) { return a.q[k] * b.q[k] + c.q[k]; });
 #endif
-  return MUDG_LANEWISE(MUDG_LANE);
-#undef MUDG_LANE
 }
 MUDG_INLINE Floats neg_mul_add(Floats a, Floats b, Floats c) {
 #if defined(__aarch64__)
-#define MUDG_LANE(k) reinterpret_cast<Quad>(vfmsq_f32((float32x4_t)c.q[k], (float32x4_t)a.q[k], (float32x4_t)b.q[k]))
+  return lanewise<Floats>([&](int k) {
+    return reinterpret_cast<Quad>(vfmsq_f32((float32x4_t)c.q[k], (float32x4_t)a.q[k], (float32x4_t)b.q[k]));
+  });
 #else
-#define MUDG_LANE(k) c.q[k] - a.q[k] * b.q[k]
+  return lanewise<Floats>([&](int k) { return c.q[k] - a.q[k] * b.q[k]; });
 #endif
-  return MUDG_LANEWISE(MUDG_LANE);
-#undef MUDG_LANE
 }
 
 MUDG_INLINE Quad select_quad(QuadInt m, Quad yes, Quad no) { return as_float((as_int(yes) & m) | (as_int(no) & ~m)); }
 MUDG_INLINE Floats select(Mask m, Floats yes, Floats no) {
-#define MUDG_LANE(k) select_quad(m.q[k], yes.q[k], no.q[k])
-  return MUDG_LANEWISE(MUDG_LANE);
-#undef MUDG_LANE
+  return lanewise<Floats>([&](int k) { return select_quad(m.q[k], yes.q[k], no.q[k]); });
 }
 MUDG_INLINE Floats keep(Mask m, Floats a) {
-#define MUDG_LANE(k) as_float(as_int(a.q[k]) & m.q[k])
-  return MUDG_LANEWISE(MUDG_LANE);
-#undef MUDG_LANE
+  return lanewise<Floats>([&](int k) { return as_float(as_int(a.q[k]) & m.q[k]); });
 }
 MUDG_INLINE Ints select_int(Mask m, Ints yes, Ints no) {
-#define MUDG_LANE(k) (yes.q[k] & m.q[k]) | (no.q[k] & ~m.q[k])
-  return MUDG_LANEWISE(MUDG_LANE);
-#undef MUDG_LANE
+  return lanewise<Ints>([&](int k) { return (yes.q[k] & m.q[k]) | (no.q[k] & ~m.q[k]); });
 }
 
 // As on x86, the second argument is the answer when either is NaN.
 #if defined(__SSE2__)
-#define MUDG_MIN(k) _mm_min_ps(a.q[k], b.q[k])
-#define MUDG_MAX(k) _mm_max_ps(a.q[k], b.q[k])
-MUDG_INLINE Floats min_of(Floats a, Floats b) { return MUDG_LANEWISE(MUDG_MIN); }
-MUDG_INLINE Floats max_of(Floats a, Floats b) { return MUDG_LANEWISE(MUDG_MAX); }
-#undef MUDG_MIN
-#undef MUDG_MAX
+MUDG_INLINE Floats min_of(Floats a, Floats b) {
+  return lanewise<Floats>([&](int k) { return _mm_min_ps(a.q[k], b.q[k]); });
+}
+MUDG_INLINE Floats max_of(Floats a, Floats b) {
+  return lanewise<Floats>([&](int k) { return _mm_max_ps(a.q[k], b.q[k]); });
+}
 MUDG_INLINE unsigned bits(Mask a) {
   return static_cast<unsigned>(_mm_movemask_ps(as_float(a.q[0])) | _mm_movemask_ps(as_float(a.q[1])) << 4 |
                                _mm_movemask_ps(as_float(a.q[2])) << 8 | _mm_movemask_ps(as_float(a.q[3])) << 12);
@@ -166,25 +157,17 @@ MUDG_INLINE Quad sqrt_quad(Quad a) {
 #endif
 }
 MUDG_INLINE Floats sqrt_of(Floats a) {
-#define MUDG_LANE(k) sqrt_quad(a.q[k])
-  return MUDG_LANEWISE(MUDG_LANE);
-#undef MUDG_LANE
+  return lanewise<Floats>([&](int k) { return sqrt_quad(a.q[k]); });
 }
 MUDG_INLINE Floats abs_of(Floats a) {
   const QuadInt magnitude = {0x7fffffff, 0x7fffffff, 0x7fffffff, 0x7fffffff};
-#define MUDG_LANE(k) as_float(as_int(a.q[k]) & magnitude)
-  return MUDG_LANEWISE(MUDG_LANE);
-#undef MUDG_LANE
+  return lanewise<Floats>([&](int k) { return as_float(as_int(a.q[k]) & magnitude); });
 }
 MUDG_INLINE Ints truncate(Floats a) {
-#define MUDG_LANE(k) __builtin_convertvector(a.q[k], QuadInt)
-  return MUDG_LANEWISE(MUDG_LANE);
-#undef MUDG_LANE
+  return lanewise<Ints>([&](int k) { return __builtin_convertvector(a.q[k], QuadInt); });
 }
 MUDG_INLINE Floats to_float(Ints a) {
-#define MUDG_LANE(k) __builtin_convertvector(a.q[k], Quad)
-  return MUDG_LANEWISE(MUDG_LANE);
-#undef MUDG_LANE
+  return lanewise<Floats>([&](int k) { return __builtin_convertvector(a.q[k], Quad); });
 }
 // Valid for |a| < 2^31, which holds for pixel coordinates after clamping.
 MUDG_INLINE Floats floor_of(Floats a) {
@@ -220,9 +203,7 @@ constexpr int kGroup = 1;  // values worked on side by side
 // 2^x with a relative error below 2e-7; x below -126 counts as -126.
 MUDG_INLINE void exp2_group(const Floats* x, Floats* out) {
   const Floats held = max_of(x[0], splat(-126.0f));
-#define MUDG_LANE(k) exp2_quad(held.q[k])
-  out[0] = MUDG_LANEWISE(MUDG_LANE);
-#undef MUDG_LANE
+  out[0] = lanewise<Floats>([&](int k) { return exp2_quad(held.q[k]); });
 }
 
 // x = mantissa * 2^exponent with the mantissa in [sqrt(1/2), sqrt(2)).
@@ -233,7 +214,6 @@ MUDG_INLINE void split_exponent(Floats x, Floats& exponent, Floats& mantissa) {
     mantissa.q[k] = as_float(as_int(x.q[k]) - (e << 23));
   }
 }
-#undef MUDG_LANEWISE
 
 }  // namespace
 }  // namespace mudg::isa_portable

@@ -2,6 +2,7 @@
 //
 // A pixel is one 64-bit word, depth bits above the point's index: an atomic minimum keeps the result independent of the
 // order in which threads arrive. Depths are positive, so their float bits order like the numbers themselves.
+#include <algorithm>
 #include <atomic>
 #include <cmath>
 #include <cstdint>
@@ -14,19 +15,6 @@ namespace {
 
 constexpr std::uint64_t kEmpty = ~std::uint64_t{0};
 
-struct Camera {
-  float rotation[9];  // cam_from_world, row major
-  float translation[3];
-  float fx, fy, cx, cy;
-  int width, height;
-};
-
-struct Splat {
-  float pixels;      // side of the square in pixels; used when metres is 0
-  float metres;      // side of the square in metres at the point's depth
-  float max_pixels;  // upper limit of the side
-};
-
 inline void keep_nearest(std::atomic<std::uint64_t>& pixel, std::uint64_t key) {
   std::uint64_t seen = pixel.load(std::memory_order_relaxed);
   while (key < seen && !pixel.compare_exchange_weak(seen, key, std::memory_order_relaxed)) {
@@ -37,61 +25,41 @@ inline void keep_nearest(std::atomic<std::uint64_t>& pixel, std::uint64_t key) {
 inline int first_pixel(float center, float side) { return static_cast<int>(std::floor(center - 0.5f * side - 0.5f)) + 1; }
 inline int last_pixel(float center, float side) { return static_cast<int>(std::floor(center + 0.5f * side - 0.5f)); }
 
-void draw(const float* xyz, std::int64_t begin, std::int64_t end, std::uint32_t first_index, const Camera& c,
-          const Splat& splat, float near_m, float far_m, std::atomic<std::uint64_t>* keys) {
-  const float* r = c.rotation;
-  for (std::int64_t i = begin; i < end; ++i) {
-    const float x = xyz[3 * i], y = xyz[3 * i + 1], z = xyz[3 * i + 2];
-    const float depth = ((r[6] * x + r[7] * y) + r[8] * z) + c.translation[2];
-    if (!(depth >= near_m && depth <= far_m)) continue;  // also drops NaN
-    const float cam_x = ((r[0] * x + r[1] * y) + r[2] * z) + c.translation[0];
-    const float cam_y = ((r[3] * x + r[4] * y) + r[5] * z) + c.translation[1];
-    const float u = c.fx * cam_x / depth + c.cx, v = c.fy * cam_y / depth + c.cy;
-    float side = splat.pixels;
-    if (splat.metres > 0.0f) {
-      side = c.fx * splat.metres / depth;
-      if (side < splat.pixels) side = splat.pixels;
-      if (side > splat.max_pixels) side = splat.max_pixels;
-    }
-    if (!(u > -side && v > -side && u < c.width + side && v < c.height + side)) continue;
-    int left = first_pixel(u, side), right = last_pixel(u, side), top = first_pixel(v, side), bottom = last_pixel(v, side);
-    if (left < 0) left = 0;
-    if (top < 0) top = 0;
-    if (right >= c.width) right = c.width - 1;
-    if (bottom >= c.height) bottom = c.height - 1;
-    std::uint32_t bits;
-    std::memcpy(&bits, &depth, sizeof bits);
-    const std::uint64_t key = (std::uint64_t{bits} << 32) | (first_index + static_cast<std::uint32_t>(i));
-    for (int row = top; row <= bottom; ++row)
-      for (int column = left; column <= right; ++column) keep_nearest(keys[static_cast<std::int64_t>(row) * c.width + column], key);
-  }
-}
-
 }  // namespace
 
 extern "C" {
 
-// Draws points xyz f32[count, 3] into keys. cam_from_points: f32[12], rows of [R | t]. intrinsics: fx, fy, cx, cy.
-// Point i carries the index first_index + i; the caller keeps the sum below 2^32.
-MUDG_API void mudg_zbuffer_draw(const float* xyz, std::int64_t count, std::uint32_t first_index, const float* cam_from_points,
+// Draws points xyz f32[count, 3] into keys. m: f32[12], cam_from_points, rows of [R | t]. intrinsics: fx, fy, cx, cy.
+// Point i carries the index first_index + i; the caller keeps the sum below 2^32. The square of a point has a side of
+// splat_pixels, or of splat_metres at its depth where that is not 0, between splat_pixels and splat_max_pixels.
+MUDG_API void mudg_zbuffer_draw(const float* xyz, std::int64_t count, std::uint32_t first_index, const float* m,
                                 const float* intrinsics, int width, int height, float splat_pixels, float splat_metres,
                                 float splat_max_pixels, float near_m, float far_m, std::uint64_t* keys) {
-  Camera camera{};
-  for (int row = 0; row < 3; ++row) {
-    for (int column = 0; column < 3; ++column) camera.rotation[3 * row + column] = cam_from_points[4 * row + column];
-    camera.translation[row] = cam_from_points[4 * row + 3];
-  }
-  camera.fx = intrinsics[0];
-  camera.fy = intrinsics[1];
-  camera.cx = intrinsics[2];
-  camera.cy = intrinsics[3];
-  camera.width = width;
-  camera.height = height;
-  const Splat splat{splat_pixels, splat_metres, splat_max_pixels};
   static_assert(sizeof(std::atomic<std::uint64_t>) == sizeof(std::uint64_t), "pixels are plain 64-bit words");
   auto* pixels = reinterpret_cast<std::atomic<std::uint64_t>*>(keys);
+  const float fx = intrinsics[0], fy = intrinsics[1], cx = intrinsics[2], cy = intrinsics[3];
   mudg::parallel_for(count, 16384, [&](std::int64_t begin, std::int64_t end, int) {
-    draw(xyz, begin, end, first_index, camera, splat, near_m, far_m, pixels);
+    for (std::int64_t i = begin; i < end; ++i) {
+      const float x = xyz[3 * i], y = xyz[3 * i + 1], z = xyz[3 * i + 2];
+      const float depth = ((m[8] * x + m[9] * y) + m[10] * z) + m[11];
+      if (!(depth >= near_m && depth <= far_m)) continue;  // also drops NaN
+      const float u = fx * (((m[0] * x + m[1] * y) + m[2] * z) + m[3]) / depth + cx;
+      const float v = fy * (((m[4] * x + m[5] * y) + m[6] * z) + m[7]) / depth + cy;
+      float side = splat_pixels;
+      if (splat_metres > 0.0f) {
+        side = fx * splat_metres / depth;
+        if (side < splat_pixels) side = splat_pixels;
+        if (side > splat_max_pixels) side = splat_max_pixels;
+      }
+      if (!(u > -side && v > -side && u < width + side && v < height + side)) continue;
+      const int left = std::max(0, first_pixel(u, side)), right = std::min(width - 1, last_pixel(u, side));
+      const int top = std::max(0, first_pixel(v, side)), bottom = std::min(height - 1, last_pixel(v, side));
+      std::uint32_t bits;
+      std::memcpy(&bits, &depth, sizeof bits);
+      const std::uint64_t key = (std::uint64_t{bits} << 32) | (first_index + static_cast<std::uint32_t>(i));
+      for (int row = top; row <= bottom; ++row)
+        for (int column = left; column <= right; ++column) keep_nearest(pixels[static_cast<std::int64_t>(row) * width + column], key);
+    }
   });
 }
 

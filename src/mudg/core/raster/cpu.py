@@ -6,7 +6,6 @@ dropped), and is then used again. Images do not depend on the number of threads.
 from __future__ import annotations
 
 import ctypes
-import math
 import weakref
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Final
@@ -19,7 +18,6 @@ from mudg import native
 from mudg.base import memory
 from mudg.base.errors import InputError, NumericsError, ResourceError
 from mudg.base.types import Camera, Gaussians, RasterTrace, Render
-from mudg.core.raster.torch_twin import FAR_M
 
 if TYPE_CHECKING:
     from mudg.core.raster.rasterize import RasterConfig
@@ -33,12 +31,11 @@ PHASES: Final = ("project", "sort", "bin", "blend", "blend_backward", "project_b
 class _Scene(ctypes.Structure):
     _fields_ = [
         *((name, _I) for name in ("count", "width", "height", "extra_channels", "sh_coefficients")),
-        *((name, _I) for name in ("sh_degree", "antialias", "want_abs_gradient")),
-        *((name, _F) for name in ("near_m", "far_m", "blur_px2", "alpha_max", "fx", "fy", "cx", "cy")),
+        *((name, _I) for name in ("antialias", "want_abs_gradient")),
+        *((name, _F) for name in ("near_m", "blur_px2", "alpha_max", "fx", "fy", "cx", "cy")),
         ("rotation", _F * 9),
         ("center_high", _F * 3),
         ("center_low", _F * 3),
-        ("background", _F * 3),
         *((name, _P) for name in ("means", "quats", "scales", "opacities", "sh", "extra", "sh_rest")),
     ]
 
@@ -57,7 +54,6 @@ class _Gradient(ctypes.Structure):
         *((name, _P) for name in ("means2d", "abs_means2d", "sh_rest")),
         ("rotation", _F * 9),
         ("center", _F * 3),
-        ("background", _F * 3),
     ]
 
 
@@ -126,7 +122,11 @@ PARTS: Final = ("means", "quats", "scales", "opacity", "sh", "extra", "sh_rest")
 
 def render(g: Gaussians, camera: Camera, world_from_cam: Tensor, config: RasterConfig, absgrad: bool) -> Render:
     """Draw with the native kernel. See ``core.raster.rasterize``."""
-    library = _library()
+    library = native.require("the CPU rasteriser")
+    library.mudg_raster_new.restype = _P
+    library.mudg_raster_free.argtypes = [_P]
+    for name in ("forward", "backward", "statistics"):
+        getattr(library, f"mudg_raster_{name}").argtypes = [_P, _P, _P]
     if g.means.dtype != torch.float32 or g.means.device.type != "cpu":
         what, got = "the native rasteriser works on float32 CPU tensors", f"{g.means.dtype} on {g.means.device}"
         raise InputError(what, where="gaussians.means", expected="torch.float32 on cpu", got=got)
@@ -215,11 +215,10 @@ def _scene(
     low = (center - high.double()).float()
     coefficients = sh.shape[1] + (0 if sh_rest is None else sh_rest.shape[1])
     counts = (len(means), camera.width, camera.height, 0 if extra is None else extra.shape[1], coefficients)
-    switches = (math.isqrt(coefficients) - 1, int(config.antialias), int(absolute))
-    limits = (config.near_m, FAR_M, config.blur_px2, config.alpha_max)
-    rotation, black = (_F * 9)(*pose[:3, :3].T.flatten().tolist()), (_F * 3)()
-    place = (rotation, (_F * 3)(*high.tolist()), (_F * 3)(*low.tolist()), black)
-    return _Scene(*counts, *switches, *limits, *camera.intrinsics, *place, *map(_at, parts))
+    settings = (int(config.antialias), int(absolute), config.near_m, config.blur_px2, config.alpha_max)
+    rotation = (_F * 9)(*pose[:3, :3].T.flatten().tolist())
+    place = (rotation, (_F * 3)(*high.tolist()), (_F * 3)(*low.tolist()))
+    return _Scene(*counts, *settings, *camera.intrinsics, *place, *map(_at, parts))
 
 
 def _check(status: int, context: _Context, parts: Sequence[Tensor | None]) -> None:
@@ -238,13 +237,3 @@ def _check(status: int, context: _Context, parts: Sequence[Tensor | None]) -> No
 
 def _at(tensor: Tensor | None) -> int | None:
     return None if tensor is None else tensor.data_ptr()
-
-
-def _library() -> ctypes.CDLL:
-    library = native.require("the CPU rasteriser")
-    if library.mudg_raster_new.restype is not _P:
-        library.mudg_raster_new.restype = _P
-        library.mudg_raster_free.argtypes = [_P]
-        for name in ("forward", "backward", "statistics"):
-            getattr(library, f"mudg_raster_{name}").argtypes = [_P, _P, _P]
-    return library
