@@ -120,9 +120,14 @@ class FitState(Progress):
     begun_at: int = 0
 
     @classmethod
-    def begun(cls, config: FitConfig, model: SceneModel, shown: ViewSet, known: Appearance, step: int = 0) -> FitState:
-        """The state before the first step, on the CPU; ``known``: the corrections."""
+    def begun(
+        cls, config: FitConfig, model: SceneModel, shown: ViewSet, start: storage.StartFit | None = None
+    ) -> FitState:
+        """The state before the first step, on the CPU; with ``start``, ``config`` is that of the whole run."""
         model.facts |= {"method": config.method, "classes": [palette.CLASSES[i] for i in model.classes]}
+        known, step = Appearance.of_views([view.name for view in shown.recorded], config.appearance), 0
+        if start is not None:
+            known, step = storage.continued_appearance(start, known), storage.begun_at(config.iterations)
         schedule = densify_schedule(config, recipe_of(config.method).last_densified)
         return cls(model, shown, DensifyStats.zeros(len(model.table)), schedule, known, step, step=step)
 
@@ -163,12 +168,13 @@ def _prepare(
     if found is None and start is None:
         return start_state(config, scene, fused, shown, classes)
     if found is None:
-        return continued_state(config, start, shown, classes)
+        model = storage.continued_model(start, classes, config)
+        log.info(f"start: {len(model.table)} Gaussians of {start.folder}")
+        return FitState.begun(config, model, shown, start)
     log.info(f"resuming at step {found.step} of {config.iterations}")
     model = SceneModel.from_state(found.state["model"], {name: found.tensors(name) for name in ("gaussians", "nodes")})
-    appearance = Appearance.from_state(found.state["appearance"], found.tensors("appearance"))
-    begun_at = 0 if start is None else storage.begun_at(config.iterations)
-    state = FitState.begun(config, model, shown, appearance, begun_at)
+    state = FitState.begun(config, model, shown, start)
+    state.appearance = Appearance.from_state(found.state["appearance"], found.tensors("appearance"))
     state.stats = DensifyStats.from_state(found.tensors("stats"))
     state.resume(found)
     return state
@@ -198,19 +204,7 @@ def start_state(
     """The state that a fit starts from, on the CPU: a model built from the fused cloud, nothing corrected yet."""
     model = recipe_of(config.method).start(FitStart(config, scene, cloud, shown.recorded, classes))
     model.facts |= {"method": config.method, "scene": scene.id, "classes": [], **drawing_facts(config.drawing)}
-    return FitState.begun(config, model, shown, _nothing_corrected(config, shown))
-
-
-def continued_state(config: FitConfig, start: storage.StartFit, shown: ViewSet, classes: tuple[int, ...]) -> FitState:
-    """The state of a fit that goes on with a finished one; ``config`` is that of the whole run."""
-    model = storage.continued_model(start, classes, config)
-    appearance = storage.continued_appearance(start, _nothing_corrected(config, shown))
-    log.info(f"start: {len(model.table)} Gaussians of {start.folder}")
-    return FitState.begun(config, model, shown, appearance, storage.begun_at(config.iterations))
-
-
-def _nothing_corrected(config: FitConfig, shown: ViewSet) -> Appearance:
-    return Appearance.of_views([view.name for view in shown.recorded], config.appearance)
+    return FitState.begun(config, model, shown)
 
 
 def add_certainty(state: FitState, config: FitConfig) -> None:
