@@ -1,8 +1,5 @@
-"""Random numbers without random state.
-
-Every draw in the package comes from a seed computed from (run seed, step, purpose). There is no generator to save:
-resuming at step 1000 draws what the uninterrupted run would have drawn.
-"""
+"""Random numbers without random state: every draw in the package comes from a seed computed from (run seed, step,
+purpose). There is no generator to save: resuming at step 1000 draws what the uninterrupted run would have drawn."""
 
 from __future__ import annotations
 

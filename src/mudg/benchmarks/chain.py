@@ -57,12 +57,10 @@ def compare(
     """Do all jobs (title -> what another process can measure), several at a time with one thread each; write
     ``bench.json`` and ``bench.md``. Results do not depend on how many run at a time; finished steps of an interrupted
     benchmark are reused. ``document``: what ``bench.json`` holds, from what the jobs measured, in their order."""
-    measured, titles, at_once = {}, list(jobs), config.processes
-    if not at_once:  # one per core, or one where they would share a GPU
-        at_once = os.cpu_count() or 1 if drawing_device(config.device, "benchmark").type == "cpu" else 1
+    measured, titles = {}, list(jobs)
     with log.task("logs", len(jobs)) as bar, native.one_thread():
         work = [(measure,) for measure in jobs.values()]
-        for index, facts in run_in_processes(operator.call, work, min(at_once, len(jobs))):
+        for index, facts in run_in_processes(operator.call, work, min(at_once(config), len(jobs))):
             measured[index] = facts
             bar.update(titles[index])
             bar.advance()
@@ -70,6 +68,13 @@ def compare(
     store.write_json(out / "bench.json", content)
     store.write_text(out / "bench.md", markdown(content))
     return out
+
+
+def at_once(config: BenchConfig) -> int:
+    """Logs that are measured at the same time: as many as asked for, else one per core, or one where they would share a
+    GPU."""
+    on_cpu = drawing_device(config.device, "benchmark").type == "cpu"
+    return config.processes or (os.cpu_count() if on_cpu else None) or 1
 
 
 def run_step(step: Result) -> Path:

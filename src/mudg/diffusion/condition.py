@@ -1,6 +1,5 @@
-"""Conditions of the diffusion model: what a fused cloud and recorded images tell about a path of views.
-
-`build_conditions` makes the model's input for a path of views from a fused cloud and recorded images:
+"""Conditions of the diffusion model: what a fused cloud and recorded images tell about a path of views
+(`build_conditions`).
 
 1. the cloud is projected into every view (z-buffer);
 2. far points that shine through gaps between near ones are removed (`core.project`, rule `condition`);
@@ -14,8 +13,6 @@
 
 Steps 2 to 7 are what the published system does not do; `ConditionRules(published=True)` gives its condition instead:
 points only, zero where nothing is known, the reference image in frame 0 being put in by the model.
-
-Training clips are made of these in `city_clips.py` and `log_clips.py`.
 """
 
 from __future__ import annotations

@@ -1,15 +1,6 @@
 """A driving log as an NCore recording (version 4), written with NVIDIA's package: NAME.ncore4.zarr.itar and
-NAME.ncore4.json.
-
-Frames: ``world``, ``rig`` (the vehicle) and one per sensor. A sensor whose place on the vehicle is fixed hangs on
-``rig`` by one pose, any other on ``world`` by its own path. Times are whole microseconds; the first record of the log
-is at 1 s. Sweeps, which the scene holds as seen at one moment, are taken apart again into rays in the sensor's frame at
-their own times. Boxes stand in ``world``.
-
-Conventions, as the package's own functions apply them: world right-handed with z up; rig x forward, y left, z up;
-cameras x right, y down, z forward, the centre of the top-left pixel at (0.5, 0.5); between keys poses move in straight
-lines and rotate evenly. A box is turned about x, then y, then z of the fixed frame.
-"""
+NAME.ncore4.json. Conventions: docs/reference/formats.md. Sweeps, which the scene holds as seen at one moment, are
+taken apart again into rays in the sensor's frame at their own times."""
 
 from __future__ import annotations
 

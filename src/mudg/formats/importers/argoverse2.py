@@ -1,18 +1,6 @@
-"""Argoverse 2 importer: one log of the sensor data set.
-
-=========================================== =====================================================================
-``sensors/cameras/<camera>/<ns>.jpg``       images named by their time: seven ring cameras at 20 Hz, two stereo cameras
-``sensors/lidar/<ns>.feather``              sweeps at 10 Hz: x, y, z in the vehicle's frame, intensity, offset_ns
-``city_SE3_egovehicle.feather``             vehicle poses, at every sensor's times
-``calibration/*.feather``                   intrinsics, and where the sensors sit
-``annotations.feather``                     boxes in the vehicle's frame at the sweeps' times (not in the test split)
-=========================================== =====================================================================
-
-Images are rectified by the publisher: the coefficients k1 to k3 describe the original lens and are kept for the record
-only. Sweeps are the returns of two sensors, compensated for the vehicle's motion to the time in their name; ``dt_s`` is
-the file's ``offset_ns``. They are stored in the frame of the upper sensor, so that a sweep has the origin its rays came
-from (the lower one sits about 0.1 m below it).
-"""
+"""Argoverse 2 importer: one log of the sensor data set. What is read, and how: docs/formats/argoverse2.md,
+docs/reference/formats.md. Images are rectified by the publisher: the coefficients k1 to k3 describe the original
+lens and are kept for the record only."""
 
 from __future__ import annotations
 

@@ -1,17 +1,6 @@
-"""nuPlan importer: one log (a ``.db`` file) with its sensor blobs, or one scene (up to 20 s) of it.
-
-================================================ =======================================================================
-``<log>.db``                                     SQLite: poses at 100 Hz, calibration, images, clouds, tracked boxes
-``sensor_blobs/<log>/CAM_F0`` ...                eight cameras, JPEG, 10 Hz, distorted (k1 k2 p1 p2 k3)
-``sensor_blobs/<log>/MergedPointCloud/*.pcd``    points of five LiDARs in one cloud, 20 Hz
-================================================ =======================================================================
-
-``sensor_blobs`` is looked for beside the database and up to four folders above it.
-
-Frames count images of the first chosen camera. Clouds are motion-compensated in the source; ``dt_s`` is 0. Image times
-are the start of a read-out of about 1/30 s; the middle row, and with it the pose, belongs 1/60 s later. Boxes come from
-an offline tracker, at every cloud.
-"""
+"""nuPlan importer: one log (a ``.db`` file) with its sensor blobs, or one scene (up to 20 s) of it. What is read,
+and how: docs/formats/nuplan.md, docs/reference/formats.md. ``sensor_blobs`` is looked for beside the database and up
+to four folders above it."""
 
 from __future__ import annotations
 

@@ -1,24 +1,6 @@
 """nuScenes importer: one scene of a release (``v1.0-mini``, ``v1.0-trainval``, ``v1.0-test``), or one annotated key
-frame.
-
-What is read, below the release's root:
-
-============== ==========================================================================================
-``v1.0-*``     the tables: scene, log, sample, sample_data, ego_pose, calibrated_sensor, sensor; and, where
-               there are annotations, sample_annotation, instance, category, attribute
-``samples``    images and sweeps of the key frames (2 Hz)
-``sweeps``     those between: six cameras at 12 Hz, ``LIDAR_TOP`` at 20 Hz
-============== ==========================================================================================
-
-Each image and sweep has a vehicle pose of its own, at its own time; nothing is interpolated but the boxes between their
-2 Hz key frames. Images are rectified by the publisher. Sweeps are compensated for the vehicle's motion inside the
-sensor, to the end of the turn, which is the sweep's time stamp.
-
-A sweep file has no point times. It holds columns of 32 returns in firing order, so the time of a point follows from its
-column; where the columns are not complete, from its azimuth: the sensor turns clockwise in 50 ms and begins 93 degrees
-to the left of forward. ``dt_s`` is therefore between -0.05 and 0. Returns from the recording vehicle itself, a quarter
-of all, are dropped.
-"""
+frame. What is read, and how times are understood: docs/formats/nuscenes.md, docs/reference/formats.md. Returns from
+the recording vehicle itself, a quarter of all, are dropped."""
 
 from __future__ import annotations
 

@@ -1,31 +1,6 @@
-"""PandaSet importer: one sequence folder (``001``, ``002``, ...) of 80 frames at 10 Hz.
-
-========================================= ==============================================================================
-``camera/<name>/NN.jpg``                   six cameras, rectified; ``intrinsics.json``, ``poses.json``,
-                                           ``timestamps.json``
-``lidar/NN.pkl.gz``                        points of both LiDARs in the world: x y z, i (0..255), t (s), d (which LiDAR)
-``lidar/poses.json``, ``timestamps.json``  pose of the vehicle (x right, y forward, z up), not of a LiDAR
-``annotations/cuboids/NN.pkl.gz``          boxes in the world
-``annotations/semseg/NN.pkl.gz``           class of every point; ``classes.json`` names them
-========================================= ==============================================================================
-
-The tables are pickled pandas frames. They are read by ``pandas_frame``, which runs nothing of them and needs no pandas.
-
-Frames. World: z up, origin and x axis at the vehicle of the first frame. The given points are motion-compensated: each
-lies where it was at its own time ``t``; ``dt_s`` keeps that time. The two LiDARs become two sensors, ``pandar64`` (d =
-0) and ``pandar_gt`` (d = 1, solid state, looks forward). Their places on the vehicle follow from the front camera's
-recorded poses and the published static calibration. A cloud is filed under the end of its turn, 0.05 s after its middle
-and after the front camera's image; a sweep here stands at the middle.
-
-Images. Measured on sequence 002 (see docs/research/formats.md), images show what moves as it was ``EXPOSURE_S`` from
-their time stamp, and fit standing points when the camera is taken ``POSE_S`` along the vehicle's path. Both are applied
-to all cameras.
-
-Boxes. ``yaw`` 0 looks along the world's y axis, and ``dimensions.y`` is the length. Moving objects where both LiDARs
-look carry two boxes that name each other as siblings; they are one track here, and in a frame with both the turning
-LiDAR's box is kept. A box that may move belongs to the time its points were measured, not to the frame's (up to 0.05 s
-apart: 1 m at 20 m/s); it is moved to the sweep's time with its track's velocity.
-"""
+"""PandaSet importer: one sequence folder (``001``, ``002``, ...) of 80 frames at 10 Hz. What is read, and how its
+times, poses and boxes are understood: docs/formats/pandaset.md, docs/reference/formats.md. The tables are read by
+``pandas_frame``, which runs nothing of these pickles and needs no pandas."""
 
 from __future__ import annotations
 

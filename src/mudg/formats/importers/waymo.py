@@ -1,21 +1,6 @@
-"""Waymo Open Dataset importer: format 1 (one TFRecord file per log) and format 2 (Parquet files by component).
-
-What becomes what:
-
-=========== ============================================================================================================
-images      five cameras (``front``, ``front_left``, ``front_right``, ``side_left``, ``side_right``), rectified; the
-            view is the one of the middle column's exposure
-labels      panoptic labels, where an image has them: ``semantics``, ``instance``, ``sky``, ``ego``
-scans       five LiDARs (``lidar_top``, ``lidar_front``, ...), both returns, at the frame's pose; ``dt_s`` for the top
-            one
-boxes       3D boxes as tracks: each holds when the top LiDAR passed it, and is carried to the moment of the frame's
-            pose with its object's own speed
-time        seconds since the first imported frame's timestamp
-=========== ============================================================================================================
-
-A frame's timestamp is when the top LiDAR began its turn; the frame's pose belongs to the middle of the turn. Its time
-is that of the image recorded with the same pose (the front camera's).
-"""
+"""Waymo Open Dataset importer: format 1 (one TFRecord file per log) and format 2 (Parquet files by component). What
+becomes what, and when it holds: docs/formats/waymo.md, docs/reference/formats.md. A frame's timestamp is when the
+top LiDAR began its turn, its pose belongs to the middle of the turn, as does the image recorded with the same pose."""
 
 from __future__ import annotations
 
