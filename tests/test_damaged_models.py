@@ -21,8 +21,7 @@ from toy_scene import EGO_FROM_CAM
 from mudg.base import store
 from mudg.base.errors import MudgError
 from mudg.base.types import Camera
-from mudg.baselines.emernerf import load_field, save_field
-from mudg.baselines.emernerf_field import Budget
+from mudg.baselines.emernerf import Budget, load_field, save_field
 from mudg.core.table import Table
 from mudg.diffusion import model_files
 from mudg.gaussians.corrections import COLOR, Appearance

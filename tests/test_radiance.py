@@ -17,10 +17,19 @@ from toy_world import camera, fused_cloud, view_at, write_scene
 
 from mudg.base import geometry, seeds, store
 from mudg.base.errors import NumericsError, UsageError
-from mudg.baselines import emernerf as loop
-from mudg.baselines import emernerf_field as fields
-from mudg.baselines.emernerf import extent_of, lidar_rays, load_field, view_rays
-from mudg.baselines.emernerf_field import SIZES, Budget, Extent, RadianceField, RayDraws, aggregated
+from mudg.baselines import emernerf
+from mudg.baselines.emernerf import (
+    SIZES,
+    Budget,
+    Extent,
+    RadianceField,
+    RayDraws,
+    aggregated,
+    extent_of,
+    lidar_rays,
+    load_field,
+    view_rays,
+)
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing.settings import RenderConfig
 from mudg.gaussians.settings import FitConfig
@@ -51,28 +60,28 @@ def test_space_and_rays_by_hand():
     center, half = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([10.0, 20.0, 5.0])
     places = torch.tensor([[1.0, 2, 3], [11, 2, 3], [1, -18, 3], [21, 2, 3], [1, 2, 1e9], [21, 22, 3]])
     wanted = [[8, 8, 8], [12, 8, 8], [8, 4, 8], [14, 8, 8], [8, 8, 16], [14, 11, 8]]
-    assert torch.allclose(fields.contract(places, center, half), torch.tensor(wanted) / 16)
+    assert torch.allclose(emernerf.contract(places, center, half), torch.tensor(wanted) / 16)
     along = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0])
-    found = fields.distances(along, 0.1, 200.0, 1000.0)
+    found = emernerf.distances(along, 0.1, 200.0, 1000.0)
     assert torch.allclose(found, torch.tensor([0.1, 100.05, 200.0, 1 / (0.5 / 200 + 0.5 / 1000), 1000.0]))
     edges = torch.tensor([[0.0, 1.0, 3.0, 4.0, 10.0]])
     density = torch.tensor([[0.5, 0.0, 2.0, 1e6]])
     first, third = 1 - math.exp(-0.5), math.exp(-0.5) * (1 - math.exp(-2.0))
     wanted = torch.tensor([[first, 0.0, third, math.exp(-2.5)]])
-    assert torch.allclose(fields.rendering_weights(density, edges), wanted, atol=1e-6)
+    assert torch.allclose(emernerf.rendering_weights(density, edges), wanted, atol=1e-6)
 
 
 def test_samples_gather_where_the_weights_are():
     edges = torch.linspace(0, 1, 11)[None]
     weights = torch.zeros(1, 10)
     weights[0, 6] = 1.0
-    found = fields.resampled_edges(edges, weights, 20, torch.full((1, 1), 0.5))
+    found = emernerf.resampled_edges(edges, weights, 20, torch.full((1, 1), 0.5))
     assert found.shape == (1, 21) and (found.diff() >= 0).all()
     assert ((found >= 0.6) & (found <= 0.7)).float().mean() > 0.9
     for jitter in (0.0, 0.5, 0.99):
-        across = fields.even_edges(1, 8, torch.full((1, 1), jitter))
+        across = emernerf.even_edges(1, 8, torch.full((1, 1), jitter))
         assert across[0, 0] == 0 and across[0, -1] == 1 and (across.diff() >= 0).all()
-    even = fields.resampled_edges(edges, torch.ones(1, 10), 9, torch.full((1, 1), 0.5))
+    even = emernerf.resampled_edges(edges, torch.ones(1, 10), 9, torch.full((1, 1), 0.5))
     assert torch.allclose(even[0], (torch.arange(10) + 0.5) / 10, atol=1e-6)
 
 
@@ -88,7 +97,7 @@ def test_a_blurred_histogram_keeps_its_mass_and_equals_a_fine_convolution():
     box = int(2 * radius * fine)
     blurred = torch.nn.functional.avg_pool1d(height[None, None], box + 1, 1, box // 2)[0, 0]
     expected = blurred.view(10, -1).sum(1) / fine
-    found = fields.blurred_mass(edges, weights, wanted, radius)[0]
+    found = emernerf.blurred_mass(edges, weights, wanted, radius)[0]
     assert torch.allclose(found, expected, atol=2e-4)
     assert float(found.sum()) == pytest.approx(1.0, abs=1e-9)
 
@@ -97,10 +106,10 @@ def test_proposals_that_agree_cost_nothing_and_others_do():
     edges = drawn(3, 9).sort(1).values
     weights = drawn(3, 8, name="weights")
     weights = weights / weights.sum(1, keepdim=True)
-    assert float(fields.interlevel_loss(edges, weights, edges, weights, 0.0)) < 1e-6
+    assert float(emernerf.interlevel_loss(edges, weights, edges, weights, 0.0)) < 1e-6
     even, flat = torch.linspace(0, 1, 9).double().expand(2, -1), torch.full((2, 8), 0.125).double()
-    assert float(fields.interlevel_loss(even, flat, even, flat, 0.03)) == pytest.approx(0.0, abs=1e-12)
-    assert float(fields.interlevel_loss(edges, weights, edges, weights.flip(1), 0.0)) > 1e-2
+    assert float(emernerf.interlevel_loss(even, flat, even, flat, 0.03)) == pytest.approx(0.0, abs=1e-12)
+    assert float(emernerf.interlevel_loss(edges, weights, edges, weights.flip(1), 0.0)) > 1e-2
 
 
 # ---- the field -----------------------------------------------------------------------------------
@@ -131,14 +140,14 @@ def test_color_loss_reaches_every_field_and_proposals_learn_only_when_asked():
     rays, _ = view_rays(view_at(0.3, camera("front", 6, 4)), field.extent, 0)
     budget = Budget((16, 12), 8, 0.1, 1000.0)
     draws = RayDraws.of(len(rays), budget, seeds.torch_generator(0, 1, "draws"), torch.device("cpu"))
-    marched = fields.march(field, rays, budget, draws)
-    fields.colors(field, rays, marched)[0].square().mean().backward()
+    marched = emernerf.march(field, rays, budget, draws)
+    emernerf.colors(field, rays, marched)[0].square().mean().backward()
     gradients = {name: value.grad for name, value in field.named_parameters() if value.grad is not None}
     reached = {name for name, gradient in gradients.items() if gradient.abs().sum() > 0}
     for part in ("static.table", "dynamic.table", "flow.net.weights.0", "color.out", "shadow", "sky", "appearance"):
         assert any(name.startswith(part) for name in reached), part
     assert not any(name.startswith("proposals") for name in reached)
-    fields.proposal_loss(fields.march(field, rays, budget, draws, True)).backward()
+    emernerf.proposal_loss(emernerf.march(field, rays, budget, draws, True)).backward()
     assert all(proposal.table.grad.abs().sum() > 0 for proposal in field.proposals)
 
 
@@ -146,26 +155,26 @@ def test_line_of_sight_wants_emptiness_before_the_surface_and_the_mass_of_a_bell
     edges, measured = torch.tensor([[1.0, 8.0, 9.5, 10.5, 20.0, 30.0]]), torch.tensor([10.0])
     one = math.erf(1 / math.sqrt(2))  # the mass within a standard deviation, which is 0.5 m
     weights = torch.tensor([[0.2, (1 - one) / 2, one, (1 - one) / 2, 0.7]])
-    assert float(fields.line_of_sight(weights, edges, measured, 1.5)) == pytest.approx(0.04, abs=5e-5)
-    assert float(fields.line_of_sight(weights - 0.05, edges, measured, 1.5)) == pytest.approx(0.03, abs=5e-5)
+    assert float(emernerf.line_of_sight(weights, edges, measured, 1.5)) == pytest.approx(0.04, abs=5e-5)
+    assert float(emernerf.line_of_sight(weights - 0.05, edges, measured, 1.5)) == pytest.approx(0.03, abs=5e-5)
 
 
 def test_the_median_lies_where_half_of_the_weight_is_passed():
     edges = torch.tensor([[1.0, 2.0, 3.0, 5.0]]).expand(3, -1)
     weights = torch.tensor([[0.1, 0.8, 0.1], [0.2, 0.2, 0.4], [0.0, 0.0, 0.5]])
-    marched = fields.Marched(edges, edges, edges[:, 1:], weights, edges, edges, (), *[edges] * 5)
+    marched = emernerf.Marched(edges, edges, edges[:, 1:], weights, edges, edges, (), *[edges] * 5)
     assert marched.median_m.tolist() == pytest.approx([2.5, 3.0, 4.0])
     assert marched.range_m.tolist() == pytest.approx([(0.2 + 2.4 + 0.5), (0.4 + 0.6 + 2.0) / 0.8, 5.0])
 
 
 def test_schedules_and_published_sizes():
-    assert [loop.rate_share(step, 1000) for step in (1, 200, 1000)] == pytest.approx([0.01, 1.0, 0.33**4])
-    assert [loop.sight_width(step, 1000) for step in (80, 81, 290, 900)] == [0.0, 6.0, 3.0, 0.6]
-    assert [loop.dynamic_share(step, 1000) for step in (1, 100, 300, 500, 900)] == pytest.approx([0, 0, 0.5, 1, 1])
+    assert [emernerf.rate_share(step, 1000) for step in (1, 200, 1000)] == pytest.approx([0.01, 1.0, 0.33**4])
+    assert [emernerf.sight_width(step, 1000) for step in (80, 81, 290, 900)] == [0.0, 6.0, 3.0, 0.6]
+    assert [emernerf.dynamic_share(step, 1000) for step in (1, 100, 300, 500, 900)] == pytest.approx([0, 0, 0.5, 1, 1])
     size = fit_config(method="emernerf", radiance__size="published").radiance.size
     assert SIZES[size].static == (10, 4, 16, 8192, 20)
-    assert (loop.BUDGETS[size].proposals, loop.BATCHES[size]) == ((128, 64), (8192, 8192))
-    assert fields.DIRECTION_WIDTH == 33
+    assert (emernerf.BUDGETS[size].proposals, emernerf.BATCHES[size]) == ((128, 64), (8192, 8192))
+    assert emernerf.DIRECTION_WIDTH == 33
 
 
 # ---- the fit -------------------------------------------------------------------------------------
@@ -182,7 +191,7 @@ def world(tmp_path_factory) -> Path:
 
 
 def test_resumed_equals_uninterrupted(world, tmp_path, monkeypatch):
-    real, calls = loop.take_step, []
+    real, calls = emernerf.take_step, []
 
     def stopped(state, config, step):
         calls.append(step)
@@ -190,7 +199,7 @@ def test_resumed_equals_uninterrupted(world, tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return real(state, config, step)
 
-    monkeypatch.setattr(loop, "take_step", stopped)
+    monkeypatch.setattr(emernerf, "take_step", stopped)
     fitting = Fit(scene=world / "scene", out=tmp_path / "fit", settings=fit_config(**TINY))
     with pytest.raises(KeyboardInterrupt):
         fitting.run()
@@ -200,18 +209,18 @@ def test_resumed_equals_uninterrupted(world, tmp_path, monkeypatch):
     assert not (folder / "steps").exists()
 
 
-def started(world: Path, device: str | torch.device = "cpu") -> tuple[loop.RadianceState, FitConfig]:
+def started(world: Path, device: str | torch.device = "cpu") -> tuple[emernerf.RadianceState, FitConfig]:
     config, folder = fit_config(**TINY), SimpleNamespace(path=world / "none")
-    return loop.prepare(config, read_scene(world / "scene"), folder, torch.device(device)), config
+    return emernerf.prepare(config, read_scene(world / "scene"), folder, torch.device(device)), config
 
 
 @pytest.mark.slow
 def test_a_step_on_another_device_is_the_same(world, monkeypatch):
-    monkeypatch.setitem(loop.BATCHES, "tiny", (8, 8))
+    monkeypatch.setitem(emernerf.BATCHES, "tiny", (8, 8))
 
     def two_steps(device: str | torch.device) -> dict[tuple[int, str], float]:
         state, config = started(world, device)
-        steps = ((step, loop.take_step(state, config, step)) for step in (1, 2))
+        steps = ((step, emernerf.take_step(state, config, step)) for step in (1, 2))
         return {(step, name): float(value.detach().cpu()) for step, terms in steps for name, value in terms.items()}
 
     with pretend_device() as there:
@@ -223,7 +232,7 @@ def test_what_is_not_finite_never_reaches_the_parameters(world):
     state, config = started(world)
     state.pixels._rgb = torch.full_like(state.pixels._rgb, 7).float() * torch.nan
     before = {name: value.clone() for name, value in state.field.state_dict().items()}
-    refused("color", loop.take_step, state, config, 1, raises=NumericsError)
+    refused("color", emernerf.take_step, state, config, 1, raises=NumericsError)
     assert all(torch.equal(value, before[name]) for name, value in state.field.state_dict().items())
 
 
@@ -242,7 +251,7 @@ def test_renders_as_observations_without_classes(world, tmp_path):
 
 def test_saved_field_is_the_fitted_one(world):
     field, budget = load_field(world / "fit")
-    assert budget == loop.BUDGETS["tiny"]
+    assert budget == emernerf.BUDGETS["tiny"]
     assert field.facts == {"method": "emernerf", "scene": "toy"}
     values = store.read_json(world / "fit" / "model.json")
     tensors = store.read_tensors(world / "fit" / "field.safetensors")
@@ -272,7 +281,7 @@ def test_pixels_and_lidar_are_rays_of_the_world(world):
     extent = extent_of(scene, lidar)
     ends = lidar[0].origins + lidar[1][:, None] * lidar[0].directions
     assert float((ends[:, 2]).min()) > -0.1  # nothing below the ground
-    inside = fields.contract(ends, torch.tensor(extent.center), torch.tensor(extent.half))
+    inside = emernerf.contract(ends, torch.tensor(extent.center), torch.tensor(extent.half))
     assert 0.85 < float(((inside > 0.249) & (inside < 0.751)).all(1).float().mean()) < 0.99
     assert extent.step == pytest.approx(0.3 / 0.9) and extent.normalised(-5.0) == 0.0
     view = scene.frames[1].view
