@@ -415,7 +415,7 @@ def test_the_reference_fits_only_where_it_was_taken(street):
 @pytest.mark.parametrize(
     ("budget_gb", "guidance", "split"),
     [
-        (8, True, WorkSplit(False, False, 1)),
+        (8, True, WorkSplit(False, False, 2)),
         (10, True, WorkSplit(False, False, 4)),
         (16, True, WorkSplit(True, False, 8)),
         (15, False, WorkSplit(True, True, 8)),
