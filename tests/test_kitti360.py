@@ -276,6 +276,11 @@ def test_spoilt_logs_are_refused_in_words(
     roundtrip.assert_refused(ingest, source, tmp_path / "out", words)
 
 
+def test_times_out_of_order_are_refused_outside_of_the_imported_frames_too(source: Path, tmp_path: Path) -> None:
+    spoil_text(STAMPS, r":17\.550", ":17.350")(source)
+    refused("do not increase", ingest, source, tmp_path / "out", frames=(1, 2))
+
+
 def test_missing_frames_can_be_skipped_and_choices_are_checked(source: Path, tmp_path: Path) -> None:
     (source / IMAGE).unlink()
     (source / SCAN).write_bytes(b"")

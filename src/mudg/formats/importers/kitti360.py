@@ -321,7 +321,11 @@ def _read_motion(path: Path, clock: NDArray[np.float64]) -> EgoPath:
     if not poses:
         what = "no pose belongs to a frame"
         raise InputError(what, where=str(path), expected=f"frame numbers up to {len(clock) - 1}")
-    return common.ego_path(clock[numbers].tolist(), list(np.stack(poses) @ IMU_FROM_EGO))
+    times = clock[numbers]
+    if (np.diff(times) <= 0).any():
+        frame = numbers[int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1]
+        raise InputError("timestamps do not increase", where=f"{path}: frame {frame}")
+    return EgoPath(times, np.stack(poses) @ IMU_FROM_EGO)
 
 
 def _has_pose(ego: EgoPath, time_s: float) -> bool:
