@@ -76,6 +76,12 @@ def test_it_learns(world, learnt, tmp_path):
         assert semantics[int(uv[0, 1]), int(uv[0, 0])] == ID["car"]
 
 
+def test_perfect_virtual_views_help_off_the_path(world, learnt, tmp_path):
+    config = settings("mudg_s", iterations=150, virtual__probability=0.4)
+    guided = fit_to(world, tmp_path / "guided", config, observations=(world["virtual"],)).run()
+    assert mean_psnr(guided, SIZE, 2.0) > mean_psnr(learnt, SIZE, 2.0) + 0.3
+
+
 def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypatch):
     """Ctrl-C and SIGTERM before and after virtual views join, a densification and an opacity reset; learnt poses and
     all. Bit for bit."""
