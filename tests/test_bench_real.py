@@ -138,7 +138,7 @@ def model(tmp_path_factory):
 def made_from(source, out, split, model):
     """Everything that methods make of a log under a split, by name, as bytes."""
     settings = {"fit": FitConfig(densify={"kind": "none"}), "synthesize": SynthesizeConfig(steps=1, shifts_m=(2.0,))}
-    config = BenchConfig(model=model, iterations=6, methods=("nearest_fill", "mudg_s"), **settings)
+    config = BenchConfig(model=model, iterations=6, methods=("nearest_fill", "mudg_s", "mudg_f"), **settings)
     job = job_of(out, source, split, config, method_rows(config))
     whole = read_scene(source)
     held = places.held_out(whole, split, ())
@@ -162,7 +162,8 @@ def test_held_out_content_changes_no_fit_no_cloud_no_model_and_no_view(scene, ci
     plain, held = made_from(city, tmp_path / "plain", split, model), places.held_out(scene, split, ())
     copied(scene, tmp_path / "noise", held.frames, held.sweeps)
     assert any("fit/mudg_s" in name for name in plain) and any("virtual/" in name for name in plain)
-    assert any("render/mudg_s" in name for name in plain) and any("fuse/static" in name for name in plain)
+    assert any("fuse/static" in name for name in plain)
+    assert all(any(f"render/{name}/" in path for path in plain) for name in ("mudg_s", "mudg_f"))
     again = made_from(tmp_path / "noise", tmp_path / "out", split, model)
     assert [name for name in plain if again[name] != plain[name]] == [] and set(again) == set(plain)
     copied(scene, tmp_path / "seen", {"front/000000"})  # what is shown does count
@@ -348,13 +349,13 @@ def test_finished_work_is_reused_and_a_method_can_be_added(made, city, model):
     split = out / "city" / "gap-1"
     watched = [split / "fit" / "street_gaussians" / "run.json", out / "city" / "truth" / "lidar" / "run.json"]
     before = [path.stat().st_mtime_ns for path in watched]
-    added = ("street_gaussians", "street_gaussians-longer", "mudg_s", "mudg_r")
+    added = ("street_gaussians", "street_gaussians-longer", "mudg_s", "mudg_r", "mudg_f")
     settings = SynthesizeConfig(shifts_m=(2.0,))
     changes = {"methods": added, "protocols": ("gap-1",), "model": model, "synthesize": settings}
     real.run(dataclasses.replace(config, **changes), [city], out)
     assert [path.stat().st_mtime_ns for path in watched] == before
     document = store.read_json(out / "bench.json")
-    assert [row["name"] for row in document["methods"]] == [*added[:2], "mudg_r", "mudg_s"]
+    assert [row["name"] for row in document["methods"]] == [*added[:2], "mudg_r", "mudg_s", "mudg_f"]
     assert isinstance(document["protocols"]["gap-1"]["against"]["mudg_s"]["psnr"], float)
     start = store.digest(split / "fit" / "street_gaussians")
     both = ("mudg_s", "street_gaussians-longer")

@@ -28,7 +28,7 @@ from mudg.benchmarks.places import (
     names_of,
     protocols_of,
 )
-from mudg.benchmarks.rows import BASE, FILL, SCENES, Facts, Row, generator_of, method_rows, settings_of
+from mudg.benchmarks.rows import BASE, FILL, Facts, Row, generator_of, method_rows, settings_of
 from mudg.benchmarks.settings import BenchConfig
 from mudg.editing import render
 from mudg.editing.settings import RenderConfig
@@ -67,7 +67,7 @@ def run(
     scenes made by ``mudg ingest``. ``preset``: what ``config`` started from. ``overwrite``: replace what other settings
     left in ``out``. UsageError: no log, an unknown method or protocol, a setting that no row uses, two logs of one
     name, or ``out`` holds something else. Whatever a verb raises."""
-    rows, protocols = method_rows(config, preset, SCENES), protocols_of(config.protocols)
+    rows, protocols = method_rows(config, preset), protocols_of(config.protocols)
     logs, out = names_of(sources), Path(out)
     refuse("real", config, preset, rows, out, read={f"log {name}": path for name, path in logs.items()})
     scenes = {name: imported(config, path, out / name / "scene", overwrite) for name, path in logs.items()}

@@ -183,7 +183,7 @@ OTHER_METHODS: Final = {FILL: "", LONGER: BASE, MIXED: FULL}
 """Method of the rows that are not named by it."""
 PLACES: Final = ("cameras", "shifts_m", "paths", "condition", "processes")
 """Settings of generated views that are the benchmark's matter, not the user's."""
-SCENES: Final = (FILL, "gs3d", BASE, LONGER, *PUBLISHED, DIFFUSION, FULL)
+SCENES: Final = (FILL, "gs3d", BASE, LONGER, *PUBLISHED, DIFFUSION, FULL, MIXED)
 """Methods that every benchmark of complete methods knows, in the order of the tables."""
 
 
@@ -295,14 +295,12 @@ def refuse_unfit(config: BenchConfig, preset: PresetName, rows: Sequence[Row]) -
 # ---- rows ----
 
 
-def method_rows(
-    config: BenchConfig, preset: PresetName = "default", known: Sequence[str] = (*SCENES, MIXED)
-) -> tuple[Row, ...]:
-    """Rows of the methods that are asked for, in the order of ``known``. UsageError: an unknown method, or one that
+def method_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row, ...]:
+    """Rows of the methods that are asked for, in the order of ``SCENES``. UsageError: an unknown method, or one that
     does not know a setting beyond the preset."""
-    _refuse_unknown(config.methods, known)
+    _refuse_unknown(config.methods, SCENES)
     usual, rows = usual_fit(config), list[Row]()
-    for name in (name for name in known if name in config.methods):
+    for name in (name for name in SCENES if name in config.methods):
         title, method = LONGER_TITLE if name == LONGER else title_of(name), OTHER_METHODS.get(name, name)
         fit = None if name in (FILL, DIFFUSION) else method_fit(usual, method, preset)
         rows.append(Row(name, title, method, fit))

@@ -38,8 +38,8 @@ class BenchConfig:
     methods: tuple[str, ...] = ("nearest_fill", "gs3d", "street_gaussians", "mudg_r", "mudg_s")
     """Methods to compare: those of the default (loop: street_gaussians and mudg_s); pvg, s3gaussian,
     bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on until it has as many steps as mudg_s,
-    without generated views. shift: also mudg_f, renders of mudg_s that the diffusion model repairs. paper: any of these
-    of shift but mudg_f; with the default, all of them."""
+    without generated views. Also mudg_f, renders of mudg_s that the diffusion model repairs. paper: any of these but
+    mudg_f; with the default, all of them."""
     iterations: int = setting(default=1000, ge=1)
     """Optimisation steps of every fit without virtual views."""
     guided_share: float = setting(default=1.5, gt=0)

@@ -84,7 +84,7 @@ def bench(
         seed: Seed of all random numbers; the same seed gives the same result.
         list: shift, loop: list of logs. Choose settings on development; report results on reported, on which nothing was chosen.
         logs: shift, loop; paper with a list of cities: number of logs taken from the list, 1 to 8 (the development list has 4).
-        methods: Methods to compare: those of the default (loop: street_gaussians and mudg_s); pvg, s3gaussian, bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on until it has as many steps as mudg_s, without generated views. shift: also mudg_f, renders of mudg_s that the diffusion model repairs. paper: any of these of shift but mudg_f; with the default, all of them.
+        methods: Methods to compare: those of the default (loop: street_gaussians and mudg_s); pvg, s3gaussian, bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on until it has as many steps as mudg_s, without generated views. Also mudg_f, renders of mudg_s that the diffusion model repairs. paper: any of these but mudg_f; with the default, all of them.
         iterations: Optimisation steps of every fit without virtual views.
         guided_share: Steps of fits under virtual views, as a multiple of the others'.
         processes: Number of logs (real: also ways of hiding frames) processed at the same time, with one thread each (0 = one per core). Results do not depend on it.
