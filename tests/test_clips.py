@@ -8,13 +8,14 @@ import torch
 from toy_clips import some_clip
 
 from mudg import native
+from mudg.base import palette
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, FusedCloud, Photo, PointCloud, Track, View
 from mudg.core import project as visible
 from mudg.diffusion import city_clips, clips
 from mudg.diffusion import condition as conditions
 from mudg.diffusion.city_clips import HELD_OUT, CityClipRules, shifts_of
-from mudg.diffusion.condition import ConditionRules, DriveInputs, WarpSource, build_conditions
+from mudg.diffusion.condition import FAR_M, ConditionRules, DriveInputs, WarpSource, build_conditions
 from mudg.diffusion.views import conditions_of
 
 CAMERA = Camera("front", 48, 32, 40.0, 40.0, 24.0, 16.0)
@@ -102,6 +103,34 @@ def test_condition_of_a_wall():
     assert float((condition.color[0] - truth).abs()[:, warped].max()) < 0.02
     assert bool(warped[:4, 10:38].all())
     assert torch.equal(condition.reference, conditions.image_tensor(recorded[1].rgb))
+
+
+@pytest.mark.parametrize("fine", [0, 2])
+def test_above_the_lidar_stands_what_recorded_images_show(fine):
+    """A house 20 m away to the left, sky to the right of it, and a car 6 m ahead; points were measured below the
+    horizon alone, most of them nearest to the car. Above it the house goes on and the sky is far away."""
+    house, car, sky = (palette.ID[name] for name in ("building", "car", "sky"))
+    grey = lambda y: np.full((len(y), 3), 128)
+    parts = [(wall(20.0, grey, (0, 20), (-9, -0.1)), house), (wall(6.0, grey, (-1, 1), (-0.6, -0.1)), car)]
+    xyz, rgb = (np.concatenate([getattr(part, name) for part, _ in parts]) for name in ("xyz", "rgb"))
+    labels = np.concatenate([np.full(len(part), name, np.uint8) for part, name in parts])
+    cloud = FusedCloud(PointCloud(xyz, rgb, "world", labels), {})
+    y_at_house = lambda view: view.center_world[1] - (np.arange(48) + 0.5 - 24) / 40 * 20
+    recorded, target = view_at(), view_at(y=1.5)
+    ids = np.tile(np.where(y_at_house(recorded) > 0, house, sky).astype(np.uint8), (32, 1))
+    y, z = (np.arange(n) + 0.5 - n / 2 for n in (48, 32))
+    ids[(np.abs(y)[None] / 40 * 6 < 1) & (z[:, None] / 40 * 6 > 0.1) & (z[:, None] / 40 * 6 < 0.6)] = car
+    drive = DriveInputs(cloud, [], [Photo(recorded, np.full((32, 48, 3), 128, np.uint8), ids)])
+    rules = replace(RULES, fine_width=48 * fine, fine_height=32 * fine)
+    made = build_conditions(drive, [target], rules)[0]
+    above = slice(0, 12)
+    assert not bool(made.valid[0, 0][above].any())
+    depth, found = made.depth[0, 0][above], made.semantics[0, 0][above]
+    for part, expected, name in ((y_at_house(target) > 1.5, 20.0, house), (y_at_house(target) < -1.5, FAR_M, sky)):
+        part &= np.arange(48) < 40  # what the image shows
+        assert part.sum() > 8
+        assert torch.allclose(depth[:, part], torch.tensor(expected), atol=1e-3)
+        assert bool((found[:, part] == name).all())
 
 
 def test_the_backdrop_and_the_published_condition():

@@ -145,7 +145,8 @@ def test_a_hole_below_the_horizon_is_no_sky(recorded, above):
         assert bool((depth[top] < 12.01).all()) and bool((ids[top] == 2).all())
 
 
-def test_ground_that_no_image_shows_is_level():
+@pytest.mark.parametrize("rendered", [True, False])
+def test_ground_that_no_image_shows_is_level(rendered):
     """Road points from 8 m on, 1.6 m below the camera, rows as dense as pixels; nearer road is neither measured nor
     rendered: it goes on at the same height, its truth. Of another class it keeps the depth of the nearest pixel."""
     x, y = np.meshgrid(np.arange(8, 14, 0.04), np.arange(-10, 10, 0.04))
@@ -156,7 +157,7 @@ def test_ground_that_no_image_shows_is_level():
     for name in ("road", "building"):
         ids = np.full(x.size, palette.ID[name], np.uint8)
         cloud = FusedCloud(PointCloud(xyz, np.zeros((x.size, 3), np.uint8), "world", semantics=ids), {})
-        made = build_conditions(DriveInputs(cloud, [], [], empty), [view], RULES)[0]
+        made = build_conditions(DriveInputs(cloud, [], [], empty if rendered else None), [view], RULES)[0]
         hole = ~made.valid[0, 0] & (falls > 0.25)
         assert int(hole.sum()) > 100
         depth = made.depth[0, 0][hole]

@@ -3,7 +3,8 @@
 
 1. the cloud is projected into every view (z-buffer);
 2. far points that shine through gaps between near ones are removed (`core.project`, rule `condition`);
-3. pixels without a measured depth get the nearest measured one; the mask of what was measured is kept;
+3. pixels without a measured depth get that of a measured one: of the nearest, or, away from measured ones, of the
+   nearest of the class that recorded images show there; the sky is far away; the mask of what was measured is kept;
 4. every pixel is carried by its depth into recorded images taken at about the same time, and takes their colour if it
    falls inside and is not hidden there; elsewhere it keeps the colour of its point, or of the nearest point;
 5. the nearest recorded image is also carried over as if everything in it were far away, for what lies above the LiDAR;
@@ -178,6 +179,8 @@ LEAST_FALL = 0.02
 """Metres per metre of depth by which a ray must fall to be followed to the ground."""
 RenderAt = Callable[[View], RenderPlanes]
 """What a fitted scene shows at a view, without the leading dimension."""
+IdsAt = Callable[[Tensor], Tensor]
+"""The classes u8[H,W] that a recorded image shows at a view's pixels, if their surfaces lie at depths f32[H,W]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,19 +198,42 @@ class DriveInputs:
     weather: InWeather | None = None
     images: dict[tuple[int, int], PreparedImages] = field(default_factory=dict)
 
-    def look(self, view: View, rules: ConditionRules, far_ids: Tensor, render: RenderPlanes | None = None) -> Surfaces:
+    def look(
+        self, view: View, rules: ConditionRules, far_ids: Tensor, ids_at: IdsAt, render: RenderPlanes | None = None
+    ) -> Surfaces:
         """The surfaces at a view: measured ones, and between them those of the render (None: of `render_at`) or else of
-        the nearest measured pixel. What the render does not cover is taken for sky, unless it lies below the horizon or
-        `far_ids` u8[H,W], the classes of what a recorded image shows in the same direction (255 = unknown), are
-        something else: there a surface stands that no image shows, and the nearest measured pixel stands for it, in the
-        render too."""
+        measured pixels. `far_ids` u8[H,W]: classes of what a recorded image shows in the same direction (255 =
+        unknown). `ids_at`: those that it shows at surfaces of a depth.
+
+        Without a render the nearest measured pixel's surface goes on. Away from measured pixels it does so where the
+        image, at its depth, shows its class; elsewhere that of the nearest pixel of the class in `far_ids` does, and
+        sky is far away. What a render does not cover is taken for sky, unless it lies below the horizon or `far_ids`
+        are something else: there a surface stands that no image shows, and the nearest measured pixel stands for it, in
+        the render too."""
         sparse = rules.project(self.cloud, self.tracks, view)
         valid, nearest = sparse.valid, nearest_pixels(sparse.valid)
+        near = torch.from_numpy(ndimage.binary_dilation(valid.numpy(), iterations=REACH_PX))
+        if render is None and self.render_at is not None:
+            render = self.render_at(view)
         color, moving, ids = sparse.rgb, sparse.moving, sparse.semantics
         depth = torch.full_like(sparse.depth, FAR_M)
         if bool(valid.any()):
+            elsewhere = ~near & (far_ids != palette.UNLABELLED)
+            if render is None:
+                elsewhere &= ids[nearest] != ids_at(sparse.depth[nearest])
+                nearest = _nearest_of_class(nearest, valid, ids, far_ids, elsewhere)
             here = (..., *nearest)
             color, depth, moving, ids = color[here], sparse.depth[here], moving[here], ids[here]
+            if render is None:
+                sky = elsewhere & (far_ids == palette.ID["sky"])
+                depth, moving = torch.where(sky, FAR_M, depth), moving & ~sky
+                ids = torch.where(sky, far_ids, ids)
+        x, y, z = ray_directions(view)
+        # ground goes on at the height, not at the depth, of the nearest measured pixel
+        falls = -z
+        level = ~valid & torch.isin(ids, GROUND_IDS) & (falls > LEAST_FALL) & (falls[nearest] > LEAST_FALL)
+        levelled = (depth * falls[nearest] / falls.clamp(min=LEAST_FALL)).clamp(max=FAR_M)
+        levelled = torch.where(level, levelled, depth)
         vacated = None if self.vacated_at is None else self.vacated_at(view)
 
         def on_ground(depth: Tensor) -> Tensor:
@@ -216,28 +242,20 @@ class DriveInputs:
                 return depth
             return torch.where(vacated.mask & ~valid & torch.isfinite(vacated.ground), vacated.ground, depth)
 
-        render = self.render_at(view) if render is None and self.render_at is not None else render
         if render is None:
-            return Surfaces(valid, color, on_ground(depth), moving, ids, None, vacated)
-        near = torch.from_numpy(ndimage.binary_dilation(valid.numpy(), iterations=REACH_PX))
+            return Surfaces(valid, color, on_ground(levelled), moving, ids, None, vacated)
         solid = render.alpha[0] >= SOLID_ALPHA
         # where the render shows another surface, which photographs determined
         sure = (render.alpha[0] > SURE_ALPHA) & determined(render, torch.ones_like(depth, dtype=torch.bool))
         other = sure & ((render.depth[0] - depth).abs() > ANOTHER_SURFACE * depth)
         near &= _among_measured(sparse, depth) | ~other
         surface_seen = (far_ids != palette.ID["sky"]) & (far_ids != palette.UNLABELLED)
-        x, y, z = ray_directions(view)
         hidden = ~solid & ((z < -GROUND_SLOPE * torch.hypot(x, y)) | surface_seen) & bool(valid.any())
-        # ground goes on at the height, not at the depth, of the nearest measured pixel
-        falls = -z
-        level = torch.isin(ids, GROUND_IDS) & (falls > LEAST_FALL) & (falls[nearest] > LEAST_FALL)
-        levelled = torch.where(level, depth * falls[nearest] / falls.clamp(min=LEAST_FALL), depth)
-        depth = torch.where(valid, depth, levelled.clamp(max=FAR_M))
         own_color, own_ids = torch.where(hidden, color, render.color), torch.where(hidden, ids, render.semantics)
         render = replace(render, color=own_color, semantics=own_ids)
         shown = torch.where(solid, render.depth[0], torch.full_like(depth, FAR_M)).clamp(max=FAR_M)
         pick = lambda mine, theirs: torch.where(near | hidden, mine, theirs)
-        depth = on_ground(pick(depth, shown))
+        depth = on_ground(pick(levelled, shown))
         moving = (moving & near) | self._in_objects(view, depth, ~near & torch.isin(render.semantics[0], MOVING_IDS))
         color, ids = pick(color, render.color), pick(ids, render.semantics[0])
         return Surfaces(valid, color, depth, moving, ids, render, vacated)
@@ -323,6 +341,19 @@ def nearest_pixels(valid: Tensor) -> tuple[Tensor, Tensor]:
     if mask.any():
         found = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
     rows, columns = torch.from_numpy(found.astype(np.int64))
+    return rows, columns
+
+
+def _nearest_of_class(
+    nearest: tuple[Tensor, Tensor], valid: Tensor, ids: Tensor, wanted: Tensor, where: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Rows and columns of the `nearest` valid pixels, and `where` bool[H,W] those of the nearest one of the `wanted`
+    class u8[H,W], if there is one."""
+    rows, columns = nearest
+    for name in torch.unique(wanted[where]).tolist():
+        if bool((valid & (ids == name)).any()):
+            own, part = nearest_pixels(valid & (ids == name)), where & (wanted == name)
+            rows, columns = torch.where(part, own[0], rows), torch.where(part, own[1], columns)
     return rows, columns
 
 
@@ -442,9 +473,9 @@ def build_conditions(
         renders = RenderPlanes(**planes)
     warped, ids, far_ids = reduced(warped) > 0.5, picked(ids), picked(far_ids)
     without_renders, own = replace(drive, render_at=None), []
-    for n, (view, there, found) in enumerate(zip(small, far_ids, warped, strict=True)):
+    for n, (view, there, shown, found) in enumerate(zip(small, far_ids, ids, warped, strict=True)):
         render = None if renders is None else renders.map(lambda x, n=n: x[n])
-        here = without_renders.look(view, rules, there[0], render)
+        here = without_renders.look(view, rules, there[0], lambda _, shown=shown: shown[0], render)
         own.append(here.with_hole(here.color, here.ids, found[0])[0])
     memory.rest_mapped()
     depth, valid = (torch.stack([getattr(o, name) for o in own])[:, None] for name in ("depth", "measured"))
@@ -465,17 +496,23 @@ def _condition_of_view(
 
     recorded, shape = drive.recorded, (view.camera.height, view.camera.width)
     if not (rules.warp and among):
-        here = drive.look(view, rules, torch.full(shape, palette.UNLABELLED, dtype=torch.uint8))
+        unknown = torch.full(shape, palette.UNLABELLED, dtype=torch.uint8)
+        here = drive.look(view, rules, unknown, lambda _: unknown)
         found = torch.zeros_like(here.measured)
         here, color, own_ids, found = here.with_hole(here.color, here.ids, found)
         ids = own_ids[None]
         return (color, here.depth[None], here.measured[None], found[None], color, ids, ids), here.render
     nearest = source(min(among, key=_rank_of_images(view, recorded)))
+
+    def ids_at(depth: Tensor) -> Tensor:
+        x, y, _ = carry(view, depth[None], nearest.view)
+        return look_up_ids(nearest.semantics, x, y)[0]
+
     x, y, _ = carry(view, torch.full((1, *shape), BACKDROP_M), nearest.view)
     backdrop, far_ids = look_up(nearest.rgb, x, y)[0], look_up_ids(nearest.semantics, x, y)
     known = None if nearest.usable is None else look_up_ids(nearest.usable, x, y)
     far_ids = far_ids if known is None else torch.where(known, far_ids, palette.UNLABELLED)
-    here = drive.look(view, rules, far_ids[0])
+    here = drive.look(view, rules, far_ids[0], ids_at)
     color, depth, ids, found = here.color, here.depth, here.ids, torch.zeros_like(here.measured)
     shown = drive.cloud.colors
     backdrop = shown.image_of(view.camera.name, backdrop).clamp(0, 1) if shown.to_common else backdrop
@@ -603,7 +640,7 @@ def _prepare_source(drive: DriveInputs, recorded: Photo, rules: ConditionRules, 
     own = np.full((height, width), palette.UNLABELLED) if recorded.semantics is None else recorded.semantics
     own = torch.from_numpy(own.astype(np.uint8))[None, None]
     ids = functional.interpolate(own, size=(height, width), mode="nearest-exact")[0, 0]
-    here = drive.look(view, rules, ids)
+    here = drive.look(view, rules, ids, lambda _: ids)
     rgb = image_tensor(resize_area(recorded.rgb, width, height))
     common = drive.cloud.colors.image_to_common(camera.name, rgb)
     usable = None
