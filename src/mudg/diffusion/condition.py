@@ -46,6 +46,7 @@ from mudg.core.weather import ShownView, Surroundings
 
 
 GROUND_IDS = torch.tensor([palette.ID[name] for name in ("road", "sidewalk", "terrain")], dtype=torch.uint8)
+SKY_ID = palette.ID["sky"]
 MOVING_IDS = torch.tensor(palette.DYNAMIC_IDS, dtype=torch.uint8)
 KNOWN_SHARE = 0.5
 """A render shows what is there where its certainty is at least this share of the usual one of its view."""
@@ -216,18 +217,14 @@ class DriveInputs:
         if render is None and self.render_at is not None:
             render = self.render_at(view)
         color, moving, ids = sparse.rgb, sparse.moving, sparse.semantics
-        depth = torch.full_like(sparse.depth, FAR_M)
+        depth, sky = torch.full_like(sparse.depth, FAR_M), torch.zeros_like(valid)
         if bool(valid.any()):
-            elsewhere = ~near & (far_ids != palette.UNLABELLED)
             if render is None:
-                elsewhere &= ids[nearest] != ids_at(sparse.depth[nearest])
-                nearest = _nearest_of_class(nearest, valid, ids, far_ids, elsewhere)
+                ends = ~near & (far_ids != palette.UNLABELLED) & (ids[nearest] != ids_at(sparse.depth[nearest]))
+                nearest, sky = _nearest_of_class(nearest, valid, ids, far_ids, ends), ends & (far_ids == SKY_ID)
             here = (..., *nearest)
-            color, depth, moving, ids = color[here], sparse.depth[here], moving[here], ids[here]
-            if render is None:
-                sky = elsewhere & (far_ids == palette.ID["sky"])
-                depth, moving = torch.where(sky, FAR_M, depth), moving & ~sky
-                ids = torch.where(sky, far_ids, ids)
+            color, depth, moving, ids = color[here], sparse.depth[here], moving[here] & ~sky, ids[here]
+        depth, ids = torch.where(sky, FAR_M, depth), torch.where(sky, far_ids, ids)
         x, y, z = ray_directions(view)
         # ground goes on at the height, not at the depth, of the nearest measured pixel
         falls = -z
@@ -249,7 +246,7 @@ class DriveInputs:
         sure = (render.alpha[0] > SURE_ALPHA) & determined(render, torch.ones_like(depth, dtype=torch.bool))
         other = sure & ((render.depth[0] - depth).abs() > ANOTHER_SURFACE * depth)
         near &= _among_measured(sparse, depth) | ~other
-        surface_seen = (far_ids != palette.ID["sky"]) & (far_ids != palette.UNLABELLED)
+        surface_seen = (far_ids != SKY_ID) & (far_ids != palette.UNLABELLED)
         hidden = ~solid & ((z < -GROUND_SLOPE * torch.hypot(x, y)) | surface_seen) & bool(valid.any())
         own_color, own_ids = torch.where(hidden, color, render.color), torch.where(hidden, ids, render.semantics)
         render = replace(render, color=own_color, semantics=own_ids)
@@ -284,7 +281,7 @@ class DriveInputs:
         if self.weather is None or self.render_at is None:
             return seen.rgb
         shown = self.render_at(view)
-        ids = torch.where(seen.valid & (shown.semantics == palette.ID["sky"]), palette.UNLABELLED, shown.semantics)
+        ids = torch.where(seen.valid & (shown.semantics == SKY_ID), palette.UNLABELLED, shown.semantics)
         depth = torch.where(seen.valid, seen.depth, shown.depth)
         return self.weather.image(view, torch.where(seen.valid, seen.rgb, shown.color), depth, ids.to(torch.uint8))
 
@@ -345,15 +342,17 @@ def nearest_pixels(valid: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _nearest_of_class(
-    nearest: tuple[Tensor, Tensor], valid: Tensor, ids: Tensor, wanted: Tensor, where: Tensor
+    nearest: tuple[Tensor, Tensor], valid: Tensor, ids: Tensor, classes: Tensor, mask: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Rows and columns of the `nearest` valid pixels, and `where` bool[H,W] those of the nearest one of the `wanted`
-    class u8[H,W], if there is one."""
+    """Rows and columns of the `nearest` valid pixels; where the `mask` bool[H,W] is, those of the nearest one whose
+    class in `ids` is the pixel's in `classes` (u8[H,W]), if there is one."""
     rows, columns = nearest
-    for name in torch.unique(wanted[where]).tolist():
-        if bool((valid & (ids == name)).any()):
-            own, part = nearest_pixels(valid & (ids == name)), where & (wanted == name)
-            rows, columns = torch.where(part, own[0], rows), torch.where(part, own[1], columns)
+    for class_id in torch.unique(classes[mask]).tolist():
+        members, pixels = valid & (ids == class_id), mask & (classes == class_id)
+        if bool(members.any()):
+            class_rows, class_columns = nearest_pixels(members)
+            rows = torch.where(pixels, class_rows, rows)
+            columns = torch.where(pixels, class_columns, columns)
     return rows, columns
 
 
@@ -473,9 +472,9 @@ def build_conditions(
         renders = RenderPlanes(**planes)
     warped, ids, far_ids = reduced(warped) > 0.5, picked(ids), picked(far_ids)
     without_renders, own = replace(drive, render_at=None), []
-    for n, (view, there, shown, found) in enumerate(zip(small, far_ids, ids, warped, strict=True)):
+    for n, (view, far, warped_ids, found) in enumerate(zip(small, far_ids, ids, warped, strict=True)):
         render = None if renders is None else renders.map(lambda x, n=n: x[n])
-        here = without_renders.look(view, rules, there[0], lambda _, shown=shown: shown[0], render)
+        here = without_renders.look(view, rules, far[0], lambda _, at=warped_ids[0]: at, render)
         own.append(here.with_hole(here.color, here.ids, found[0])[0])
     memory.rest_mapped()
     depth, valid = (torch.stack([getattr(o, name) for o in own])[:, None] for name in ("depth", "measured"))
@@ -665,7 +664,7 @@ class InWeather:
 
     def image(self, view: View, rgb: Tensor, depth: Tensor, ids: Tensor) -> Tensor:
         """Colours f32[3,H,W] in this weather, from depth f32[1,H,W] and classes u8[1,H,W]; sky has no depth."""
-        metres = torch.where(ids == palette.ID["sky"], torch.zeros_like(depth), depth)[0].numpy().astype(np.float32)
+        metres = torch.where(ids == SKY_ID, torch.zeros_like(depth), depth)[0].numpy().astype(np.float32)
         shown = ShownView(view, rgb.permute(1, 2, 0).numpy(), metres, ids[0].numpy())
         made = weather.edited_view(shown, self.settings, self.seed, self.drive, self.velocity_at(view.time_s))
         return torch.from_numpy(np.ascontiguousarray(made.transpose(2, 0, 1), np.float32)).clamp(0, 1)
