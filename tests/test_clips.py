@@ -147,6 +147,36 @@ def test_the_backdrop_and_the_published_condition():
     assert condition.warped is None
 
 
+def test_images_that_show_the_same_surface_are_averaged():
+    """Three photographs of one wall from one place: two differ by noise, the third has the sun on it."""
+    random = np.random.default_rng(5)
+    wall_now = image_of_wall(view_at(), 12.0).clip(20, 200)
+    noisy = [(wall_now + random.integers(-12, 13, wall_now.shape)).astype(np.uint8) for _ in range(2)]
+    photos = [Photo(view_at(time_s=0.1 * n), rgb) for n, rgb in enumerate([*noisy, (wall_now + 50).astype(np.uint8)])]
+    drive = DriveInputs(FusedCloud(wall(12.0, stripes), {}), [], photos)
+    made = build_conditions(drive, [view_at()], RULES)[0]
+    assert bool(made.warped.all())
+    mean = np.stack(noisy).astype(np.float32).mean(0) / 255
+    assert torch.allclose(made.color[0], torch.from_numpy(mean).permute(2, 0, 1), atol=1e-4)
+
+
+@pytest.mark.parametrize(("depth", "labelled"), [(6.0, True), (60.0, True), (6.0, False)])
+def test_near_road_users_are_no_part_of_the_backdrop(depth, labelled):
+    """A red bus ahead in a grey street: the street goes on behind it, unless it is far away."""
+    bus, house = palette.ID["bus"], palette.ID["building"]
+    there = torch.zeros(32, 48, dtype=torch.bool)
+    there[10:22, 18:30] = True
+    ids = torch.where(there, bus, house).to(torch.uint8)
+    ids = ids if labelled else torch.full_like(ids, palette.UNLABELLED)
+    grey, red = torch.full((3, 1, 1), 0.5), torch.tensor([1.0, 0.0, 0.0])[:, None, None]
+    photo = WarpSource(view_at(), torch.where(there, red, grey), torch.where(there, depth, 50.0), there, ids)
+    color, found, known = conditions._backdrop(view_at(), photo)
+    near = depth < 40
+    assert known is None
+    assert torch.allclose(color, grey if near else photo.rgb, atol=1e-5)
+    assert torch.equal(found[0], torch.where(there & near & labelled, house, ids).to(torch.uint8))
+
+
 @pytest.mark.parametrize("fine", [0, 2])
 def test_parts_of_a_condition_are_switched_off(fine):
     cloud = FusedCloud(wall(12.0, stripes, z_range=(-9, 1)), {})

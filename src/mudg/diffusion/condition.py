@@ -5,9 +5,10 @@
 2. far points that shine through gaps between near ones are removed (`core.project`, rule `condition`);
 3. pixels without a measured depth get that of a measured one: of the nearest, or, away from measured ones, of the
    nearest of the class that recorded images show there; the sky is far away; the mask of what was measured is kept;
-4. every pixel is carried by its depth into recorded images taken at about the same time, and takes their colour if it
-   falls inside and is not hidden there; elsewhere it keeps the colour of its point, or of the nearest point;
+4. every pixel is carried by its depth into recorded images taken at about the same time, and takes the mean colour of
+   those in which it is not hidden; elsewhere it keeps the colour of its point, or of the nearest point;
 5. the nearest recorded image is also carried over as if everything in it were far away, for what lies above the LiDAR;
+   near road users, which stand elsewhere in the view, are filled with what is around them;
 6. the classes of labelled points and images travel with their colours;
 7. renders of a scene fitted to the recorded images, if there is one, are given too, and in steps 3 to 5 tell the depth
    of what no point was measured on.
@@ -120,6 +121,10 @@ LEAST_OVERLAP = 0.02
 """Images that show less than this share of a view are not tried."""
 BACKDROP_M = 80.0
 """Distance at which the nearest recorded image is put up as a backdrop."""
+BEHIND_M = 40.0
+"""Road users nearer than this are no part of a backdrop."""
+ALIKE, ALIKE_PX = 0.1, 4
+"""Recorded images whose means over squares of this side differ by less show the same surface, and are averaged."""
 REACH_PX = 4
 """A pixel this near to a measured one takes that one's depth; farther ones take the depth of the render, where there is
 one."""
@@ -421,14 +426,14 @@ class WarpSource:
 
     def warped(self, view: View, depth: Tensor, surface: Tensor, hidden_share: float) -> tuple[Tensor, Tensor, Tensor]:
         """Colours and classes that the pixels of another view, at `depth` f32[H,W], have in the image. `surface`
-        f32[h,w]: depth of the nearest surface at its pixels. Returns rgb f32[3,H,W] (bilinear), semantics u8[H,W]
+        f32[h,w]: depth of the nearest surface at its pixels. Returns rgb f32[3,H,W] (bicubic), semantics u8[H,W]
         (nearest) and found bool[H,W]: inside the image, usable and not hidden in it."""
         x, y, z = carry(view, depth[None], self.view)
         in_front = look_up(surface[None], x, y, "nearest")[0, 0]
         found = inside(self.view, x, y, z)[0] & (in_front >= z[0] * (1 - hidden_share) - 0.3)
         if self.usable is not None:
             found &= look_up_ids(self.usable, x, y)[0]
-        return look_up(self.rgb, x, y)[0], look_up_ids(self.semantics, x, y)[0], found
+        return look_up(self.rgb, x, y, "bicubic")[0], look_up_ids(self.semantics, x, y)[0], found
 
 
 def build_conditions(
@@ -507,28 +512,47 @@ def _condition_of_view(
         x, y, _ = carry(view, depth[None], nearest.view)
         return look_up_ids(nearest.semantics, x, y)[0]
 
-    x, y, _ = carry(view, torch.full((1, *shape), BACKDROP_M), nearest.view)
-    backdrop, far_ids = look_up(nearest.rgb, x, y)[0], look_up_ids(nearest.semantics, x, y)
-    known = None if nearest.usable is None else look_up_ids(nearest.usable, x, y)
-    far_ids = far_ids if known is None else torch.where(known, far_ids, palette.UNLABELLED)
+    backdrop, far_ids, known = _backdrop(view, nearest)
     here = drive.look(view, rules, far_ids[0], ids_at)
     color, depth, ids, found = here.color, here.depth, here.ids, torch.zeros_like(here.measured)
     shown = drive.cloud.colors
-    backdrop = shown.image_of(view.camera.name, backdrop).clamp(0, 1) if shown.to_common else backdrop
+    backdrop = shown.image_of(view.camera.name, backdrop).clamp(0, 1)
+    total, count = torch.zeros_like(color), torch.zeros(shape)
     for number in _order_of_images(view, depth, recorded, among, rules):
         image = source(number)
         fresh = abs(image.view.time_s - view.time_s) <= SAME_TIME_S
         surface = image.depth if fresh else torch.where(image.moving, torch.zeros_like(image.depth), image.depth)
-        rgb, labels, new = image.warped(view, depth, surface, rules.hidden_share)
-        rgb = shown.image_of(view.camera.name, rgb).clamp(0, 1) if shown.to_common else rgb
-        new = new & ~found if fresh else new & ~found & ~here.moving
-        color = torch.where(new, rgb, color)
+        rgb, labels, seen = image.warped(view, depth, surface, rules.hidden_share)
+        rgb = shown.image_of(view.camera.name, rgb).clamp(0, 1)
+        seen = seen if fresh else seen & ~here.moving
+        new = seen & ~found
         ids = torch.where(new & (labels != palette.UNLABELLED), labels, ids)
-        found = found | new
+        apart = functional.avg_pool2d(rgb - color, ALIKE_PX, ceil_mode=True).abs().amax(0)
+        same = (apart < ALIKE).repeat_interleave(ALIKE_PX, 0).repeat_interleave(ALIKE_PX, 1)
+        color = torch.where(new, rgb, color)
+        alike = new | (seen & same[: shape[0], : shape[1]])
+        total, count, found = total + rgb * alike, count + alike, found | new
+    color = torch.where(found, total / count.clamp(min=1), color)
     here, color, ids, found = here.with_hole(color, ids, found)
     if known is not None:  # what stood there is not part of the picture any more
         backdrop, far_ids = torch.where(known, backdrop, color), torch.where(known, far_ids, ids[None])
     return (color, depth[None], here.measured[None], found[None], backdrop, ids[None], far_ids), here.render
+
+
+def _backdrop(view: View, image: WarpSource) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Colours f32[3,H,W], common ones, and classes u8[1,H,W] that a recorded image shows of what lies far away in the
+    directions of a view; and which of its pixels bool[1,H,W] are usable, None for all. Near road users stand elsewhere
+    in the view: what is around them is continued."""
+    x, y, _ = carry(view, torch.full((1, view.camera.height, view.camera.width), BACKDROP_M), image.view)
+    color, ids = look_up(image.rgb, x, y)[0], look_up_ids(image.semantics, x, y)
+    users = torch.where(ids == palette.UNLABELLED, look_up_ids(image.moving, x, y), torch.isin(ids, MOVING_IDS))
+    users &= look_up(image.depth[None], x, y, "nearest")[0] < BEHIND_M
+    known = None if image.usable is None else look_up_ids(image.usable, x, y)
+    ids = ids if known is None else torch.where(known, ids, palette.UNLABELLED)
+    if bool(users.any()) and not bool(users.all()):
+        color = torch.where(users, _pulled(color[None] * ~users, (~users)[None].float())[0], color)
+        ids = torch.where(users, ids[0][nearest_pixels(~users[0])][None], ids)
+    return color, ids, known
 
 
 def _among_measured(sparse: ProjectedPoints, depth: Tensor) -> Tensor:
