@@ -170,11 +170,18 @@ def test_near_road_users_are_no_part_of_the_backdrop(depth, labelled):
     ids = ids if labelled else torch.full_like(ids, palette.UNLABELLED)
     grey, red = torch.full((3, 1, 1), 0.5), torch.tensor([1.0, 0.0, 0.0])[:, None, None]
     photo = WarpSource(view_at(), torch.where(there, red, grey), torch.where(there, depth, 50.0), there, ids)
-    color, found, known = conditions._backdrop(view_at(), photo)
+    color, found, usable = conditions._backdrop(view_at(), photo)
     near = depth < 40
-    assert known is None
+    assert bool(usable.all())
     assert torch.allclose(color, grey if near else photo.rgb, atol=1e-5)
     assert torch.equal(found[0], torch.where(there & near & labelled, house, ids).to(torch.uint8))
+    spoilt = torch.zeros_like(there)
+    spoilt[:, :18] = True  # what an edit took away to the left of the bus must not be continued behind it
+    blue = torch.where(spoilt, torch.tensor([0.0, 0.0, 1.0])[:, None, None], photo.rgb)
+    color, found, usable = conditions._backdrop(view_at(), replace(photo, rgb=blue, usable=~spoilt))
+    assert torch.equal(usable[0], ~spoilt)
+    assert torch.allclose(color[:, there], (grey if near else red)[:, 0], atol=1e-5)
+    assert not near or not labelled or bool((found[0][there] == house).all())
 
 
 @pytest.mark.parametrize("fine", [0, 2])

@@ -6,7 +6,7 @@
 3. pixels without a measured depth get that of a measured one: of the nearest, or, away from measured ones, of the
    nearest of the class that recorded images show there; the sky is far away; the mask of what was measured is kept;
 4. every pixel is carried by its depth into recorded images taken at about the same time, and takes the mean colour of
-   those in which it is not hidden; elsewhere it keeps the colour of its point, or of the nearest point;
+   those in which it is not hidden and that look alike; elsewhere it keeps that of its point, or of the nearest point;
 5. the nearest recorded image is also carried over as if everything in it were far away, for what lies above the LiDAR;
    near road users, which stand elsewhere in the view, are filled with what is around them;
 6. the classes of labelled points and images travel with their colours;
@@ -512,7 +512,7 @@ def _condition_of_view(
         x, y, _ = carry(view, depth[None], nearest.view)
         return look_up_ids(nearest.semantics, x, y)[0]
 
-    backdrop, far_ids, known = _backdrop(view, nearest)
+    backdrop, far_ids, usable = _backdrop(view, nearest)
     here = drive.look(view, rules, far_ids[0], ids_at)
     color, depth, ids, found = here.color, here.depth, here.ids, torch.zeros_like(here.measured)
     shown = drive.cloud.colors
@@ -522,37 +522,37 @@ def _condition_of_view(
         image = source(number)
         fresh = abs(image.view.time_s - view.time_s) <= SAME_TIME_S
         surface = image.depth if fresh else torch.where(image.moving, torch.zeros_like(image.depth), image.depth)
-        rgb, labels, seen = image.warped(view, depth, surface, rules.hidden_share)
+        rgb, labels, visible = image.warped(view, depth, surface, rules.hidden_share)
         rgb = shown.image_of(view.camera.name, rgb).clamp(0, 1)
-        seen = seen if fresh else seen & ~here.moving
-        new = seen & ~found
+        visible = visible if fresh else visible & ~here.moving
+        new = visible & ~found
         ids = torch.where(new & (labels != palette.UNLABELLED), labels, ids)
         apart = functional.avg_pool2d(rgb - color, ALIKE_PX, ceil_mode=True).abs().amax(0)
         same = (apart < ALIKE).repeat_interleave(ALIKE_PX, 0).repeat_interleave(ALIKE_PX, 1)
         color = torch.where(new, rgb, color)
-        alike = new | (seen & same[: shape[0], : shape[1]])
+        alike = new | (visible & same[: shape[0], : shape[1]])
         total, count, found = total + rgb * alike, count + alike, found | new
     color = torch.where(found, total / count.clamp(min=1), color)
     here, color, ids, found = here.with_hole(color, ids, found)
-    if known is not None:  # what stood there is not part of the picture any more
-        backdrop, far_ids = torch.where(known, backdrop, color), torch.where(known, far_ids, ids[None])
+    # what is not usable is not part of the picture any more
+    backdrop, far_ids = torch.where(usable, backdrop, color), torch.where(usable, far_ids, ids[None])
     return (color, depth[None], here.measured[None], found[None], backdrop, ids[None], far_ids), here.render
 
 
-def _backdrop(view: View, image: WarpSource) -> tuple[Tensor, Tensor, Tensor | None]:
+def _backdrop(view: View, image: WarpSource) -> tuple[Tensor, Tensor, Tensor]:
     """Colours f32[3,H,W], common ones, and classes u8[1,H,W] that a recorded image shows of what lies far away in the
-    directions of a view; and which of its pixels bool[1,H,W] are usable, None for all. Near road users stand elsewhere
-    in the view: what is around them is continued."""
+    directions of a view; and which of its pixels bool[1,H,W] are usable. Near road users stand elsewhere in the view:
+    what is around them is continued."""
     x, y, _ = carry(view, torch.full((1, view.camera.height, view.camera.width), BACKDROP_M), image.view)
     color, ids = look_up(image.rgb, x, y)[0], look_up_ids(image.semantics, x, y)
     users = torch.where(ids == palette.UNLABELLED, look_up_ids(image.moving, x, y), torch.isin(ids, MOVING_IDS))
     users &= look_up(image.depth[None], x, y, "nearest")[0] < BEHIND_M
-    known = None if image.usable is None else look_up_ids(image.usable, x, y)
-    ids = ids if known is None else torch.where(known, ids, palette.UNLABELLED)
-    if bool(users.any()) and not bool(users.all()):
-        color = torch.where(users, _pulled(color[None] * ~users, (~users)[None].float())[0], color)
-        ids = torch.where(users, ids[0][nearest_pixels(~users[0])][None], ids)
-    return color, ids, known
+    usable = torch.ones_like(users) if image.usable is None else look_up_ids(image.usable, x, y)
+    ids, around = torch.where(usable, ids, palette.UNLABELLED), usable & ~users
+    if bool(users.any()) and bool(around.any()):
+        color = torch.where(users, _pulled(color[None] * around, around[None].float())[0], color)
+        ids = torch.where(users, ids[0][nearest_pixels(around[0])][None], ids)
+    return color, ids, usable
 
 
 def _among_measured(sparse: ProjectedPoints, depth: Tensor) -> Tensor:
